@@ -1,8 +1,8 @@
-"""The baseline: one SOS gradient by the published block method (SPST as released with SGSST), written anew.
+"""Baseline: one SOS gradient by the published block method (SPST as released with SGSST), reimplemented.
 
-Blocks of 512 px go through the network with a margin of 256 px, twice: once for statistics, once to back-propagate.
-The loss pulls at every feature of the window, and what lies in the margin is cropped away afterwards. Content features
-are computed in every iteration. It runs on this project's network code, so that only the method differs.
+Blocks of 512 px go through the network with a margin of 256 px, twice: once for statistics, once for back-propagation.
+The loss acts on every feature of the window, and the margin is cropped away afterwards. Content features are recomputed
+in every iteration. It runs on this project's network code, so that only the method differs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MARGIN = 256
 
 
 def blocks(height: int, width: int) -> list[PartitionTile]:
-    """Blocks with their margins, clipped to the view."""
+    """Return the blocks with their margins, clipped to the view."""
     return [
         PartitionTile(
             Rectangle(top, left, min(top + BLOCK, height), min(left + BLOCK, width)),
@@ -41,7 +41,7 @@ def blocks(height: int, width: int) -> list[PartitionTile]:
 
 
 def block_gradient(network: FeatureNetwork, image: Tensor, style: Mapping[int, ScaleTarget], content: Tensor) -> Tensor:
-    """dE/dimage [H, W, 3] of the SOS loss with lambda_c = 1, for image and content image [H, W, 3]."""
+    """Compute dE/dimage [H, W, 3] of the SOS loss with lambda_c = 1, for image and content image [H, W, 3]."""
     scales = range(scale_count(image.shape[0], image.shape[1]))
     total = torch.zeros(image.shape)
     for scale in scales:

@@ -1,4 +1,4 @@
-"""The cameras that benchmarks look at a scene with."""
+"""Cameras of the benchmarks, from a camera file or an orbit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,14 @@ from sgsst_core.scene.orbit import orbit
 
 
 def read_views(source: str, scene: Scene, count: int, resolution: int) -> list[Camera]:
-    """`count` cameras of a camera file, or of a ring of N for orbit:N, so many pixels on their longer side."""
+    """Return `count` cameras, with `resolution` pixels on their longer side.
+
+    Args:
+        source: Camera file, or orbit:N for a ring of N cameras.
+        scene: Scene, which determines the orbit.
+        count: Number of cameras, evenly spread over the source.
+        resolution: Longer side in pixels.
+    """
     if source.startswith("orbit:"):
         cameras = orbit(scene, int(source.removeprefix("orbit:")), up=[0, -1, 0])
     else:

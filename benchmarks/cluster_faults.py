@@ -1,14 +1,15 @@
-"""Faults of machines at random moments, while a cluster that shares PostgreSQL and S3 alone works through small jobs.
+"""Random machine failures in a cluster that shares only PostgreSQL and S3, while it works through small jobs.
 
 python -m benchmarks.cluster_faults [--faults 60] [--seconds S] [--seed 0] [--kinds kill-node cut-node ...]
 
-Ten hosts of namespaces (`benchmarks.cluster_hosts`), each with its own network, processes and disk: two for the API,
-two for dispatchers, one for Ray's head, three Ray nodes that compute, PostgreSQL, and S3 (moto's server). What runs on
-a host is started again when it ends, and a killed host comes back with an empty disk, as machines of a cluster do.
+There are ten hosts made of namespaces (`benchmarks.cluster_hosts`), each with its own network, processes and disk: two
+for the API, two for dispatchers, one for Ray's head, three Ray nodes that compute, PostgreSQL, and S3 (moto's server).
+Services that end are restarted, and a killed host returns with an empty disk, as in a real cluster.
 
-Counted: jobs lost (accepted, and not succeeded), published twice, of another result than `sgsst stylize` gives on one
-rank (byte for byte for jobs of one rank; colors for jobs of two), files left over, reads that no API process answered
-while the database was there, and for each kind of fault the seconds until a job makes steps again.
+The benchmark counts accepted jobs that do not succeed (lost), jobs published twice, and results that differ from those
+of `sgsst stylize` on one rank (bit by bit for jobs on one rank, by color for jobs on two). It also counts files left
+behind and reads that no API process answered while the database was up, and measures for each kind of fault the seconds
+until a job makes steps again.
 """
 
 from __future__ import annotations
@@ -46,22 +47,22 @@ from tests.small_scenes import wall, write_files
 
 PARAMETERS = {"preset": "standard", "steps_coarse": 0, "steps_sos": 150, "backbone": "vgg16", "early_stop": False}
 SEEDS = (1, 2)
-#: Jobs that are kept waiting or running; every third runs on two ranks.
+#: Number of unfinished jobs to maintain; every third job runs on two ranks.
 QUEUE, TWO_RANKS_EVERY = 3, 3
 RAY_PORT, PG_PORT, S3_PORT, API_PORT = 6479, 5498, 5599, 8000
 NODES, DISPATCHERS, APIS = ("n1", "n2", "n3"), ("d1", "d2"), ("a1", "a2")
 FINISHED = ("succeeded", "failed", "canceled", "expired")
-#: Seconds that a cut lasts at least and at most; that S3 is away; that a cable is slow, and a disk full.
+#: Minimum and maximum seconds of a network cut; seconds of an S3 outage, of a slow connection, and of a full disk.
 CUT, AWAY, SLOW, FULL = (5.0, 60.0), 30.0, 30.0, 20.0
 DELAY, LOSS = 0.2, 0.05
-#: Seconds for everything that was accepted to end, once nothing is broken any more, and for what is left to be swept.
+#: Seconds for all accepted jobs to end after the last fault is repaired, and for leftover files to be deleted.
 PATIENCE, SWEEP = 900.0, 120.0
-#: Bytes of a node's disk, which a fault fills: scene, network and checkpoint are small here.
+#: Size in bytes of a node's disk, which a fault fills; scene, network and checkpoint are small here.
 NODE_DISK = 96 << 20
 
 
 class Cluster:
-    """The hosts and what runs on them."""
+    """Hosts and the services that run on them."""
 
     def __init__(self, network: Network, weights: Path) -> None:
         self.network, self._weights = network, weights
@@ -92,7 +93,7 @@ class Cluster:
         return self.network.hosts[name]
 
     def start(self) -> None:
-        """Everything, in no order that matters but for the database and the store, which are there first."""
+        """Start everything: database and store first, then the rest, in arbitrary order."""
         for name, number in self._addresses.items():
             self.network.host(name, number, NODE_DISK if name in NODES else 1 << 30)
         self.start_services("pg")
@@ -104,12 +105,12 @@ class Cluster:
         _wait("the service", lambda: all(_ready(url) for url in self.urls))
 
     def bring_back(self, name: str) -> None:
-        """A killed host, with an empty disk."""
+        """Restart a killed host, with an empty disk."""
         self[name].start()
         self.start_services(name)
 
     def start_services(self, name: str) -> None:
-        """What belongs on a host."""
+        """Start the services of a host."""
         host = self[name]
         python, disk = sys.executable, str(host.disk)
         if name == "pg":
@@ -170,7 +171,7 @@ class Cluster:
         return httpx.put(f"{self.store['AWS_ENDPOINT_URL']}/files", trust_env=False, timeout=5).status_code == 200
 
     def database_answers(self) -> bool:
-        """Whether PostgreSQL takes connections."""
+        """Return whether PostgreSQL accepts connections."""
         with socket.create_connection((self["pg"].address, PG_PORT), timeout=2):
             return True
 
@@ -200,12 +201,12 @@ def _wait(what: str, condition: Callable[[], bool], seconds: float = 180.0) -> N
 
 @dataclass
 class Run:
-    """A cluster under fire, and what is counted."""
+    """Cluster under attack, and the figures collected."""
 
     cluster: Cluster
     files: dict[str, Path]
     chance: random.Random
-    accepted: dict[str, tuple[int, int]] = field(default_factory=dict)  # seed and ranks
+    accepted: dict[str, tuple[int, int]] = field(default_factory=dict)  # seed and number of ranks
     faults: list[dict[str, Any]] = field(default_factory=list)
     unanswered: list[float] = field(default_factory=list)
     database_away: bool = False
@@ -214,7 +215,7 @@ class Run:
     # --- through the API -------------------------------------------------------------------------------------------
 
     def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """A request to whichever API process answers, sent again while none does."""
+        """Send a request to any API process that answers, retrying while none does."""
         deadline = time.monotonic() + PATIENCE
         while True:
             for url in self.cluster.urls:
@@ -227,7 +228,7 @@ class Run:
             time.sleep(0.2)
 
     def jobs(self) -> list[dict[str, Any]]:
-        """All jobs."""
+        """Return all jobs."""
         found: list[dict[str, Any]] = []
         cursor: str | None = None
         while True:
@@ -240,7 +241,7 @@ class Run:
                 return found
 
     def fill(self) -> None:
-        """Keep the queue full."""
+        """Submit jobs until the queue is full."""
         waiting = sum(job["status"] not in FINISHED for job in self.jobs())
         for _ in range(QUEUE - waiting):
             number = len(self.accepted)
@@ -259,14 +260,17 @@ class Run:
             self.accepted[str(answer.json()["id"])] = seed, ranks
 
     def steps(self) -> tuple[int, int]:
-        """Something that grows whenever a job makes a step or ends: jobs that ended, steps of those that run."""
+        """Return the number of ended jobs, and the total steps of running jobs.
+
+        The pair grows whenever a job makes a step or ends.
+        """
         jobs = self.jobs()
         running = [job for job in jobs if job["status"] == "running" and (job["progress"] or {}).get("loss")]
         ended = sum(job["status"] in FINISHED for job in jobs)
         return ended, sum(job["attempt"] * 1_000_000 + job["progress"]["step"] for job in running)
 
     def watch_reads(self) -> None:
-        """Ask for a page of jobs every half second; note the seconds of what no API process answers."""
+        """Request a page of jobs every half second, and record how long no API process answers."""
         while not self.over.wait(0.5):
             started = time.monotonic()
             if not any(self._reads(url) for url in self.cluster.urls) and not self.database_away:
@@ -281,7 +285,7 @@ class Run:
     # --- faults ----------------------------------------------------------------------------------------------------
 
     def strike(self, kind: str) -> None:
-        """One fault, mended again, and the seconds from it until a job makes steps."""
+        """Inject a fault, repair it, and record the seconds until a job makes steps."""
         self.fill()
         self.wait_for_steps(120)
         time.sleep(self.chance.uniform(0, 4))
@@ -300,7 +304,7 @@ class Run:
         print(f"{len(self.faults):3} {time.strftime('%H:%M:%S')} {record}", flush=True)
 
     def wait_for_steps(self, seconds: float) -> float | None:
-        """Seconds until a job has made steps or has ended; None where none does in time."""
+        """Wait until a job makes steps or ends. Returns the seconds, or None if none does in time."""
         started = time.monotonic()
         before = self.steps()
         while time.monotonic() - started < seconds:
@@ -378,7 +382,7 @@ class Run:
     # --- what became of it -----------------------------------------------------------------------------------------
 
     def wait_for_all(self) -> dict[str, dict[str, Any]]:
-        """Every accepted job at its end, or as it is when patience is over; those that are gone are left out."""
+        """Wait until all accepted jobs have ended or time is up. Returns the last status of those that exist."""
         deadline = time.monotonic() + PATIENCE
         found: dict[str, dict[str, Any]] = {}
         while time.monotonic() < deadline:
@@ -393,12 +397,12 @@ class Run:
         return found
 
     def published(self, job_id: str) -> int:
-        """How often the end of a job was told of."""
+        """Return how often a job's result was reported."""
         text = self.call("GET", f"/v1/jobs/{job_id}/events").text
         return max(text.count('"name": "stylized.ply"'), text.count('"status": "succeeded"'))
 
     def result(self, job_id: str) -> bytes:
-        """Its PLY."""
+        """Download a job's PLY."""
         return self.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
 
 
@@ -417,7 +421,7 @@ KINDS = (
 
 
 def main() -> None:
-    """Break, count, print and store."""
+    """Inject faults, print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=60)
     parser.add_argument("--seconds", type=float, default=None, help="no further fault after these")
@@ -445,7 +449,15 @@ def main() -> None:
 def measure(
     folder: Path, kinds: Sequence[str], faults: int, seconds: float | None = None, seed: int = 0
 ) -> dict[str, Any]:
-    """All figures of so many faults, or of those that began in so many seconds, in a folder with a short name."""
+    """Run the cluster under faults and return all figures.
+
+    Args:
+        folder: Working folder, with a short path.
+        kinds: Kinds of faults.
+        faults: Number of faults.
+        seconds: Time after which no further fault starts; None for no limit.
+        seed: Seed of the random choices.
+    """
     folder.chmod(0o755)
     for name in ("inputs", "weights", "net"):
         (folder / name).mkdir()
@@ -469,7 +481,7 @@ def measure(
 
 
 def attack(run: Run, kinds: Sequence[str], faults: int, limit: float | None) -> float:
-    """Kinds in turns, each round in another order; returns the seconds that it took."""
+    """Inject the kinds of faults in rounds, each round in a random order. Returns the seconds it took."""
     started = time.monotonic()
     order: list[str] = []
     while len(run.faults) < faults and (limit is None or time.monotonic() - started < limit):
@@ -481,7 +493,7 @@ def attack(run: Run, kinds: Sequence[str], faults: int, limit: float | None) -> 
 
 
 def _expected(folder: Path, files: dict[str, Path]) -> dict[int, Path]:
-    """What `sgsst stylize` makes of the files on one rank, with the network that the cluster has."""
+    """Return the results of `sgsst stylize` on one rank, by seed, with the network of the cluster."""
     installed = os.environ.get("SGSST_CACHE")
     os.environ["SGSST_CACHE"] = str(folder / "weights")
     try:
@@ -497,7 +509,7 @@ def _expected(folder: Path, files: dict[str, Path]) -> dict[int, Path]:
 
 
 def _count(run: Run, found: dict[str, dict[str, Any]], expected: dict[int, Path], folder: Path) -> dict[str, Any]:
-    """What became of the jobs."""
+    """Return the figures about jobs."""
     ended = [job_id for job_id in run.accepted if found.get(job_id, {}).get("status") == "succeeded"]
     different, farthest = 0, 0.0
     before = read_scene(run.files["scene"]).scene.sh_dc
@@ -542,7 +554,7 @@ def _spread(values: list[float | None]) -> dict[str, float | int | None]:
 
 
 def _left(run: Run, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """What is left on the hosts and in the store once dispatchers have had time to sweep."""
+    """Return what is left on the hosts and in the store after dispatchers have had time to clean up."""
     deadline = time.monotonic() + SWEEP
     while True:
         hosts = {name: _files_of_jobs(run.cluster[name]) for name in (*NODES, *DISPATCHERS)}
@@ -559,7 +571,7 @@ def _files_of_jobs(host: Host) -> int:
 
 
 def _stray_objects(run: Run, found: dict[str, dict[str, Any]]) -> list[str]:
-    """Objects of jobs that no published artifact is."""
+    """Return stored objects of jobs that are not published artifacts."""
     listing = subprocess.run(
         [sys.executable, "-c", _LIST],
         env={**os.environ, **run.cluster.store, "NO_PROXY": "*"},
@@ -584,5 +596,5 @@ print("\\n".join(ObjectStore("s3://files/sgsst").below("")))
 """
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # hosts go with this process, whatever ends it
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # hosts end with this process, however it ends
     main()

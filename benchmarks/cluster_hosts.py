@@ -1,7 +1,7 @@
-"""Hosts on one machine: namespaces of Linux, each with its own network, processes, name and disk, on one switch.
+"""Simulated hosts on one machine: Linux namespaces, each with its own network, processes, name and disk, on one switch.
 
-Every host hangs on a cable of its own (`Cable`): a pair of TAP devices between which this process carries packets, so
-that a cable can be cut in one direction or in both, lose packets and delay them, without any module of the kernel.
+Every host is connected by a cable of its own (`Cable`), a pair of TAP devices between which this process forwards
+packets. A cable can therefore be cut in one or both directions, lose packets and delay them, without any kernel module.
 Needs Linux, root, iproute2, util-linux and /dev/net/tun.
 """
 
@@ -23,16 +23,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-#: Of `linux/if_tun.h`: give a TAP device its name; one without a header before each packet.
+#: From `linux/if_tun.h`: request to name a TAP device, and flag for packets without a header.
 _TUNSETIFF, _TAP_WITHOUT_HEADER = 0x400454CA, 0x0002 | 0x1000
 _LARGEST_PACKET = 65536
 _TOOLS = ("ip", "unshare", "nsenter", "mount")
-#: Third numbers of addresses: 10.77.N. The scripts in deploy/ have those from 81 on.
+#: Third numbers of addresses 10.77.N. The scripts in deploy/ use those from 81 on.
 _NETWORKS = range(61, 80)
 
 
 def missing() -> str | None:
-    """What this machine lacks for hosts; None where nothing is missing."""
+    """Return what this machine lacks to run hosts, or None."""
     if os.name != "posix" or not hasattr(os, "geteuid") or os.geteuid() != 0:
         return "hosts of namespaces need Linux and root"
     for tool in _TOOLS:
@@ -46,9 +46,9 @@ class Way:
     """One direction of a cable.
 
     Attributes:
-        cut: nothing comes through.
-        delay: seconds that each packet takes.
-        loss: share of packets that are lost.
+        cut: Whether all packets are dropped.
+        delay: Delay of each packet in seconds.
+        loss: Fraction of packets that are lost.
     """
 
     cut: bool = False
@@ -58,19 +58,19 @@ class Way:
 
 @dataclass
 class Cable:
-    """Between a host and the switch."""
+    """Cable between a host and the switch."""
 
     to_host: Way = field(default_factory=Way)
     from_host: Way = field(default_factory=Way)
 
     def mend(self) -> None:
-        """As new, in both directions."""
+        """Restore both directions."""
         for way in (self.to_host, self.from_host):
             way.cut, way.delay, way.loss = False, 0.0, 0.0
 
 
 class Carrier(threading.Thread):
-    """Carries the packets of all cables."""
+    """Thread that forwards the packets of all cables."""
 
     def __init__(self) -> None:
         super().__init__(name="cables", daemon=True)
@@ -82,12 +82,12 @@ class Carrier(threading.Thread):
         self._ended = threading.Event()
 
     def add(self, source: int, way: Way, target: int) -> None:
-        """Carry from a device's descriptor to another's."""
+        """Forward packets from one device's descriptor to another's."""
         with self._lock:
             self._selector.register(source, selectors.EVENT_READ, (way, target))
 
     def remove(self, *descriptors: int) -> None:
-        """Carry no more of these."""
+        """Stop forwarding for these descriptors."""
         with self._lock:
             for each in descriptors:
                 self._drop(each)
@@ -95,12 +95,12 @@ class Carrier(threading.Thread):
             heapq.heapify(self._late)
 
     def end(self) -> None:
-        """Stop carrying."""
+        """Stop the thread."""
         self._ended.set()
         self.join()
 
     def run(self) -> None:
-        """Until `end`."""
+        """Forward packets until `end` is called."""
         while not self._ended.is_set():
             wait = min(0.05, max(0.0, self._late[0][0] - time.monotonic())) if self._late else 0.05
             ready = self._selector.select(wait)
@@ -135,22 +135,22 @@ class Carrier(threading.Thread):
 
     @staticmethod
     def _write(target: int, packet: bytes) -> None:
-        with contextlib.suppress(OSError):  # a full queue drops packets, as a switch does; a device may be gone
+        with contextlib.suppress(OSError):  # a full queue drops packets, as in a switch; a device may be gone
             os.write(target, packet)
 
 
 class Network:
-    """A switch with hosts, on the first of `_NETWORKS` that is free; this machine itself is at `gateway`.
+    """Switch with hosts, on the first free one of `_NETWORKS`; this machine has the address `gateway`.
 
-    A context manager that leaves nothing behind. What one that was killed has left is passed over: two networks on a
-    machine do not disturb each other.
+    It is a context manager that leaves nothing behind. Leftovers of a killed one are skipped, and two networks on one
+    machine do not interfere.
 
     Args:
-        folder: new, for logs and the hosts' disks.
+        folder: New folder for logs and the hosts' disks.
 
     Attributes:
-        prefix: the first three numbers of all addresses, once entered.
-        name: of the switch; names of devices begin with it.
+        prefix: First three numbers of all addresses, once entered.
+        name: Name of the switch, and prefix of the devices' names.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -177,7 +177,7 @@ class Network:
         _ip("link", "delete", self.name, check=False)
 
     def _take(self) -> None:
-        """A switch of a name that no other has: making it is what takes its network."""
+        """Create a switch with an unused name, which reserves its network."""
         for number in _NETWORKS:
             self.prefix, self.name = f"10.77.{number}", f"sgsst{number}"
             made = subprocess.run(["ip", "link", "add", self.name, "type", "bridge"], capture_output=True, text=True)
@@ -188,7 +188,7 @@ class Network:
         )
 
     def host(self, name: str, number: int, disk_bytes: int = 1 << 30) -> Host:
-        """A new host, which runs."""
+        """Create and start a host."""
         host = Host(self, name, f"{self.prefix}.{number}", disk_bytes)
         self.hosts[name] = host
         host.start()
@@ -196,11 +196,11 @@ class Network:
 
 
 class Host:
-    """A host: what it runs (`run`) is started again whenever it ends, until the host is killed.
+    """Simulated host. Its services (`run`) are restarted whenever they end, until the host is killed.
 
     Attributes:
-        disk: its own, in memory: empty after each start.
-        log: what its services say, over all its lives.
+        disk: Its disk, in memory and empty after each start.
+        log: Log of its services, across restarts.
     """
 
     def __init__(self, network: Network, name: str, address: str, disk_bytes: int) -> None:
@@ -216,13 +216,13 @@ class Host:
 
     @property
     def runs(self) -> bool:
-        """Whether it has been started and not killed."""
+        """Whether it is running."""
         return self._first is not None
 
     def start(self) -> None:
-        """Switch it on: nothing runs on it yet, its disk is empty."""
+        """Start the host, with an empty disk and no services."""
         self.disk.mkdir(parents=True, exist_ok=True)
-        _ip("netns", "delete", self._space, check=False)  # its file outlives a machine whose /run is on a disk
+        _ip("netns", "delete", self._space, check=False)  # its file survives a reboot if /run is on a disk
         _ip("netns", "add", self._space)
         self._plug_in()
         made = f"hostname {self.name}; mount -t tmpfs -o size={self._disk_bytes} tmpfs {self.disk}; exec sleep infinity"
@@ -236,7 +236,7 @@ class Host:
             time.sleep(0.05)
 
     def kill(self) -> None:
-        """Off: all its processes at once, and its disk."""
+        """Kill all processes of the host at once, and delete its disk."""
         if self._first is None:
             return
         self._first.send_signal(signal.SIGKILL)
@@ -253,11 +253,11 @@ class Host:
         _ip("netns", "delete", self._space, check=False)
 
     def call(self, *command: str) -> subprocess.CompletedProcess[bytes]:
-        """A command on it, waited for."""
+        """Run a command on the host and wait for it."""
         return subprocess.run([*self._enter(), *command], capture_output=True, check=False)
 
     def run(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
-        """A service on it: started again a second after it has ended, as a supervisor of services does."""
+        """Run a service on the host, restarted a second after it ends, as by a supervisor."""
         again = 'while true; do "$@"; sleep 1; done'
         with self.log.open("ab") as log:
             self._services.append(
@@ -272,7 +272,7 @@ class Host:
             )
 
     def _enter(self) -> list[str]:
-        """What a command on this machine begins with, to run on the host."""
+        """Return the prefix that makes a command run on the host."""
         assert self._first is not None
         children = Path(f"/proc/{self._first.pid}/task/{self._first.pid}/children")
         deadline = time.monotonic() + 10
@@ -281,7 +281,7 @@ class Host:
         return ["nsenter", "-t", found[0], "-n", "-u", "-p", "-m", f"--wd={Path.cwd()}"]
 
     def _plug_in(self) -> None:
-        """Lay the cable: a device in the host's network, and one at the switch."""
+        """Connect the host: create a device in its network and one at the switch."""
         own, other = f"{self._space}-h"[:15], f"{self._space}-s"[:15]
         host, switch = _tap(own), _tap(other)
         self._descriptors = (host, switch)
@@ -297,7 +297,7 @@ class Host:
 
 
 def _tap(name: str) -> int:
-    """Descriptor of a new TAP device, which goes when it is closed."""
+    """Create a TAP device and return its descriptor; closing it removes the device."""
     descriptor = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     fcntl.ioctl(descriptor, _TUNSETIFF, struct.pack("16sH", name.encode(), _TAP_WITHOUT_HEADER))
     return descriptor

@@ -1,11 +1,11 @@
-"""One iteration's rasterizing in phase 1, at full size and with the kept coarse operator, as ratios within one run.
+"""Rasterization time of a phase 1 step, at full size and with the cached coarse operator, as ratios within one run.
 
     python -m benchmarks.coarse point_cloud.ply [--cameras cameras.json] [--side 1280] [--scales 1 2] [--repeats 9]
 
-All make the image at a scale and one color gradient from there: `cpu` and `cached` with the box average and its
-adjoint around them, `coarse` without. They take turns on the same view, and a figure is the fastest of its turns, the
-one least disturbed by whatever else the machine was doing. What depends on the geometry alone is prepared before; what
-`coarse` prepares beyond tile lists, its operator, is timed with the first image from it.
+Each method computes the image at a scale and one color gradient from there: `cpu` and `cached` through the box average
+and its adjoint, `coarse` directly. They take turns on the same view, and the fastest turn counts, because other
+programs disturbed it least. Geometry is prepared in advance. Beyond tile intersections, `coarse` prepares its operator;
+this is timed with the first image that uses it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 
 def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camera: Camera, scale: int) -> None:
-    """Image at a scale and the gradient from there, by way of the whole view."""
+    """Compute the image at a scale and the gradient from there, through the full-size view."""
     downscale(rasterizer.render(colors, camera), scale)
     whole = torch.zeros((camera.height, camera.width, 3))
     add_upscaled_(whole, gradient, scale)
@@ -42,7 +42,7 @@ def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camer
 
 
 def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str, Any]:
-    """Fastest seconds of each way, what the operator costs, and the ratios, on one view."""
+    """Return the fastest seconds of each method, the cost of the operator, and the ratios, on one view."""
     colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
     gradient = torch.randn(camera.height >> scale, camera.width >> scale, 3, generator=torch.Generator().manual_seed(1))
     cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
@@ -59,7 +59,7 @@ def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str,
     }
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     builds: list[float] = []
-    for way in ways.values():  # compiles, lists, kept weights
+    for way in ways.values():  # compilation, intersections, cached weights
         way()
     for _ in range(repeats):
         for name, way in ways.items():

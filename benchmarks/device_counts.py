@@ -1,11 +1,11 @@
-"""Count what a step asks of a GPU, on a pretend one: kernels, waits of the host, bytes copied, line by line.
+"""Count a step's GPU kernels, host synchronizations and copied bytes on a simulated GPU, line by line.
 
     python -m benchmarks.device_counts [--size 980x545] [--name device_counts]
 
-VGG19's layers with random weights, three scales, a scene without a surround and a scan, whose statistics are weighted.
-Kernels are those that PyTorch's operations launch one by one; a library may take a few more for one of them. Steps are
-made of a small view, because Triton's interpreter takes minutes to render a large one. What depends on the size could
-only be the loss: it is counted for the given size, too.
+The network has VGG19's layers with random weights, and there are three scales. One scene fills its views; the other is
+an object scan, whose statistics are weighted. Kernels are those that PyTorch's operations launch one by one; a library
+may launch a few more for one of them. Steps use a small view, because Triton's interpreter takes minutes to render a
+large one. Only the loss could depend on the size, so it is counted for the given size too.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall
 
-#: Of the view that steps are made of.
+#: Size of the view that steps use.
 SMALL = (64, 64)
 
 
 def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str, Any]:
-    """Counts of the first step of a view, of a later one, and of the loss of a small and a large view."""
+    """Count the first step of a view, a later one, and the loss of a small and a large view."""
     settings = make_settings(
         steps_coarse=0,
         steps_sos=2,
@@ -45,9 +45,9 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
     )
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
     with pretend_cuda() as counts:
-        weights = comparing_pixels(tiny_weights("vgg19"))  # as `even` has them
+        weights = comparing_pixels(tiny_weights("vgg19"))  # as with feature scale `even`
         plan, planning_context = make_plan(scene, cameras(1, *SMALL), settings, weights=weights)
-        plan = replace(plan, precision=precision)  # however fast this processor computes it
+        plan = replace(plan, precision=precision)  # whatever is fastest on this processor
         kept = planning_context if plan.precision == planning_context.network.precision else None
         stylizer = Stylizer(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, planning_context=kept)
         steps = []
@@ -70,7 +70,7 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
 
 
 def launches_of(loss: SosLoss, counts: Counts, size: tuple[int, int], scan: bool) -> int:
-    """Of the loss of a view (height, width) in three scales, and its gradient."""
+    """Count the launches of the loss, with gradient, of a view (height, width) in three scales."""
     assert loss.scale_count(*size) == 3
     image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0)).to("cuda")
     view = loss.view_target(image.flip(0), image[..., 0] if scan else None)
@@ -81,7 +81,7 @@ def launches_of(loss: SosLoss, counts: Counts, size: tuple[int, int], scan: bool
 
 
 def totals(counts: Counts) -> dict[str, int]:
-    """Of all lines."""
+    """Return the totals over all lines."""
     return {kind: getattr(counts, kind).total() for kind in ("launches", "waits", "copies")}
 
 

@@ -1,12 +1,12 @@
-"""Settings compared after the same steps, judged by a network that no run optimizes, on views between the cameras.
+"""Comparison of settings after the same number of steps, on novel views, by a network that no run optimizes.
 
 python -m benchmarks.equal_steps SCENE CAMERAS|orbit:N STYLE NAME 'ROW={"content_weight": 3000}' 'ROW=...'
 
-Every row has settings on top of the standard preset's, in JSON; `factor` scales all features of VGG16 by a number (1
-leaves them as the network comes), or each layer's by its own ({"relu1_1": 16, "relu2_1": 8}; later ones follow). Rows
-are added to benchmarks/results/equal_steps.json, under NAME; with more seeds they are means, and "spread" is the
-largest difference between two seeds. "sliced" is a distance of palettes that no term of a loss and no start is made
-of: how far pixels' colors are from the style's as whole distributions, in levels of 8 bits (sliced Wasserstein).
+Every row has settings in JSON that override the standard preset. `factor` scales all features of VGG16 by a number (1
+leaves the network as it is), or each layer by its own ({"relu1_1": 16, "relu2_1": 8}; later layers follow). Rows are
+added to benchmarks/results/equal_steps.json, under NAME. With several seeds, figures are means, and "spread" is the
+largest difference between two seeds. "sliced" is a color distance that neither a loss nor a start optimizes: the sliced
+Wasserstein distance of the pixels' colors from the style's, in 8-bit levels.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from sgsst_core.report.contact_sheet import write_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Views on the sheet.
+#: Number of views on the sheet.
 SHOWN = 3
 COLUMNS = ("style", "color_distance", "sliced", "content", "features", "background_sensitivity", "saturated", "seconds")
-#: Directions of color, and quantiles along each, that distributions are compared by.
+#: Number of color directions, and of quantiles along each, in the sliced distance.
 DIRECTIONS, QUANTILES = 64, 1024
 
 
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
-    """Of all views between those of a job."""
+    """Make a judge of all views between those of a job."""
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
     novel_views = novel_view_names(stylizer)
     views = [novel_views.cameras[index] for index in novel_views.views]
@@ -96,10 +96,11 @@ def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[st
 
 
 def sliced_distance(pictures: list[torch.Tensor], palette: torch.Tensor) -> float:
-    """Sliced Wasserstein distance, of order 2, of a view's covered pixels from a palette, in levels.
+    """Return the sliced Wasserstein distance, of order 2, of a view's covered pixels from a palette, in 8-bit levels.
 
     Args:
-        pictures: of the view [h, w, 3], on black and on white.
+        pictures: Renders of the view [h, w, 3], on black and on white.
+        palette: Quantiles of the style's colors.
     """
     on_black, on_white = pictures
     coverage = (1 - (on_white - on_black).mean(-1)).clamp(0, 1)
@@ -107,7 +108,7 @@ def sliced_distance(pictures: list[torch.Tensor], palette: torch.Tensor) -> floa
 
 
 def quantiles(picture: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """[QUANTILES, DIRECTIONS] along each direction, of a picture [h, w, 3] whose pixels count by weights [h, w]."""
+    """Return the quantiles [QUANTILES, DIRECTIONS] of an image [h, w, 3] with pixel weights [h, w]."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn((3, DIRECTIONS), generator=generator).double(), dim=0)
     ordered, order = (picture.reshape(-1, 3).double() @ directions).sort(dim=0)
@@ -120,7 +121,7 @@ def quantiles(picture: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
 def _run(
     scene: Scene, cameras: list[Camera], style: torch.Tensor, values: dict[str, Any]
 ) -> tuple[torch.Tensor, float]:
-    """Colors [N, 3], and processor seconds of the steps."""
+    """Run a job. Returns its colors [N, 3] and the processor seconds of the steps."""
     weights = _weights(values.pop("factor", None))
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **values), weights=weights)
     before = time.process_time()
@@ -140,7 +141,7 @@ def _weights(factor: float | dict[str, float] | None) -> BackboneWeights:
 
 
 def _mean(found: list[dict[str, float]]) -> dict[str, Any]:
-    """Of several seeds."""
+    """Return the mean over seeds."""
     mean: dict[str, Any] = {name: sum(row[name] for row in found) / len(found) for name in found[0]}
     mean["seeds"] = len(found)
     if len(found) > 1:
@@ -154,7 +155,7 @@ def _print(name: str, row: dict[str, Any]) -> None:
 
 
 def _store(arguments: argparse.Namespace, rows: dict[str, Any]) -> None:
-    """Add the rows of a pair to those that are there."""
+    """Add rows to the stored ones of the pair."""
     path = RESULTS / "equal_steps.json"
     pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
     told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
@@ -166,7 +167,7 @@ def _store(arguments: argparse.Namespace, rows: dict[str, Any]) -> None:
 
 
 def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
-    """A row of views for each of the ways."""
+    """Write the colors, and a sheet with a row of views per setting."""
     folder.mkdir(parents=True, exist_ok=True)
     rows = [(way, [judge.pictures(sh_dc, view)[0] for view in judge.cameras[:SHOWN]]) for way, sh_dc in colors.items()]
     write_rows(folder / f"{name}.jpg", style, rows)

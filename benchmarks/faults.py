@@ -1,10 +1,10 @@
-"""Kill ranks, Ray and the driver at random moments of small jobs, and see what it costs and what comes out.
+"""Random kills of ranks, Ray and the driver in small jobs: what each fault costs, and whether results stay correct.
 
 python -m benchmarks.faults [--faults 33] [--drivers 3] [--seed 0]
 
-Jobs of two ranks on this machine; faults follow each other within a job, one an attempt. Results go to
-benchmarks/results/faults.json: for each fault what happened, steps lost, and seconds from the fault to the first step
-after it; for each job its loss against that of an undisturbed one.
+Jobs run on two ranks on this machine, with one fault per attempt and several attempts per job. Results go to
+benchmarks/results/faults.json: for each fault its kind, the steps lost, and the seconds until the first step after it;
+for each job its loss against that of an undisturbed one.
 """
 
 from __future__ import annotations
@@ -36,41 +36,42 @@ from worker.ranks.listener import Listener
 from worker.request import StylizeRequest
 
 STEPS = 250
-#: Faults of one job: an attempt makes some dozen steps before its fault.
+#: Faults per job; an attempt makes some dozen steps before its fault.
 FAULTS_A_JOB = 9
 CHECKPOINT_SECONDS, RANK_TIMEOUT = 0.5, 5.0
-#: Of every ten faults: ranks that are stopped instead of killed, and Ray's own processes.
+#: Out of ten faults: number of ranks that are stopped instead of killed, and of kills of Ray's own processes.
 STOPPED, DAEMONS = 2, 1
 
 
 @dataclass(frozen=True)
 class DaemonFault:
-    """One of Ray's own processes is killed after so many reports of progress."""
+    """Kill of one of Ray's own processes after a number of progress reports."""
 
     daemon: str
     reports: int
 
 
 def random_faults(chance: random.Random) -> Iterator[Fault | DaemonFault]:
-    """Every place in turn, everything else by chance."""
+    """Yield random faults that cycle through all places in the code where one can happen."""
     for number, place in enumerate(itertools.cycle(get_args(Place))):
         if number % 10 < DAEMONS:
             yield DaemonFault(chance.choice(["raylet", "gcs_server"]), chance.randint(3, 12))
             continue
         what: Literal["SIGKILL", "SIGSTOP"] = "SIGSTOP" if chance.random() < STOPPED / 10 else "SIGKILL"
         rank = 0 if place == "checkpoint" else chance.randint(0, 1)
-        # Checkpoints are written twice a second, and values are gathered only while a job is prepared.
+        # Checkpoints are written twice a second, and values are gathered only during preparation.
         call = chance.randint(*{"checkpoint": (2, 5), "all_gather": (2, 8)}.get(place, (20, 60)))
-        # Half of them at once, half in the middle of what takes some milliseconds.
+        # Half of the faults happen immediately, the others during an operation that takes some milliseconds.
         yield Fault(rank, place, call, what, chance.choice([0.0, chance.uniform(0, 0.005)]))
 
 
 class Chaos:
-    """Lets faults happen to a job, one in each attempt, and writes down what becomes of it.
+    """Injector of faults into a job, one per attempt, that records their effects.
 
     Args:
-        request: the job.
-        faults: to take from; one that has not happened when the job ends goes back to the end.
+        request: Job.
+        cluster: Ray cluster that runs it.
+        faults: Queue of faults; one that has not happened when the job ends is returned to it.
     """
 
     def __init__(self, request: StylizeRequest, cluster: Cluster, faults: list[Fault | DaemonFault]) -> None:
@@ -79,19 +80,19 @@ class Chaos:
         self._faults = faults
         self._current: Fault | DaemonFault | None = None
         self._reports = 0
-        self._at: float | None = None  # when the current one happened, seconds since the epoch
+        self._at: float | None = None  # time of the current fault, in seconds since the epoch
         self.found: list[dict[str, Any]] = []
         self._arm()
 
     def run(self) -> RanksResult:
-        """The job to its end."""
+        """Run the job to its end."""
         options = WorkerOptions(RANK_TIMEOUT, CHECKPOINT_SECONDS, actor=FaultyRank)
         listener = Listener(progress=self._progress, happened=self._happened)
         ended = stylize_on_ranks(self._request, 2, listener, options=options, cluster=self._cluster)
         if self._current is not None:
             self._faults.append(self._current)
         for entry, attempt in zip(self.found, ended.attempts, strict=True):
-            entry.pop("at", None)  # of one that was followed by the next before anything ran again
+            entry.pop("at", None)  # only left if the next fault came before anything ran again
             entry |= {
                 "reason": attempt.reason,
                 "steps_lost": attempt.last_step - attempt.saved_step,
@@ -120,7 +121,7 @@ class Chaos:
         if isinstance(self._current, Fault):
             at = fired(self._request)
             self._at = None if at is None else at + self._current.delay
-        if self._current is None or self._at is None:  # a busy machine: a rank that was only slow to answer
+        if self._current is None or self._at is None:  # no fault: a rank that was slow to answer on a busy machine
             self.found.append({"fault": {"what": "none"}, "at": time.time()})
             return
         self.found.append({"fault": asdict(self._current), "at": self._at})
@@ -129,7 +130,7 @@ class Chaos:
 
 
 def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
-    """Kill the command itself after a random time; then let the same command go on, where something was saved."""
+    """Kill the command itself after a random time, then run it again, resumed if there is a checkpoint."""
     request = small_request(folder, STEPS)
     source = request.source
     arguments = ["stylize", str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
@@ -149,7 +150,7 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
     process.wait()
     _, alive = psutil.wait_procs(family, timeout=30)
     seconds = time.monotonic() - started
-    time.sleep(2)  # the folder goes last
+    time.sleep(2)  # the folder is deleted last
     saved = request.out.with_name("s.checkpoint.safetensors").exists()
     again = subprocess.run([*command, *(["--resume"] if saved else [])], capture_output=True, text=True)
     return {

@@ -1,11 +1,12 @@
-"""A fleet in simulation: the service's own queue, turns, leases and packing under a clock of its own.
+"""Simulation of a fleet with the service's own queue, fairness, leases and packing, under a simulated clock.
 
 python -m benchmarks.fleet [--gpus 1000] [--hours 6] [--load 0.9]
 python -m benchmarks.fleet --database [--queued 10000]
 
-How much of its GPUs a fleet uses, how long jobs wait by size and by key, what failing hosts cost. `--database` measures
-what one PostgreSQL takes instead, with real dispatchers' statements and a long queue. What is made up: the jobs
-(`benchmarks.fleet_parts.demand`), and that time passes; see `benchmarks.fleet_parts.simulation`.
+It shows how well a fleet uses its GPUs, how long jobs wait by size and by key, and what failing hosts cost. With
+`--database` it measures the load on one PostgreSQL server instead, with real dispatchers' statements and a long queue.
+Only the jobs (`benchmarks.fleet_parts.demand`) and the passing of time are simulated; see
+`benchmarks.fleet_parts.simulation`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _GPUS_EACH = 8
 
 
 def simulate(demand: Demand, hours: float, host_days: float, seed: int, patience: float = math.inf) -> dict[str, Any]:
-    """Figures of a fleet of hosts of eight GPUs; the first quarter of the hours fills it."""
+    """Return the figures of a fleet with eight GPUs per host; the first quarter of the hours is warm-up."""
     seconds = hours * 3600
     started = time.perf_counter()
     with tempfile.TemporaryDirectory(dir=_MEMORY if _MEMORY.is_dir() else None, prefix="sgsst-fleet-") as folder:
@@ -52,7 +53,7 @@ def simulate(demand: Demand, hours: float, host_days: float, seed: int, patience
 
 
 def _stored() -> dict[str, Any]:
-    """What earlier runs have found, but for the machine, which is described anew."""
+    """Return the results of earlier runs, without their machine, which every run describes itself."""
     path = RESULTS / "fleet.json"
     known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return {name: known[name] for name in ("simulated", "database") if name in known}

@@ -1,10 +1,11 @@
-"""Forecast of a step on one H200, from counted operations, bytes and launches, to hold a measurement against.
+"""Forecast of a step on one H200 from counted operations, bytes and launches, for comparison with measurements.
 
 python -m benchmarks.forecast [--launches 494]
 
-Nothing here is measured on a GPU: peaks are the data sheet's, and how much of them is reached are the `SHARES` below.
-The feature network, the image pyramid, colors and the content loss are counted by running the project's own code on
-tensors without values; Triton's kernels from their source; the rasterizer from pairs of Gaussian and raster tile.
+Nothing here is measured on a GPU: peaks come from the data sheet, and `SHARES` below assumes how much of them is
+reached. Feature network, image pyramid, colors and content loss are counted by running the project's own code on
+tensors without values; Triton's kernels are counted from their source, and the rasterizer from pairs of Gaussian and
+raster tile.
 """
 
 from __future__ import annotations
@@ -34,37 +35,39 @@ from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings
 
-#: H200 SXM, data sheet, dense: operations a second by what is multiplied, bytes a second, bytes of memory and of L2.
+#: Peaks of the H200 SXM from the data sheet, dense: operations per second by precision, bytes per second, bytes of
+#: memory and of L2.
 PEAKS = {"bfloat16": 989e12, "tf32": 495e12, "float32": 67e12}
 BANDWIDTH, MEMORY, L2 = 4.8e12, 141e9, 50e6
-#: Instructions of single threads a second: a float32 operation of the data sheet is half a fused multiply-add.
+#: Instructions of single threads per second: the data sheet counts a fused multiply-add as two float32 operations.
 LANES = PEAKS["float32"] / 2
 PRECISIONS = ("float32", "tf32", "bfloat16")
-#: Launches of a step in which all that is kept of a view is there: a scan's in bfloat16, as `device_counts` has them.
+#: Launches of a step on a fully cached view: an object scan in bfloat16, as counted by `device_counts`.
 LAUNCHES = 494
-#: Of a view's lists of raster tiles: two sorts in passes, a sum in passes, kernels and copies.
+#: Launches to compute a view's tile intersections: two sorts in passes, a sum in passes, kernels and copies.
 LIST_LAUNCHES = 40
-#: Instructions a pixel of a pair of Gaussian and raster tile, as the source of `blend_weights` and of its callers has
-#: them: about 30 for the weight, with two functions of a quarter of the rate or less, the rest for three colors.
+#: Instructions per pixel for a pair of Gaussian and raster tile, from the source of `blend_weights` and its callers:
+#: about 30 for the weight, including two functions at a quarter of the rate or less, and the rest for three colors.
 PIXEL_INSTRUCTIONS = 45
-#: Visible Gaussians, and pairs each: half of a scene; as the biker's 152,605 at widths of 980 and 5187, most of which
-#: are a few pixels wide, as those of large scenes are. (The plush toy's, which are larger: 12.8 and 236.)
+#: Fraction of the scene's Gaussians that are visible. The pairs per Gaussian in `JOBS` are those of the biker's 152,605
+#: Gaussians at widths of 980 and 5187; most are a few pixels wide, as in large scenes. (The plush toy's are larger:
+#: 12.8 and 236 pairs.)
 VISIBLE_SHARE = 0.5
-#: Bytes that lists keep: of a visible Gaussian, and of a pair.
+#: Bytes of tile intersections per visible Gaussian, and per pair.
 LIST_BYTES = (80, 8)
 
 
 @dataclass(frozen=True)
 class Shares:
-    """How much of the peaks is reached.
+    """Fractions of the peaks that are reached.
 
     Attributes:
-        convolution: by precision, of `PEAKS`.
-        matrix: of the same, by Triton's products of features, in TF32 or float32 ("ieee").
-        bandwidth: of memory.
-        lanes: of `LANES`, by the rasterizer.
-        blended: of the pairs of Gaussian and tile, those that come before the tile is opaque.
-        launch: seconds of the host for each launch.
+        convolution: Fraction of `PEAKS` for convolutions, by precision.
+        matrix: Fraction of `PEAKS` for Triton's feature products, in TF32 or float32 ("ieee").
+        bandwidth: Fraction of the memory bandwidth.
+        lanes: Fraction of `LANES` for the rasterizer.
+        blended: Fraction of the pairs of Gaussian and tile that come before the tile is opaque.
+        launch: Seconds of the host per launch.
     """
 
     convolution: Mapping[str, float]
@@ -75,7 +78,7 @@ class Shares:
     launch: float
 
     def rates(self, precision: str) -> dict[str, float]:
-        """Operations and bytes a second, for `Work.seconds`."""
+        """Return operations and bytes per second, for `Work.seconds`."""
         product = matrix_precision(torch.bfloat16 if precision == "bfloat16" else torch.float32)
         return {
             "convolution": PEAKS[precision] * self.convolution[precision],
@@ -99,13 +102,13 @@ SHARES = {
 
 @dataclass(frozen=True)
 class Job:
-    """A scene and its views.
+    """Scene and its views.
 
     Attributes:
         size: (height, width) of every view.
-        gaussians: in the scene, SH of degree 3.
-        pairs_each: raster tiles that a visible Gaussian touches.
-        views: of the job.
+        gaussians: Number of Gaussians in the scene, with SH of degree 3.
+        pairs_each: Number of raster tiles that a visible Gaussian touches.
+        views: Number of views.
     """
 
     size: Size
@@ -115,16 +118,17 @@ class Job:
 
     @property
     def visible(self) -> float:
-        """Gaussians that a view shows."""
+        """Number of Gaussians in a view."""
         return VISIBLE_SHARE * self.gaussians
 
     @property
     def pairs(self) -> float:
-        """Of Gaussian and raster tile, in a view."""
+        """Number of pairs of Gaussian and raster tile in a view."""
         return self.pairs_each * self.visible
 
 
-#: A scene of Tanks and Temples, and the garden of Mip-NeRF 360 at its full size: 25.5 hours on an A100 in the paper.
+#: A scene of Tanks and Temples, and the garden of Mip-NeRF 360 at full size, which took 25.5 hours on an A100 in the
+#: paper.
 JOBS = {
     "980x545": Job((545, 980), 2_500_000, 2.5, 250),
     "5187x3361": Job((3361, 5187), 5_800_000, 15.0, 185),
@@ -133,7 +137,7 @@ JOBS = {
 
 @dataclass(frozen=True)
 class Part:
-    """Of a step: its launches, how many of them the host's count of `LAUNCHES` lacks, and how often a step has it."""
+    """Part of a step: its launches, how often a step has it, and how many launches are not included in `LAUNCHES`."""
 
     works: Sequence[Work]
     visits: float = 1.0
@@ -141,7 +145,7 @@ class Part:
 
 
 def shapes_of(name: str) -> BackboneWeights:
-    """A network's weights, of which only the shapes are there."""
+    """Return a network's weights as shapes without values."""
     layers, channels = {}, 3
     for block, count in enumerate(BLOCKS[name], start=1):
         for index in range(1, count + 1):
@@ -152,19 +156,19 @@ def shapes_of(name: str) -> BackboneWeights:
 
 
 def make_loss(precision: str) -> SosLoss:
-    """The loss of VGG19 with the memory that a job has on the device."""
+    """Return the loss of VGG19 with the memory budget of a job on the device."""
     dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
     network = FeatureNetwork(shapes_of("vgg19"), dtype=dtype, device="meta", tf32=precision == "tf32")
     return SosLoss(network, memory=int(memory_limit() * MEMORY_SHARES["activations"]))
 
 
 def memory_limit() -> float:
-    """Bytes that a job plans with (`budget.default_memory_limit`)."""
+    """Return the bytes that a job plans with (`budget.default_memory_limit`)."""
     return GPU_SHARE * MEMORY
 
 
 class Passes:
-    """The parts of the loss of some scales of a view."""
+    """Parts of the loss of a view on some scales."""
 
     def __init__(self, loss: SosLoss, size: Size, scales: Sequence[int]) -> None:
         self.loss, self.size = loss, size
@@ -174,7 +178,7 @@ class Passes:
         self.kept = loss.tiling.kept([tile.outer.pixels for tile, _ in self.tiles])
 
     def network(self) -> tuple[list[Work], list[Work]]:
-        """Forward; and backward with what has to go forward once more, because its activations do not fit."""
+        """Return the work of the forward pass, and of the backward pass including recomputed activations."""
         forward, backward = [], []
         for (tile, _), kept in zip(self.tiles, self.kept, strict=True):
             outer = tile.outer
@@ -187,7 +191,7 @@ class Passes:
         return forward, backward
 
     def style(self) -> tuple[list[Work], list[Work]]:
-        """Statistics and comparison; and the gradient."""
+        """Return the work of the statistics and their comparison, and of the style gradient."""
         size = self.loss.network.dtype.itemsize
         pieces = [
             (self.loss.network.channels(layer), _cells(layer, tile, scaled))
@@ -197,7 +201,7 @@ class Passes:
         return [statistics(*piece, size) for piece in pieces], [style_gradient(*piece, size) for piece in pieces]
 
     def content(self) -> list[Work]:
-        """Of features that are there: loss and gradient."""
+        """Return the work of the content loss and gradient, given the features."""
         channels, dtype = self.loss.network.channels(CONTENT_LAYER), self.loss.network.dtype
         works: list[Work] = []
         for tile, scaled in self.tiles:
@@ -211,14 +215,14 @@ class Passes:
         return works
 
     def scaled(self) -> list[Work]:
-        """The scales of an image."""
+        """Return the work of downscaling an image to all scales."""
         with Counted() as counted:
             for scale in self.sizes:
                 downscale(meta(*self.size, 3), scale)
         return counted.works
 
     def added_up(self) -> list[Work]:
-        """The scales' gradients, as one of the image."""
+        """Return the work of adding the scales' gradients to that of the image."""
         with Counted() as counted:
             for scale, scaled in self.sizes.items():
                 add_upscaled_(meta(*self.size, 3), meta(*scaled, 3), scale)
@@ -230,17 +234,17 @@ def _cells(layer: str, tile: PartitionTile, size: Size) -> int:
 
 
 def statistics(channels: int, positions: int, size: int) -> Work:
-    """`fused_kernels.shifted_moments` and what follows it.
+    """Return the work of `fused_kernels.shifted_moments` and the kernels that follow it.
 
     Args:
-        channels: of the layer.
-        positions: cells.
-        size: bytes of a feature.
+        channels: Number of channels of the layer.
+        positions: Number of feature cells.
+        size: Bytes of a feature.
     """
     tiles = -(-channels // TILE)
     pairs = tiles * (tiles + 1) // 2
-    # Each pair of tiles reads both of them, those on the diagonal one; spans are walked first, so that a layer larger
-    # than the cache is read from memory every time.
+    # Each pair of tiles reads both, or one on the diagonal. Spans are the outer loop, so a layer larger than the cache
+    # is read from memory every time.
     reads = tiles if channels * positions * size > L2 else 1
     spans = -(-positions // (SPAN_VALUES // channels))
     moved = reads * channels * positions * size + 2 * spans * channels**2 * 4
@@ -248,20 +252,26 @@ def statistics(channels: int, positions: int, size: int) -> Work:
 
 
 def style_gradient(channels: int, positions: int, size: int) -> Work:
-    """`fused_kernels.add_style_gradient`: every tile of channels reads all features, and its own gradient twice."""
+    """Return the work of `fused_kernels.add_style_gradient`.
+
+    Every tile of channels reads all features; its own gradient is read and written.
+    """
     tiles = -(-channels // TILE)
     reads = tiles if channels * positions * size > L2 else 1
     return Work(2.0 * channels**2 * positions, (reads + 2.0) * channels * positions * size, "matrix")
 
 
 def render(job: Job) -> list[Work]:
-    """Of kept lists: rank, eight float64 and a color for each pair; image and transmittance."""
+    """Return the work of a render with cached tile intersections.
+
+    Each pair reads its rank, eight float64 values and a color; each pixel writes its color and transmittance.
+    """
     pixels = job.size[0] * job.size[1]
     return [Work(_blending(job), job.pairs * (4 + 64 + 8 + 12) + 16 * pixels, "lanes")]
 
 
 def raster_gradient(job: Job) -> list[Work]:
-    """Slots, cleared, written and added up; the gradient [N, 3]."""
+    """Return the work of clearing, writing and adding up the slots, and of the gradient [N, 3]."""
     pixels = job.size[0] * job.size[1]
     return [
         Work(_blending(job), job.pairs * (8 + 64 + 24) + 12 * pixels, "lanes"),
@@ -274,9 +284,10 @@ def _blending(job: Job) -> float:
 
 
 def lists(job: Job) -> list[Work]:
-    """Projection; a sort of 8-byte depths and one of 4-byte tiles, with 8-byte places, a byte of the key in each pass.
+    """Return the work to compute tile intersections.
 
-    Each pass reads and writes keys and places.
+    This is the projection, and two sorts with 8-byte indices: one of 8-byte depths, one of 4-byte tiles. A sort handles
+    one byte of the key per pass, and each pass reads and writes keys and indices.
     """
     depths, tiles = 8 * 2 * 16 * job.gaussians, 4 * 2 * 12 * job.pairs
     gathered = 40 * job.gaussians + 128 * job.visible + 36 * job.pairs
@@ -284,12 +295,12 @@ def lists(job: Job) -> list[Work]:
 
 
 def rest(job: Job) -> list[Work]:
-    """Colors' frozen part, from spherical harmonics of degree 3: every coefficient read once, in one launch."""
+    """Return the work for the frozen part of the colors (SH of degree 3): one launch, each coefficient read once."""
     return [Work(0, (15 * 12 + 12 + 12) * job.gaussians)]
 
 
 def colors(job: Job) -> list[Work]:
-    """Colors of a view whose frozen part is kept, and the way back; Adam: four tensors read, three written."""
+    """Return the work for a view's colors, their gradient, and Adam, which reads four tensors and writes three."""
     values = meta(job.gaussians, 3)
     with Counted() as counted:
         view_colors(values, values)
@@ -298,13 +309,13 @@ def colors(job: Job) -> list[Work]:
 
 
 def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kept: bool = False) -> dict[str, Part]:
-    """The parts of a step.
+    """Return the parts of a step.
 
     Args:
-        job: scene and views.
-        precision: of the feature network.
-        coarse: of phase 1, on the coarsest scale alone.
-        everything_kept: as if the memory held content features, lists and frozen colors of all views.
+        job: Scene and views.
+        precision: Precision of the feature network.
+        coarse: Whether the step is one of phase 1, on the coarsest scale alone.
+        everything_kept: Whether content features, intersections and frozen colors of all views are cached.
     """
     loss = make_loss(precision)
     count = loss.scale_count(*job.size)
@@ -333,7 +344,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
 
 
 def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
-    """Of the views, those whose content features, lists and frozen colors fit the memory (`Views`, `KeptLists`)."""
+    """Return the fractions of views whose content features, intersections and frozen colors fit the caches."""
     views = memory_limit() * MEMORY_SHARES["views"]
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
     count = loss.scale_count(*job.size)
@@ -350,7 +361,7 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
 
 
 def step_seconds(parts: Mapping[str, Part], shares: Shares, precision: str, launches: int) -> dict[str, float]:
-    """Seconds by part, of the device; of the host's launches; and of the whole: what takes longer."""
+    """Return the device's seconds by part, the host's, and the total, which is the larger of both sums."""
     rates = shares.rates(precision)
     seconds = {name: part.visits * sum(w.seconds(rates) for w in part.works) for name, part in parts.items()}
     host = shares.launch * (launches + sum(part.visits * part.more_launches for part in parts.values()))
@@ -358,7 +369,7 @@ def step_seconds(parts: Mapping[str, Part], shares: Shares, precision: str, laun
 
 
 def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
-    """Seconds of a step of each phase, with and without all kept, and hours of the paper's job, by scenario."""
+    """Return the seconds of a step by phase, with and without everything cached, and the hours of the paper's job."""
     kinds: dict[str, dict[str, bool]] = {
         "sos": {},
         "coarse": {"coarse": True},
@@ -386,7 +397,7 @@ def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
 
 
 def table(found: Mapping[str, Mapping[str, Any]]) -> str:
-    """Milliseconds of a step as Markdown, by precision: likely, and in brackets optimiztic and pessimistic."""
+    """Return the milliseconds of a step as Markdown, by precision: the likely value, with the range in parentheses."""
     lines = ["| part of a step, ms | " + " | ".join(found) + " |", "|---|" + "---:|" * len(found)]
     first = next(iter(found.values()))["sos"]["likely"]
 

@@ -1,4 +1,4 @@
-"""Where an iteration's time goes on a real scene at 1280x720: the share spent outside the feature network.
+"""Time of an iteration by part, on a real scene at 1280x720, and the fraction spent outside the feature network.
 
 python -m benchmarks.iteration SCENE.ply CAMERAS STYLE [--views 3] [--rounds 2]
 """

@@ -1,11 +1,11 @@
-"""Scenes of millions of Gaussians on the CPU: what reading, looking, rendering and unseen Gaussians take.
+"""Scenes of millions of Gaussians on the CPU: time and memory of reading, survey, rendering and unseen Gaussians.
 
     python -m benchmarks.large_scene [--millions 1 4 12] [--views 4] [--parts reading survey ...] [--write FOLDER]
 
-The plush scene is multiplied: each copy of a Gaussian is moved by up to its size, and scales are reduced so that the
-volume stays the same; where the data is not there, a generated scene takes its place. Seeded. Every size runs in a
-process of its own, for its peak of memory. Of what was made faster, the plain way runs in the same process, and the
-ratio is what counts: seconds depend on what else the machine does. `--write` keeps the scenes, for `sgsst` itself.
+The plush scene is multiplied: each copy of a Gaussian is moved by up to its size, and scales are reduced to keep the
+total volume. If the data is missing, a generated scene is used. Everything is seeded. Every size runs in a process of
+its own, so that its memory peak is its own. Optimized code is timed against a plain version in the same process; only
+the ratio counts, because seconds depend on what else the machine does. `--write` keeps the scenes for use with `sgsst`.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from sgsst_core.timing import Timer
 
 PARTS = ("reading", "harmonics", "survey", "first step", "unseen")
 _PLUSH = DATA / "snowmiku_plush"
-#: Gaussians on which the slow twin of spherical harmonics is timed.
+#: Number of Gaussians on which the slow reference of spherical harmonics is timed.
 _HARMONICS_SAMPLE = 200_000
-#: Larger side of the views of a job.
+#: Longer side in pixels of a job's views.
 _RESOLUTION = 990
 
 
 def multiplied(scene: Scene, count: int) -> Scene:
-    """So many Gaussians: copies of a scene's, each moved by up to its size, with the same volume together."""
+    """Return `count` Gaussians: copies of a scene's, each moved by up to its size, with the same total volume."""
     generator = torch.Generator().manual_seed(0)
     copies = -(-count // len(scene))
     many = scene.subset(torch.arange(len(scene)).repeat(copies)[:count])
@@ -62,7 +62,7 @@ def multiplied(scene: Scene, count: int) -> Scene:
 
 
 def small_scene() -> tuple[Scene, list[Camera], str]:
-    """What is multiplied, its cameras, and its name."""
+    """Return the scene to multiply, its cameras and its name."""
     if _PLUSH.is_dir():
         return read_scene(_PLUSH / "point_cloud.ply").scene, read_cameras(_PLUSH / "cameras.json"), "plush"
     scene = generated_scene(50_000)
@@ -72,12 +72,12 @@ def small_scene() -> tuple[Scene, list[Camera], str]:
 
 
 def middle(action: Callable[[Camera], object], cameras: list[Camera]) -> float:
-    """Median over the views of the seconds that one call takes."""
+    """Return the median over views of the seconds of one call."""
     return statistics.median(timed(lambda camera=camera: action(camera)) for camera in cameras)  # type: ignore[misc]
 
 
 def measure_harmonics(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """Spherical harmonics of a view, and how much faster than their slow twin they are, on a part of the scene."""
+    """Time the spherical harmonics of a view, and their speedup over the reference on part of the scene."""
     part = scene.subset(torch.arange(min(_HARMONICS_SAMPLE, len(scene))))
     rest_colors(part.sh_rest, part.means, cameras[0])  # compiles
     slow = middle(
@@ -89,14 +89,17 @@ def measure_harmonics(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """Lists of a view, on one thread and on all; coverage and gradient of ones against the one pass of a survey."""
+    """Time a view's tile intersections on one thread and on all, its renders and its survey.
+
+    The survey's single pass is compared with separate passes for coverage and gradient.
+    """
     CpuRasterizer(scene.subset(torch.arange(100))).survey(cameras[0])  # compiles
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     alone = middle(lambda camera: build_raster_lists(scene, camera), cameras)
     torch.set_num_threads(threads)
     lists = middle(lambda camera: build_raster_lists(scene, camera), cameras)
-    rasterizer = CpuRasterizer(scene, max_list_bytes=0)  # the last view's lists alone
+    rasterizer = CpuRasterizer(scene, max_list_bytes=0)  # caches the last view only
     places = torch.arange(len(scene), dtype=torch.int32)
     places[::8] = -1  # about as many as views do not see
     places[places >= 0] = torch.arange(int((places >= 0).sum()), dtype=torch.int32)
@@ -124,7 +127,7 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """Neighbors of what the views do not see; against a search on one core in the order of the file."""
+    """Time the neighbor search for unseen Gaussians, against one on a single core in file order."""
     rasterizer = CpuRasterizer(scene, max_list_bytes=0)
     weights = torch.zeros(len(scene), dtype=torch.float64)
     for camera in cameras:
@@ -141,7 +144,7 @@ def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """From a scene in memory to the end of the first step, in parts; the weights of a network are installed."""
+    """Time a job by part, from a scene in memory to the end of the first step; network weights are installed."""
     settings = make_settings(max_resolution=_RESOLUTION)
     timer, weights, style = Timer(), load_network_weights("auto"), soft_picture(512)
     plan, planning_context = make_plan(scene, cameras, settings, weights=weights, timer=timer)
@@ -153,7 +156,7 @@ def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_reading(scene: Scene, folder: Path | None) -> dict[str, float]:
-    """A scene's file; it stays in `folder` if there is one."""
+    """Time the reading of a scene's file, which is kept in `folder` if given."""
     with tempfile.TemporaryDirectory() as temporary:
         path = (folder or Path(temporary)) / f"{len(scene) / 1e6:g}m.ply"
         write_scene(path, scene)
@@ -161,7 +164,7 @@ def measure_reading(scene: Scene, folder: Path | None) -> dict[str, float]:
 
 
 def measure(count: int, views: int, parts: list[str], folder: Path | None) -> dict[str, float]:
-    """All figures of one size; `parts`: of PARTS."""
+    """Return all figures of one size; `parts` selects from PARTS."""
     small, cameras, _ = small_scene()
     scene, cameras = multiplied(small, count), spread(cameras, views)
     figures: dict[str, float] = {"gaussians": count}
@@ -189,7 +192,7 @@ def main() -> None:
     arguments = parser.parse_args()
     sizes = []
     for millions in arguments.millions:
-        # A new process, not a copy of this one: its peak of memory and its threads are its own.
+        # A new process instead of a fork, so that its memory peak and its threads are its own.
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             sizes.append(pool.apply(measure, (int(millions * 1e6), arguments.views, arguments.parts, arguments.write)))
         print(json.dumps(sizes[-1], indent=2), flush=True)

@@ -1,12 +1,12 @@
-"""One large scene through the whole service: sent in three ways, checked, planned, stylized, downloaded.
+"""One large scene through the whole service: uploaded in three ways, checked, planned, stylized, downloaded.
 
     python -m benchmarks.large_upload [--millions 4] [--scene FILE] [--stages tus dry_run ...]
 
-Real processes of `sgsst serve`, with curl, `sgsst submit` and plain tus requests as clients. A connection is cut in the
-middle of the tus upload and of a download, and both go on. Of each stage: seconds, the share of them that files were
-checked or planned (`inspecting_seconds`), the API's memory before and at most, and the peaks of the processes that read
-the scene, with the pages of the file that they map and without (`own`). Clients run on the same machine and take a
-share of it.
+The processes of `sgsst serve` are real; clients are curl, `sgsst submit` and plain tus requests. A connection is cut in
+the middle of the tus upload and of a download, and both resume. Each stage reports its seconds, the seconds of them in
+which files were checked or planned (`inspecting_seconds`), the API's memory before and at its peak, and the peaks of
+the processes that read the scene, with the mapped pages of the file and without (`own`). Clients run on the same
+machine and use some of its capacity.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import write_files
 
 STAGES = ("tus", "dry_run", "submit", "curl", "download")
-#: Of `tests.api.service`, but with the times and threads that a service has.
+#: Settings for `tests.api.service`, with the intervals and threads of a real service.
 SETTINGS: dict[str, Any] = {
     "SGSST_MIN_FREE_BYTES": "1000000000",
     "SGSST_CHECKPOINT_SECONDS": "60",
@@ -55,7 +55,7 @@ _PIECE = 1 << 20
 
 
 class Memory:
-    """Looks at the memory of the service's processes all the time, and at whether files are being inspected."""
+    """Monitor of the memory of the service's processes, and of the time in which files are inspected."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -66,16 +66,16 @@ class Memory:
         self._thread.start()
 
     def begin(self) -> None:
-        """Count peaks from here."""
+        """Reset the peaks."""
         self._peaks, self._inspecting = {}, 0.0
 
     def figures(self) -> dict[str, float]:
-        """Peaks in MB since `begin`, and seconds in which something was inspected."""
+        """Return peaks in MB since `begin`, and the seconds in which something was inspected."""
         peaks = {f"{name}_mb": round(size / 1e6, 1) for name, size in self._peaks.items()}
         return {"inspecting_seconds": round(self._inspecting, 1), **peaks}
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop monitoring."""
         self._over.set()
         self._thread.join()
 
@@ -94,7 +94,7 @@ class Memory:
 
 
 def memory_of(process: psutil.Process) -> dict[str, int]:
-    """Bytes that a process has now, with what it maps (`_peak`) and without (`_own_peak`); nothing of a dead one."""
+    """Return a process's resident bytes with mapped files (`_peak`) and without (`_own_peak`); empty if it is gone."""
     try:
         status = Path(f"/proc/{process.pid}/status").read_text()
     except OSError:
@@ -105,7 +105,7 @@ def memory_of(process: psutil.Process) -> dict[str, int]:
 
 
 class Trial:
-    """The stages, each on the service as the ones before have left it."""
+    """Stages of the benchmark; each continues in the state the previous ones left."""
 
     def __init__(self, service: Service, folder: Path, files: dict[str, Path], parameters: dict[str, Any]) -> None:
         self._service, self._folder, self._files, self._parameters = service, folder, files, parameters
@@ -113,7 +113,7 @@ class Trial:
         self._upload = self._job = ""
 
     def tus(self) -> dict[str, Any]:
-        """The scene in one PATCH that is cut off in the middle, and a second one from where the service is."""
+        """Upload the scene in a PATCH that is cut off halfway, and a second one that resumes where the service is."""
         path = self._files["scene"]
         size = path.stat().st_size
         name = base64.b64encode(path.name.encode()).decode()
@@ -130,7 +130,7 @@ class Trial:
         return {"went_on_at_mb": round(offset / 1e6, 1)}
 
     def _offset(self, where: str) -> int:
-        """What the service has of an upload that nobody writes to."""
+        """Return the offset of an upload that no request is writing to."""
         answer = self._client.patch(where, content=b"", headers=self._patch_headers(0))
         return 0 if answer.status_code == 423 else int(answer.json()["offset"])
 
@@ -150,7 +150,7 @@ class Trial:
         return {**_TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream"}
 
     def dry_run(self) -> dict[str, Any]:
-        """A dry run that names the upload."""
+        """Request a dry run that refers to the upload."""
         told = {"scene": self._upload, "parameters": json.dumps(self._parameters)}
         with self._files["style"].open("rb") as style, self._files["cameras"].open("rb") as cameras:
             files = {"style": ("style.png", style), "cameras": ("cameras.json", cameras)}
@@ -160,7 +160,7 @@ class Trial:
         return {name: plan[name] for name in ("gaussians", "views", "estimated_seconds", "memory_bytes")}
 
     def submit(self) -> dict[str, Any]:
-        """`sgsst submit --out`: sent in parts, stylized, downloaded and checked."""
+        """Run `sgsst submit --out`: upload in parts, stylize, download and verify."""
         out = self._folder / "submitted.ply"
         command = [sys.executable, "-m", "api.cli", "submit", str(self._files["scene"]), "--json"]
         command += ["--style", str(self._files["style"]), "--cameras", str(self._files["cameras"])]
@@ -170,7 +170,7 @@ class Trial:
         return {**self._job_seconds(), "result_mb": round(out.stat().st_size / 1e6, 1)}
 
     def curl(self) -> dict[str, Any]:
-        """One multipart request by curl, its job, and the result by curl."""
+        """Submit a job with curl in one multipart request, and wait for it."""
         command = ["curl", "--silent", "--show-error", "--fail-with-body", f"{self._service.url}/v1/jobs"]
         command += [part for role, path in self._files.items() for part in ("-F", f"{role}=@{path}")]
         started = time.perf_counter()
@@ -182,7 +182,7 @@ class Trial:
         return {"accepted_seconds": round(accepted, 1), **self._job_seconds()}
 
     def download(self) -> dict[str, Any]:
-        """The result by curl, cut off in the middle, and the rest by `curl -C -`."""
+        """Download the result with curl, cut it off, and fetch the rest with `curl -C -`."""
         url = f"{self._service.url}/v1/jobs/{self._job}/artifacts/stylized.ply"
         size = int(self._client.head(url).headers["content-length"])
         out = self._folder / "downloaded.ply"
@@ -202,7 +202,7 @@ class Trial:
         return self._client.get(f"/v1/jobs/{self._job}").json()["status"] in ("succeeded", "failed")
 
     def _job_seconds(self) -> dict[str, Any]:
-        """How long the job waited and ran, by its record."""
+        """Return the job's last attempt and its seconds by part."""
         job = self._client.get(f"/v1/jobs/{self._job}").json()
         assert job["status"] == "succeeded", job["error"]
         report = self._client.get(f"/v1/jobs/{self._job}/artifacts/report.json").json()
@@ -210,7 +210,7 @@ class Trial:
 
 
 def _run(command: list[str]) -> str:
-    """What a command prints; raises CalledProcessError where it fails."""
+    """Run a command and return its output; raises CalledProcessError if it fails."""
     return subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.PIPE, text=True).stdout
 
 
@@ -220,7 +220,7 @@ def _sha256(path: Path) -> str:
 
 
 def write_inputs(folder: Path, millions: float, scene: Path | None) -> dict[str, Path]:
-    """The files of a job: a scene of so many Gaussians, or another file, with the cameras of what was multiplied."""
+    """Write the files of a job: a scene of the given size, or an existing file, with cameras and style."""
     small, cameras, _ = small_scene()
     written, camera_file, style = write_files(
         folder, multiplied(small, int(millions * 1e6)) if scene is None else small, cameras
@@ -229,7 +229,7 @@ def write_inputs(folder: Path, millions: float, scene: Path | None) -> dict[str,
 
 
 def run_stages(trial: Trial, memory: Memory, stages: list[str], api: Callable[[], int]) -> dict[str, Any]:
-    """Figures of each stage."""
+    """Run the stages and return their figures."""
     found: dict[str, Any] = {}
     for name in stages:
         before = api()

@@ -1,10 +1,10 @@
-"""What leaving out saves, item by item: seconds of an iteration on all scales, and peak memory; and whether the plan
-had foreseen both.
+"""Savings of each optimization that a plan makes, in seconds per iteration and in peak memory.
 
 python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 684] [--views 3] [--rounds 3]
 
-CAMERAS is a camera file, or orbit:N. Each configuration runs in a process of its own, so that peaks do not mix: first
-with everything left out that the scene does not need, then with one item kept at a time, then with all of them kept.
+CAMERAS is a camera file, or orbit:N. Each configuration runs in a process of its own, so that peaks do not mix. The
+first one omits everything that the scene does not need; the next ones keep one item each; the last one keeps them all.
+The plan's predictions are printed beside the measured values.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sgsst_core.settings import EVERYTHING
 
 
 def main() -> None:
-    """Measure, print and store; or, with --keep, measure one configuration and print it as JSON."""
+    """Measure, print and store; with --keep, measure one configuration and print it as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE.ply:CAMERAS")
     parser.add_argument("--style", type=Path, required=True)
@@ -61,7 +61,7 @@ def _in_a_process(scene: str, kept: Sequence[str]) -> dict[str, Any]:
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Seconds of an iteration and peak memory with some items kept."""
+    """Return seconds per iteration and peak memory, with the items of `--keep` kept."""
     ply, _, cameras = arguments.scenes[0].partition("=")[2].partition(":")
     scene = read_scene(Path(ply)).scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)

@@ -1,9 +1,9 @@
-"""How near the feature network comes to what its convolutions reach alone, and where the rest of a gradient goes.
+"""Throughput of the feature network relative to its convolutions alone, and the time of a gradient by part.
 
 python -m benchmarks.network_rate [--size 1024] [--precisions float32 bfloat16] [--repeats 3]
 
-One scale of a square view: the convolutions one by one on pictures of the same sizes, and the whole gradient with its
-statistics. Rates count the convolutions' multiplications and additions in both.
+On one scale of a square view, the convolutions run one by one on inputs of the same sizes, and then the whole gradient
+runs with its statistics. Rates count the convolutions' multiplications and additions in both cases.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.features.vgg import FeatureNetwork, layer_stride
 from sgsst_core.loss.sos import SosLoss
 
-#: The last convolution that the loss needs.
+#: Last convolution that the loss needs.
 _DEEPEST = "conv5_1"
 
 
@@ -75,7 +75,7 @@ def _measure(weights: BackboneWeights, precision: str, size: int, repeats: int) 
 
 @torch.no_grad()
 def _convolutions_alone(weights: BackboneWeights, dtype: torch.dtype, size: int, repeats: int) -> tuple[float, float]:
-    """Operations and seconds of all convolutions of a gradient, forward and backward, each on memory that is warm."""
+    """Return operations and seconds of a gradient's convolutions, forward and backward, each on warm memory."""
     operations = seconds = 0.0
     for name, (weight, bias) in weights.convolutions.items():
         out, into = int(weight.shape[0]), int(weight.shape[1])

@@ -1,11 +1,11 @@
-"""What the page costs in a real browser whose WebGL is computed by the processor: bytes, seconds, memory, frames.
+"""Cost of the web page in a real browser with software WebGL: bytes, seconds, memory, frame times.
 
 python -m benchmarks.page SCENE.ply... [--frames 5] [--width 640 --height 480]
 
 For each scene: seconds until the first Gaussians are drawn and until all of them are, memory of the browser's
-processes, and milliseconds of frames of a turning view (sorted and drawn) and of a wipe (drawn alone). For the page
-itself: bytes over the wire, largest paint, and how long tasks blocked it, by the browser's own tracing. A GPU draws
-hundreds of times faster; reading, sorting and memory beside the textures are the same.
+processes, and milliseconds per frame of a rotating view (sorted and drawn) and of a wipe (only drawn). For the page
+itself: bytes over the wire, largest paint, and blocking time, from the browser's own tracing. A GPU draws hundreds of
+times faster; the time for reading and sorting, and memory apart from textures, are the same.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _SCENE = """async ([base, frames, width, height]) => {
 
 
 def memory_bytes() -> dict[str, int]:
-    """Resident bytes of this process' browser by kind of process, shared pages counted once for each."""
+    """Return the resident bytes of this process's browser by kind of process; shared pages count once per process."""
     found: dict[str, int] = {}
     for process in psutil.Process().children(recursive=True):
         try:
@@ -96,7 +96,7 @@ def memory_bytes() -> dict[str, int]:
 
 
 def measure_page(url: str) -> dict[str, Any]:
-    """Of the first visit, with nothing in the browser's cache."""
+    """Measure the first visit of the page, with an empty browser cache."""
     with open_browser() as browser:
         watched = Watched(browser, url, width=1280, height=800)
         watched.page.goto(url)
@@ -106,7 +106,7 @@ def measure_page(url: str) -> dict[str, Any]:
 
 
 def measure_scene(url: str, path: Path, frames: int, size: tuple[int, int]) -> dict[str, Any]:
-    """One scene in a browser of its own."""
+    """Measure one scene in a browser of its own."""
     with open_browser() as browser:
         watched = Watched(browser, url)
         watched.page.goto(f"{url}/#/jobs")

@@ -1,4 +1,4 @@
-"""Pictures of the page's views for docs/: a job of a real scene is run by a service of its own, and looked at.
+"""Screenshots of the web page for docs/, taken from a service of its own that runs jobs on a real scene.
 
 python -m benchmarks.page_pictures SCENE.ply CAMERAS.json STYLE.jpg STYLE.jpg [--resolution 320] [--steps 150]
 """
@@ -25,7 +25,7 @@ _WIDTH = 1280
 
 
 def save(watched: Watched, name: str, folder: Path, width: int = _WIDTH) -> None:
-    """The window as docs/page_NAME.webp, no wider than it was."""
+    """Save a screenshot of the window as page_NAME.webp, scaled to a width."""
     with Image.open(io.BytesIO(watched.page.screenshot())) as picture:
         size = (width, round(picture.height * width / picture.width))
         picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(
@@ -34,7 +34,7 @@ def save(watched: Watched, name: str, folder: Path, width: int = _WIDTH) -> None
 
 
 def submit(service: Service, files: dict[str, Path], parameters: dict[str, Any]) -> str:
-    """The id of a job."""
+    """Submit a job and return its id."""
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     answer = httpx.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(parameters)}, timeout=120)
     answer.raise_for_status()
@@ -42,10 +42,10 @@ def submit(service: Service, files: dict[str, Path], parameters: dict[str, Any])
 
 
 def finished(service: Service, job_id: str) -> bool:
-    """Whether a job has succeeded.
+    """Return whether a job has succeeded.
 
     Raises:
-        SystemExit: it has failed.
+        SystemExit: If it has failed or was canceled.
     """
     job = httpx.get(f"{service.url}/v1/jobs/{job_id}", timeout=60).json()
     if job["status"] in ("failed", "canceled"):
@@ -54,7 +54,7 @@ def finished(service: Service, job_id: str) -> bool:
 
 
 def shown_step(page: Any) -> int:
-    """The step that a job's page tells of; 0 while it tells of something else."""
+    """Return the step that a job's page shows, or 0 if it shows none."""
     found = re.search(r"step (\d+)", page.locator(".state").inner_text())
     return int(found[1]) if found else 0
 
@@ -62,7 +62,7 @@ def shown_step(page: Any) -> int:
 def take(
     service: Service, browser: Any, files: dict[str, Path], styles: list[Path], options: Any, folder: Path
 ) -> None:
-    """All pictures, in the order in which a user sees the views."""
+    """Take all screenshots, in the order in which a user sees the views."""
     parameters = {"resolution": options.resolution, "steps_sos": options.steps, "views": 12, "early_stop": False}
     watched = Watched(browser, service.url, width=1280, height=800)
     page = watched.page

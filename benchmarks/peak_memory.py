@@ -1,4 +1,4 @@
-"""Peak memory of one exact SOS gradient of a 5187x3361 view: the largest of the paper.
+"""Peak memory of one exact SOS gradient of a 5187x3361 view, the paper's largest.
 
 python -m benchmarks.peak_memory [--memory 5] [--width 5187] [--height 3361] [--device cuda]
 """
@@ -18,7 +18,7 @@ from sgsst_core.timing import Timer
 
 
 def main() -> None:
-    """Measure, print and store; one process, so that the peak is this gradient's."""
+    """Measure, print and store; everything runs in this process, so its peak is that of the gradient."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--memory", type=float, default=5.0, help="GB for activations")
     parser.add_argument("--width", type=int, default=5187)

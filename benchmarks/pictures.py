@@ -1,4 +1,4 @@
-"""Pictures for benchmarks: real ones that scikit-image carries, at any size."""
+"""Images for benchmarks: photos included in scikit-image, at any size."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from torch import Tensor
 
 
 def picture(name: str, height: int, width: int) -> Tensor:
-    """A picture of scikit-image (for instance "astronaut") as [height, width, 3] in 0..1, with fine grain on top.
+    """Return an image of scikit-image, for example "astronaut", as [height, width, 3] in 0 to 1, with fine grain.
 
-    Enlarged photos have no detail at full size, which would make the largest scale unlike a real view.
+    Without grain, enlarged photos have no detail at full size, so the largest scale would be unlike that of a real
+    view.
     """
     pixels = torch.from_numpy(getattr(data, name)()[..., :3].copy()).float() / 255
     planes = F.interpolate(pixels.permute(2, 0, 1)[None], size=(height, width), mode="bicubic", align_corners=False)

@@ -1,11 +1,11 @@
-"""Whether plans and the seconds left are right: what `sgsst plan` says against what the job then takes.
+"""Accuracy of plans and of the remaining time: predictions of `sgsst plan` against what the job then takes.
 
     python -m benchmarks.plan_accuracy SCENE.ply:RESOLUTION[:COARSE:SOS] ... --cameras FILE --style STYLE [--views 6]
 
-Each case is planned by `sgsst plan` in one process and stylized in another, as `sgsst stylize` does it, with so many
-steps of either phase. Compared are the seconds of a step of either phase whose view has been visited before, what a
-first visit takes beside them, peak memory, and what is measured. After each step the promised seconds left are noted,
-and held against the seconds that it then took to the last file.
+Each case is planned by `sgsst plan` in one process and stylized in another, as by `sgsst stylize`, with the given steps
+in either phase. Compared are the seconds of a step on a view visited before, the additional seconds of a first visit,
+both by phase, peak memory, and the time of measurements. After each step the predicted remaining time is recorded, and
+compared with the time that the job then takes until the last file is written.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from typing import Any
 
 from benchmarks.machine import write_result
 
-#: Steps of either phase, where a case does not say.
+#: Steps of either phase if a case has none.
 _STEPS = (9, 9)
 
 
 def main() -> None:
-    """Measure, print and store; or, with --run, run one job and print what it took as JSON."""
+    """Measure, print and store; with --run, run one job and print its figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="+", metavar="SCENE.ply:RESOLUTION[:COARSE:SOS]")
     parser.add_argument("--cameras", type=Path, required=True)
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def _options(case: str, arguments: argparse.Namespace) -> tuple[str, list[str]]:
-    """Scene, and the options of its case for the command line."""
+    """Return the scene of a case and its options for the command line."""
     scene, resolution, *steps = case.split(":")
     coarse, sos = steps or _STEPS
     options = ["--cameras", str(arguments.cameras), "--style", str(arguments.style), "--views", str(arguments.views)]
@@ -59,7 +59,7 @@ def _options(case: str, arguments: argparse.Namespace) -> tuple[str, list[str]]:
 
 
 def _case(case: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """A case in two processes: what was planned, what happened, and the ratios."""
+    """Run a case in two processes. Returns predicted and measured values, and their ratios."""
     scene, options = _options(case, arguments)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.json"
@@ -81,9 +81,9 @@ def _case(case: str, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _run(arguments: argparse.Namespace) -> dict[str, Any]:
-    """One job from its files to its files: what it took, and what it promised on the way."""
+    """Run one job from input files to output files. Returns what it took, and its predictions on the way."""
     started = time.perf_counter()
-    # What a job imports, and how long that takes, is a part of it.
+    # Imported here, because the time of imports is part of the job's.
     from sgsst_core.report.machine import peak_memory
     from worker.execute import execute
     from worker.options import StylizeOptions

@@ -1,7 +1,7 @@
-"""Runs of `sgsst bench quality` put together: figures in benchmarks/results/quality.json, and Markdown tables of them.
+"""Results of several runs of `sgsst bench quality`, collected in benchmarks/results/quality.json and shown as Markdown.
 
 python -m benchmarks.quality_tables add NAME FOLDER   # store what a run wrote to FOLDER/quality.json, under NAME
-python -m benchmarks.quality_tables show [NAME...]    # tables: what was judged, and loss left against seconds
+python -m benchmarks.quality_tables show [NAME...]    # print tables of the judgments, and of the loss over time
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _JUDGED = (
 
 
 def main() -> None:
-    """Store or print."""
+    """Store a run or print tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     ways = parser.add_subparsers(dest="way", required=True)
     adding = ways.add_parser("add")
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def read_run(folder: Path) -> dict[str, Any]:
-    """What a run wrote, its scene and style by name instead of where they lay on its machine."""
+    """Read the result of a run, with scene and style by name instead of by path."""
     run: dict[str, Any] = json.loads((folder / "quality.json").read_text())
     run["scene"] = "/".join(Path(run["scene"]).parts[-2:])
     run["style"] = Path(run["style"]).name
@@ -55,7 +55,7 @@ def read_run(folder: Path) -> dict[str, Any]:
 
 
 def judged(outcomes: list[dict[str, Any]]) -> str:
-    """A table: what AlexNet says of each outcome, the best style and palette of stylized ones in bold."""
+    """Return a table of the judgments, with the best style and color distance of stylized outcomes in bold."""
     stylized = [outcome for outcome in outcomes if outcome["name"] != UNSTYLIZED]
     best = {figure: min(outcome[figure] for outcome in stylized) for figure in ("style", "color_distance")}
 
@@ -81,7 +81,7 @@ def judged(outcomes: list[dict[str, Any]]) -> str:
 
 
 def against_time(variants: dict[str, Any]) -> str:
-    """A table: loss left, and steps, of each variant at the moments of evaluation, a range of seconds for each."""
+    """Return a table of loss and steps of each variant at each evaluation, with the range of its seconds."""
     points = {name: variant["points"] for name, variant in variants.items() if variant["points"]}
     moments = [[point["seconds"] for point in column] for column in zip(*points.values(), strict=True)]
     heads = [f"{min(moment):.0f} to {max(moment):.0f} s" for moment in moments]

@@ -1,9 +1,9 @@
-"""Two ranks of one thread each against one rank of one thread, on all scales of a view, in turn in one run.
+"""Two single-threaded ranks against one, on all scales of a view, in turn within one run.
 
 python -m benchmarks.ranks SCENE.ply CAMERAS STYLE [--ranks 2] [--sizes 1280x720,2048x2048] [--rounds 3]
 
-Ranks are gloo processes on this machine. Beside the ratio stand the bound that halos set, the share of an iteration in
-which ranks wait for each other or for bytes, and what the planner's model says from constants measured on one rank.
+Ranks are gloo processes on this machine. Reported with the ratio are its limit from halos, the fraction of an iteration
+in which ranks wait for each other or for data, and the prediction of the planner's model from measurements on one rank.
 """
 
 from __future__ import annotations
@@ -63,13 +63,13 @@ def main() -> None:
 
 
 def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
-    """One rank's part of the comparison; rank 0 prints and stores."""
+    """Run one rank's part of the comparison; rank 0 prints and stores."""
     torch.set_num_threads(1)
     scene = read_scene(arguments.scene).scene
     camera = spread(read_cameras(arguments.cameras), 1)[0]
     style = load_image(arguments.style)
     results = []
-    # One rank may take long alone, while the others wait.
+    # A long timeout, because the other ranks wait while one runs alone.
     with process_group(rank, arguments.ranks, address, timeout=timedelta(hours=1)) as collectives:
         link = probe_link(collectives, torch.device("cpu"))
         for size in arguments.sizes.split(","):
@@ -86,13 +86,13 @@ def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
 
 
 def with_size(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with another picture: the same field of view across, as much above and below as then fits."""
+    """Return the camera at another size, with the same horizontal field of view."""
     focal = camera.fx * width / camera.width
     return replace(camera, width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
 
 
 def make(collectives: Collectives, scene: Any, view: Camera, style: Any, arguments: argparse.Namespace) -> Stylizer:
-    """A job of one view that stays in the second phase."""
+    """Make a job of one view that stays in the second phase."""
     settings = make_settings(
         "paper",
         steps_coarse=0,
@@ -105,14 +105,14 @@ def make(collectives: Collectives, scene: Any, view: Camera, style: Any, argumen
 
 
 def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]:
-    """Seconds of iterations on all ranks and on one, in turn; the first of each prepares the view."""
+    """Measure iterations on all ranks and on one, in turn; the first of each prepares the view and does not count."""
     together = build(collectives)
     alone = build(ALONE) if collectives.rank == 0 else None
     steps: dict[str, list[dict[str, float]]] = {"together": [], "alone": []}
     sent: dict[str, int] = {}
     for turn in range(rounds + 1):
         for name, stylizer in (("together", together), ("alone", alone)):
-            collectives.all_gather(None)  # nobody else computes while one rank is alone
+            collectives.all_gather(None)  # no other rank computes while one runs alone
             if stylizer is not None:
                 before, used = stylizer.seconds, resource.getrusage(resource.RUSAGE_SELF)
                 record = stylizer.run_step()
@@ -154,7 +154,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
 
 
 def processor_seconds(before: resource.struct_rusage) -> dict[str, float]:
-    """What the process has taken since then, in its own code and in the system's (page faults, exchanges)."""
+    """Return the user and system time of this process since `before`, and its page faults."""
     now = resource.getrusage(resource.RUSAGE_SELF)
     return {
         "processor_user": now.ru_utime - before.ru_utime,
@@ -164,7 +164,7 @@ def processor_seconds(before: resource.struct_rusage) -> dict[str, float]:
 
 
 def modeled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> dict[str, Any]:
-    """What the planner's model makes of one rank's seconds."""
+    """Return the prediction of the planner's model from one rank's seconds."""
     steps = figures["steps"]["alone"]
     network = sum(median(steps, part) for part in NETWORK)
     raster = sum(median(steps, part) for part in RASTER)
@@ -195,22 +195,22 @@ def modeled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> 
 
 
 def whole_piece(scale: int, height: int, width: int) -> Piece:
-    """All of a scale."""
+    """Return a piece that covers all of a scale."""
     return Piece(scale, (height, width), Rectangle(0, 0, height, width))
 
 
 def median(steps: list[dict[str, float]], part: str) -> float:
-    """Seconds of a part of a step."""
+    """Return the median seconds of a part of a step."""
     return statistics.median(step.get(part, 0.0) for step in steps) if steps else math.nan
 
 
 def fastest(steps: list[dict[str, float]]) -> float:
-    """Seconds of the step that other programs of the machine disturbed least."""
+    """Return the seconds of the step that other programs disturbed least."""
     return min(step["total"] for step in steps)
 
 
 def describe(result: dict[str, Any]) -> str:
-    """One line."""
+    """Return a one-line summary."""
     waiting = ", ".join(f"{share:.1%}" for share in result["waiting_share_by_rank"])
     ratio, best, bound = (f"{result[key]:.2f}" for key in ("ratio", "ratio_of_fastest", "bound_by_halos"))
     return (

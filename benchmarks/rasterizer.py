@@ -1,11 +1,11 @@
-"""Forward plus color backward at 1280x720: `reference` in float32, `cpu` and `cached`, as ratios within one run.
+"""Rendering plus color gradient at 1280x720 with `reference` in float32, `cpu` and `cached`, as ratios within one run.
 
     python -m benchmarks.rasterizer [--scene point_cloud.ply --cameras cameras.json] [--repeats 15]
 
 All do the same work: one image from colors, one color gradient from an image gradient. What depends on the geometry
-alone (projection, depth order, tile lists; for `cached` the weights too) is prepared before and timed by itself,
-because a job does it once a view. The rasterizers take turns, each on one thread and on all; a figure is the fastest of
-its turns, the one least disturbed by whatever else the machine was doing.
+alone (projection, depth order, tile intersections; for `cached` the weights too) is prepared in advance and timed
+separately, because a job does it once per view. The rasterizers take turns, each on one thread and on all threads. The
+fastest turn counts, because other programs disturbed it least.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scenes"
 
 
 def generated_scene(count: int = 100_000) -> Scene:
-    """Gaussians around a sphere, for where there is no real scene."""
+    """Return Gaussians around a sphere, for use without a real scene."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -55,7 +55,7 @@ def generated_scene(count: int = 100_000) -> Scene:
 
 
 def resized(camera: Camera) -> Camera:
-    """The camera at 1280 x 720: same horizontal field of view, principal point in the middle."""
+    """Return the camera at 1280 x 720, with the same horizontal field of view and a centered principal point."""
     factor = WIDTH / camera.width
     return replace(
         camera,
@@ -69,33 +69,33 @@ def resized(camera: Camera) -> Camera:
 
 
 def timed(action: Callable[[], object]) -> float:
-    """Seconds that one call takes."""
+    """Return the seconds of one call."""
     started = time.perf_counter()
     action()
     return time.perf_counter() - started
 
 
 def both(rasterizer: Rasterizer, colors: Tensor, image_gradient: Tensor, camera: Camera, threads: int) -> float:
-    """Seconds of forward plus backward on so many threads."""
+    """Return the seconds of forward plus backward pass with a number of threads."""
     torch.set_num_threads(threads)
     render = timed(lambda: rasterizer.render(colors, camera))
     return render + timed(lambda: rasterizer.color_gradient(image_gradient, camera))
 
 
 def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
-    """Fastest seconds of each rasterizer and the ratios between them, in turn on one view."""
+    """Return the fastest seconds of each rasterizer and the ratios between them, in turn on one view."""
     colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
     image_gradient = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
     threads = sorted({1, torch.get_num_threads()})
     cpu = CpuRasterizer(scene)
-    CpuRasterizer(scene).lists(camera)  # compile first
+    CpuRasterizer(scene).lists(camera)  # compilation
     prepare = timed(lambda: cpu.lists(camera))
     caches = {p: CachedRasterizer(scene, precision=p) for p in ("float32", "half")}
     for cache in caches.values():
         cache.render(colors, camera)
     keep = timed(lambda: CachedRasterizer(scene).render(colors, camera)) - prepare
     reference = ReferenceRasterizer(scene, dtype=torch.float32)
-    reference.render(colors, camera, (0, 1))  # projects and sorts
+    reference.render(colors, camera, (0, 1))  # projection and sorting
     rasterizers: dict[str, Rasterizer] = {
         "reference": reference,
         "cpu": cpu,
@@ -106,7 +106,7 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     for turn in range(repeats):
         for name, rasterizer in rasterizers.items():
             for count in threads:
-                if turn < 2 or name != "reference":  # it takes seconds, which is repetition enough
+                if turn < 2 or name != "reference":  # at seconds per call, two repetitions are enough
                     seconds[name][count].append(both(rasterizer, colors, image_gradient, camera, count))
     torch.set_num_threads(threads[-1])
     fastest = {name: {n: min(times) for n, times in runs.items()} for name, runs in seconds.items()}
@@ -126,7 +126,7 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
 
 
 def scenes(arguments: argparse.Namespace) -> dict[str, tuple[Scene, Camera]]:
-    """What to measure: the scene asked for, else the real ones where they are, else a generated one."""
+    """Return the requested scene, or the real ones that are present, or a generated one."""
     if arguments.scene:
         scene = read_scene(arguments.scene).scene
         cameras = read_cameras(arguments.cameras) if arguments.cameras else orbit(scene, 8)

@@ -1,9 +1,9 @@
-"""Forecast of an SOS iteration on 1 to 64 GPUs, by the model with which the planner chooses ranks.
+"""Forecast of an SOS iteration on 1 to 64 GPUs, by the model that the planner uses to choose the number of ranks.
 
 python -m benchmarks.scaling [--tflops 100] [--shown 0.65]
 
-Nothing here is measured on GPUs: the assumptions are the constants below, and are stored and printed with the table.
-The same model, fed with one CPU rank's seconds, is held against two ranks by `benchmarks.ranks`.
+Nothing here is measured on GPUs. The assumptions are the constants below; they are printed and stored with the table.
+`benchmarks.ranks` checks the same model, with the seconds of one CPU rank, against two ranks.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from sgsst_core.planning.ranks_model import IterationWork, Link
 from sgsst_core.scene.pyramid import scale_count
 
 RANKS = (1, 2, 4, 8, 16, 32, 64)
-#: VGG19 up to relu5_1: operations a pixel, forward, and as many backward.
+#: Operations per pixel of VGG19 up to relu5_1 in the forward pass; the backward pass has as many.
 FLOP_PER_PIXEL = 2 * 0.72e6
-#: Four fifths of what the data sheets promise in one direction; seconds from one rank to the next.
+#: Links at four fifths of the data sheets' bandwidth in one direction, with the latency in seconds between two ranks.
 LINKS = {
     "NVLink 4": Link(0.8 * 450e9, 5e-6),
     "PCIe 4.0 x16": Link(0.8 * 32e9, 10e-6),
     "25 Gb/s Ethernet": Link(0.8 * 25e9 / 8, 30e-6),
 }
-#: Height, width, optimized Gaussians, seconds of render and gradient: a scene of Tanks and Temples, and the garden of
-#: Mip-NeRF 360 at its full size.
+#: Height, width, optimized Gaussians, seconds of render and gradient, for a scene of Tanks and Temples and for the
+#: garden of Mip-NeRF 360 at full size.
 VIEWS = {"980x545": (545, 980, 2_500_000, 0.006), "5187x3361": (3361, 5187, 5_800_000, 0.030)}
-#: Share of the optimized Gaussians that a view shows: 65 % of the plush toy's in views of its real cameras, 68 % of the
-#: biker's in an orbit. Views of scenes that are walked through show less.
+#: Fraction of the optimized Gaussians in a view: 65 % for the plush toy from its real cameras, 68 % for the biker in an
+#: orbit. Views of walk-through scenes show fewer.
 SHOWN_SHARE = 0.65
-#: Comparing statistics, the optimizer and launching kernels, in every iteration on every rank.
+#: Seconds per iteration on every rank for comparing statistics, the optimizer and launching kernels.
 FIXED_SECONDS = 0.003
 
 
@@ -75,7 +75,10 @@ def main() -> None:
 
 
 def forecast(work: IterationWork) -> dict[str, Any]:
-    """By number of ranks: speed-up by halos alone, and over each link with communication's share; bytes sent."""
+    """Return the forecast by number of ranks.
+
+    It consists of the speedup limit from halos, speedup and fraction of communication for each link, and bytes sent.
+    """
     one = max(loads(divide(work.pieces, work.halo, (1.0,)), work.halo))
     found = {}
     for ranks in RANKS:
@@ -92,7 +95,7 @@ def forecast(work: IterationWork) -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """The forecast as Markdown."""
+    """Return the forecast as Markdown."""
     lines = ["| GPUs | halos alone | " + " | ".join(LINKS) + " |", "|---:" * (2 + len(LINKS)) + "|"]
     for ranks, entry in found.items():
         cells = [f"{part['speed_up']:.1f} ({part['communication_share']:.0%})" for part in entry["links"].values()]

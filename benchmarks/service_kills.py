@@ -1,11 +1,11 @@
-"""SIGKILL of the service's processes at random moments, a hundred times, while it works through a queue of small jobs.
+"""Random SIGKILLs of the service's processes, a hundred times, while it works through a queue of small jobs.
 
 python -m benchmarks.service_kills [--kills 100] [--rank-kills 6] [--seed 0]
 
-`sgsst serve` runs with its defaults but for what `SETTINGS` says. A job that was accepted and does not end as succeeded
-counts as lost; one whose result was told of twice, or lies on the disk twice, as published twice; one whose PLY is not
-byte for byte that of `sgsst stylize` with the same seed as different. A job on two ranks adds in another order: its
-colors are compared with one rank's instead.
+`sgsst serve` runs with its defaults except for `SETTINGS`. The benchmark counts accepted jobs that do not succeed
+(lost), results that are reported or stored twice (published twice), and PLY files that are not bit-identical to that of
+`sgsst stylize` with the same seed (different). A job on two ranks adds in another order, so its colors are compared
+with one rank's instead.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from tests.small_scenes import wall, write_files
 
 PARAMETERS = {"preset": "standard", "steps_sos": 60, "backbone": "vgg16", "early_stop": False}
 SEEDS = (1, 2)
-#: Of the job on two ranks: enough for all of their deaths.
+#: Steps of the job on two ranks: enough to survive all of its kills.
 RANK_STEPS = 200
-#: Attempts end by our hand here: neither a reason to give a job up nor to wait ever longer.
+#: The benchmark itself ends attempts, so they must neither make the service give up nor lengthen its waits.
 SETTINGS: dict[str, Any] = {
     "SGSST_LEASE_SECONDS": "30",
     "SGSST_MAX_ATTEMPTS": "1000000",
@@ -55,7 +55,7 @@ API, DISPATCHER, ATTEMPT, RANK = (
 EVERYTHING = "sgsst serve"
 #: Mean seconds between two kills of one kind.
 EVERY = {API: 9.0, DISPATCHER: 30.0, ATTEMPT: 30.0, EVERYTHING: 120.0}
-#: Jobs that are kept waiting or running.
+#: Number of unfinished jobs to maintain.
 _QUEUE = 2
 _FINISHED = ("succeeded", "failed", "canceled", "expired")
 _PATIENCE = 600.0
@@ -63,7 +63,7 @@ _PATIENCE = 600.0
 
 @dataclass
 class Run:
-    """The service under fire, and what is counted."""
+    """Service under attack, and the figures collected."""
 
     service: Service
     files: dict[str, Path]
@@ -75,7 +75,7 @@ class Run:
     everything_back: list[float] = field(default_factory=list)
 
     def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """A request, sent again while the API is away."""
+        """Send a request, retrying while the API is down."""
         deadline = time.monotonic() + _PATIENCE
         while True:
             try:
@@ -87,7 +87,7 @@ class Run:
                 time.sleep(0.02)
 
     def submit(self, seed: int, **parameters: Any) -> str:
-        """An accepted job's id."""
+        """Submit a job and return its id."""
         body = {role: (path.name, path.read_bytes()) for role, path in self.files.items()}
         data = {"parameters": json.dumps({**PARAMETERS, "seed": seed, **parameters})}
         headers = {"Idempotency-Key": secrets.token_hex(8)}
@@ -99,22 +99,22 @@ class Run:
         return job_id
 
     def jobs(self) -> list[dict[str, Any]]:
-        """All jobs that the service knows."""
+        """Return all jobs that the service lists."""
         found: list[dict[str, Any]] = self.call("GET", "/v1/jobs", params={"limit": 200}).json()["jobs"]
         return found
 
     def active(self) -> dict[str, Any] | None:
-        """The job that is being worked on."""
+        """Return the job in progress, or None."""
         return next((job for job in self.jobs() if job["status"] in ("starting", "running")), None)
 
     def fill(self) -> None:
-        """Keep the queue full."""
+        """Submit jobs until the queue is full."""
         waiting = sum(job["status"] not in _FINISHED for job in self.jobs())
         for _ in range(_QUEUE - waiting):
             self.submit(SEEDS[len(self.accepted) % len(SEEDS)])
 
     def strike(self, target: str, chance: random.Random) -> None:
-        """One kill, and what has to be measured after it."""
+        """Kill once, and measure the recovery."""
         if target == EVERYTHING:
             started = time.monotonic()
             self.service.stop(signal.SIGKILL)
@@ -128,23 +128,23 @@ class Run:
             if target == API:
                 self.call("GET", "/v1/jobs", params={"limit": 1})
                 self.api_back.append(time.monotonic() - struck)
-            elif before is not None and chance.random() < 0.6:  # else the next kill may come before the job runs
+            elif before is not None and chance.random() < 0.6:  # otherwise the next kill may come before the job runs
                 self._measure(before, struck)
         self.kills[target] += 1
 
     def _measure(self, before: Mapping[str, Any], struck: float) -> None:
-        """Wait until an interrupted job makes steps again."""
+        """Wait until an interrupted job makes steps again, and record the time."""
         while time.monotonic() - struck < _PATIENCE:
             job = self.call("GET", f"/v1/jobs/{before['id']}").json()
             if job["status"] in _FINISHED:
-                return  # it was over when the dispatcher died
+                return  # it had finished when the dispatcher died
             if job["attempt"] > before["attempt"] and job["status"] == "running":
                 self.running_again.append(time.monotonic() - struck)
                 return
             time.sleep(0.1)
 
     def kill(self, target: str, chance: random.Random) -> bool:
-        """SIGKILL a process of a kind; False where there is none for a while."""
+        """Send SIGKILL to a random process of a kind. Returns False if none appears in time."""
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline:
             found = self.service.processes(target)
@@ -157,7 +157,7 @@ class Run:
 
 
 def attack(run: Run, kills: int, chance: random.Random) -> None:
-    """Kill at random moments until it was enough."""
+    """Kill at random moments until the given number of kills is reached."""
     due = {target: time.monotonic() + chance.expovariate(1 / mean) for target, mean in EVERY.items()}
     while sum(run.kills.values()) < kills:
         run.fill()
@@ -171,7 +171,7 @@ def attack(run: Run, kills: int, chance: random.Random) -> None:
 
 
 def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
-    """A job on two ranks, of which one is killed again and again; its id."""
+    """Run a job on two ranks and kill one of them repeatedly. Returns its id."""
     if not kills:
         return None
     job_id = run.submit(SEEDS[0], workers=2, steps_sos=RANK_STEPS)
@@ -191,7 +191,7 @@ def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
 
 
 def wait_for_all(run: Run) -> dict[str, dict[str, Any]]:
-    """Every accepted job at its end, or as it is when patience is over; those that are gone are left out."""
+    """Wait until all accepted jobs have ended or time is up. Returns the last status of those that exist."""
     deadline = time.monotonic() + _PATIENCE
     found: dict[str, dict[str, Any]] = {}
     while time.monotonic() < deadline:
@@ -207,7 +207,7 @@ def wait_for_all(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def published(run: Run, job_id: str) -> int:
-    """How often a job's result was told of, or how often it is on the disk if that is more."""
+    """Return how often a job's result was reported, or stored on disk if that is more."""
     text = run.call("GET", f"/v1/jobs/{job_id}/events").text
     told = text.count('"name": "stylized.ply"')
     ended = text.count('"status": "succeeded"')
@@ -216,12 +216,12 @@ def published(run: Run, job_id: str) -> int:
 
 
 def sha256(run: Run, job_id: str) -> str:
-    """Digest of a downloaded result."""
+    """Return the digest of a downloaded result."""
     return hashlib.sha256(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content).hexdigest()
 
 
 def distance(run: Run, job_id: str, one_rank: Path) -> float:
-    """Of a two-rank job's colors from one rank's, relative to how far these have moved."""
+    """Return the distance between a two-rank job's colors and one rank's, relative to how far the latter have moved."""
     path = run.service.data / "two.ply"
     path.write_bytes(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     two, one, before = (read_scene(each).scene.sh_dc for each in (path, one_rank, run.files["scene"]))
@@ -229,7 +229,7 @@ def distance(run: Run, job_id: str, one_rank: Path) -> float:
 
 
 def spread(values: list[float]) -> dict[str, float | int | None]:
-    """Count, median and largest."""
+    """Return count, median and maximum."""
     ordered = sorted(values)
     return {
         "measured": len(ordered),
@@ -239,7 +239,7 @@ def spread(values: list[float]) -> dict[str, float | int | None]:
 
 
 def main() -> None:
-    """Kill, count, print and store."""
+    """Attack the service, print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--rank-kills", type=int, default=6)
@@ -256,7 +256,7 @@ def main() -> None:
 
 
 def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) -> dict[str, Any]:
-    """All figures."""
+    """Run the attack and return all figures."""
     (folder / "inputs").mkdir()
     ply, cameras, style = write_files(folder / "inputs", wall())
     files = {"scene": ply, "cameras": cameras, "style": style}

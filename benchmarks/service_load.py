@@ -1,13 +1,14 @@
-"""What the API holds while a job is running on the same machine: submissions, status, watchers, a large upload.
+"""Load that the API sustains while a job runs on the same machine: submissions, status, watchers, a large upload.
 
 python -m benchmarks.service_load [--upload-mb 2000] [--watchers 1000] [--seconds 20] [--postgresql]
 
-Aims: 100 submissions a second by reference to uploads; status at 200 requests a second with a 99th percentile under
-50 ms; 1000 watchers of server-sent events; an API that grows by less than 64 MB during an upload of 2 GB. The client
-runs on the same machine and takes a share of its processors: it is part of what is measured, and told.
+Targets: 100 submissions per second by reference to uploads; status at 200 requests per second with a 99th percentile
+under 50 ms; 1000 watchers of server-sent events; an API that grows by less than 64 MB during an upload of 2 GB. The
+client runs on the same machine and uses some of its processors; its share is reported.
 
-With --postgresql the database is a PostgreSQL server whose commits are on the disk before they are answered, and two
-API processes on it get every other request and watcher each; the running job's events pass from one to the other.
+With --postgresql the database is a PostgreSQL server whose commits are on disk before they are acknowledged. Two API
+processes share it, and requests and watchers alternate between them; the running job's events pass from one to the
+other.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from tests.api.service import Service
 from tests.postgres import fresh_database, server
 from tests.small_scenes import wall, write_files
 
-#: A job that outlasts the benchmark; the others never get its place.
+#: Parameters of a job that outlasts the benchmark, so that the others never run.
 LONG = {"preset": "standard", "steps_sos": 1_000_000, "backbone": "vgg16", "early_stop": False}
 SETTINGS: dict[str, Any] = {
     "SGSST_LEASE_SECONDS": "30",
@@ -54,7 +55,7 @@ _PIECE = 1 << 20
 
 
 async def upload(client: httpx.AsyncClient, path: Path) -> str:
-    """The id of a small file's upload."""
+    """Upload a small file and return the upload's id."""
     name = base64.b64encode(path.name.encode()).decode()
     length = str(path.stat().st_size)
     begun = await client.post(
@@ -67,8 +68,9 @@ async def upload(client: httpx.AsyncClient, path: Path) -> str:
 
 
 class Connection:
-    """A connection that is kept, and just enough HTTP: a client for all purposes takes as much processor time as the
-    API, on the same processors.
+    """Persistent connection with a minimal HTTP client.
+
+    A general-purpose client would use as much processor time as the API, on the same processors.
     """
 
     def __init__(self, url: str) -> None:
@@ -77,10 +79,10 @@ class Connection:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, method: str, path: str, body: bytes = b"") -> tuple[int, bytes]:
-        """Status and body of the answer.
+        """Send a request and return status and body of the response.
 
         Raises:
-            OSError, EOFError: the connection broke; the next request makes a new one.
+            OSError, EOFError: If the connection breaks; the next request opens a new one.
         """
         reader, writer = self._streams = self._streams or await asyncio.open_connection(self._host, self._port)
         try:
@@ -93,14 +95,14 @@ class Connection:
             raise
 
     async def lines(self, path: str) -> AsyncIterator[bytes]:
-        """The lines of an answer that does not end, those of its head too."""
+        """Yield the lines of an endless response, including its headers."""
         reader, writer = self._streams = await asyncio.open_connection(self._host, self._port)
         writer.write(self._head("GET", path, 0))
         while line := await reader.readline():
             yield line
 
     def close(self) -> None:
-        """Give the connection up."""
+        """Close the connection."""
         if self._streams is not None:
             self._streams[1].close()
             self._streams = None
@@ -111,7 +113,7 @@ class Connection:
 
 
 async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float, made: list[str]) -> dict[str, Any]:
-    """Jobs by reference to uploads, by some clients at once, as fast as they are accepted; their ids go into `made`."""
+    """Submit jobs by reference to uploads from several clients, as fast as possible; their ids go into `made`."""
     took: list[float] = []
     failures: Counter[str] = Counter()
     end = time.perf_counter() + seconds
@@ -141,9 +143,9 @@ async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float,
 
 
 async def at_a_rate(urls: Sequence[str], path: Callable[[int], str], rate: float, seconds: float) -> dict[str, Any]:
-    """Requests that are due at fixed moments, whether or not earlier ones have been answered.
+    """Send requests at fixed moments, whether or not earlier ones have been answered.
 
-    A request that waits for a free connection waits on our clock: the time counts from when it was due.
+    Times count from the moment a request is due, including any wait for a free connection.
     """
     took: list[float] = []
     failures: Counter[str] = Counter()
@@ -179,7 +181,10 @@ async def at_a_rate(urls: Sequence[str], path: Callable[[int], str], rate: float
 
 
 async def with_processor(apis: list[psutil.Process], work: Awaitable[dict[str, Any]], count: str) -> dict[str, Any]:
-    """Figures with the processor time of API and client for each request, which other work does not change much."""
+    """Await the figures of `work`, and add the processor time of API and client per request.
+
+    Unlike wall-clock time, it hardly depends on what else the machine does.
+    """
     processes = {"api": apis, "client": [psutil.Process()]}
     before = {name: _processor_seconds(some) for name, some in processes.items()}
     figures = await work
@@ -200,16 +205,16 @@ def _memory(processes: list[psutil.Process]) -> int:
 async def watch(
     urls: Sequence[str], job_id: str, count: int, seconds: float, apis: list[psutil.Process]
 ) -> dict[str, Any]:
-    """Watchers of one running job: how many are connected, and how late they learn what happens."""
+    """Watch one running job with many clients. Returns how many are connected and how late events arrive."""
     before = _memory(apis)
     late: list[float] = []
     events = [0] * count
     connected = 0
-    opened = float("inf")  # events of the past do not count
+    opened = float("inf")  # past events do not count
 
     async def one(number: int) -> None:
         nonlocal connected
-        await asyncio.sleep(number / 200)  # not all of them in one moment
+        await asyncio.sleep(number / 200)  # spread the connections over time
         connection = Connection(urls[number % len(urls)])
         try:
             async for line in connection.lines(f"/v1/jobs/{job_id}/events"):
@@ -248,12 +253,12 @@ async def watch(
 
 
 def _moment(told: str | None) -> float:
-    """Seconds since 1970 of a time as the API tells it; 0 for none."""
+    """Convert a time from the API to seconds since 1970; 0 for None."""
     return datetime.fromisoformat(told).timestamp() if told else 0.0
 
 
 async def large_upload(client: httpx.AsyncClient, path: Path, api: psutil.Process) -> dict[str, Any]:
-    """One file in one request, and the API's memory meanwhile."""
+    """Upload one file in one request, and monitor the API's memory meanwhile."""
     size = path.stat().st_size
     begun = await client.post("/v1/uploads", headers=_TUS | {"Upload-Length": str(size)})
     begun.raise_for_status()
@@ -289,7 +294,7 @@ async def large_upload(client: httpx.AsyncClient, path: Path, api: psutil.Proces
 
 
 def spread(values: list[float]) -> dict[str, float]:
-    """Percentiles of seconds, as milliseconds."""
+    """Return percentiles of seconds, in milliseconds."""
     cuts = statistics.quantiles(values, n=1000, method="inclusive") if len(values) > 1 else values * 999
     return {f"p{name}_ms": round(1000 * cuts[index], 1) for name, index in (("50", 499), ("95", 949), ("99", 989))}
 
@@ -297,7 +302,7 @@ def spread(values: list[float]) -> dict[str, float]:
 async def measure(
     services: Sequence[Service], files: dict[str, Path], arguments: argparse.Namespace, large: Path
 ) -> dict[str, Any]:
-    """All figures, one after the other; the first service has the dispatcher."""
+    """Measure all figures, one after the other; the first service has the dispatcher."""
     service, urls = services[0], [each.url for each in services]
     apis = [process for each in services for process in each.processes(_API)]
     async with httpx.AsyncClient(base_url=service.url, timeout=120) as client:
@@ -307,7 +312,7 @@ async def measure(
         await _until_it_runs(client, running)
         figures: dict[str, Any] = {"job_steps_per_second_alone": await _speed(client, running, arguments.seconds / 2)}
         print(figures, flush=True)
-        # first, as what watchers leave free in the API's heap would hide its growth
+        # Before the watchers, because the memory they free in the API's heap would hide the growth.
         figures["upload"] = await large_upload(client, large, apis[0])
         print(figures["upload"], flush=True)
         asking = at_a_rate(urls, lambda number: f"/v1/jobs/{running}", 200, arguments.seconds)
@@ -345,7 +350,7 @@ async def _speed(client: httpx.AsyncClient, job_id: str, seconds: float) -> floa
 
 
 def _services(folder: Path, stack: contextlib.ExitStack, postgresql: bool) -> list[Service]:
-    """What is asked; none of them runs yet."""
+    """Return the services to measure; they are not started yet."""
     if not postgresql:
         return [Service(folder / "data", **SETTINGS)]
     database = fresh_database(stack.enter_context(server(durable=True)))
@@ -361,15 +366,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--postgresql", action="store_true", help="two API processes on a PostgreSQL server")
     arguments = parser.parse_args()
-    load = [round(value, 2) for value in psutil.getloadavg()]  # of what else the machine does
+    load = [round(value, 2) for value in psutil.getloadavg()]  # load from other programs
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sgsst-load-")))
         (folder / "inputs").mkdir()
         ply, cameras, style = write_files(folder / "inputs", wall())
         large = folder / "large"
         large.touch()
-        os.truncate(large, arguments.upload_mb * 1_000_000)  # a hole: it takes room only where it is uploaded to
-        # the files of 1000 watchers, here and in the service
+        os.truncate(large, arguments.upload_mb * 1_000_000)  # sparse: it needs no space on disk
+        # Raise the limit of open files for 1000 watchers, here and in the service.
         with contextlib.suppress(ValueError, OSError):
             import resource
 

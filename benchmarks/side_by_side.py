@@ -1,4 +1,4 @@
-"""The same view of several scenes in a row, as a JPEG.
+"""Renders of several scenes side by side, as a JPEG with one column per scene.
 
 python -m benchmarks.side_by_side CAMERAS|orbit:N OUT.jpg LABEL=SCENE.ply ... [--views 2] [--resolution 480]
 """
@@ -22,7 +22,7 @@ _LABEL = 22
 
 
 def main() -> None:
-    """Render and write."""
+    """Render and write the image."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cameras", help="camera file, or orbit:N")
     parser.add_argument("out", type=Path)

@@ -1,10 +1,11 @@
-"""Memory and seconds of jobs by Gaussians and pixels, on this machine, from the planner's model. For operators.
+"""Memory and seconds of jobs on this machine by number of Gaussians and pixels, predicted for operators.
 
 python -m benchmarks.sizing [--preset standard] [--views 50]
 
-The built-in scene is measured as for a job. What a plan would be for others follows from that by the planner's own
-model (`decide`), with these changes: a view shows half of the Gaussians, its blend weights grow as its pixels, and a
-render's seconds half as its pixels and half as the Gaussians. A dry run of a real scene is always better.
+The built-in scene is measured as for a job, and the planner's own model (`decide`) predicts the plans for other sizes.
+It assumes that a view shows half of the Gaussians, that blend weights grow in proportion to the pixels, and that the
+time of a render grows half with the pixels and half with the Gaussians. A dry run of a real scene is always more
+accurate.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ SH_DEGREE = 3
 
 
 def measured(settings: Settings) -> Probe:
-    """The built-in scene's probe."""
+    """Return the probe of the built-in scene."""
     with tempfile.TemporaryDirectory() as folder:
         files = build_demo(Path(folder))
         scene, cameras = read_scene(files.ply).scene, read_cameras(files.cameras)
@@ -48,7 +49,7 @@ def measured(settings: Settings) -> Probe:
 
 
 def changed(probe: Probe, gaussians: int, width: int, views: int) -> Probe:
-    """A probe as another scene would have, seen in other views."""
+    """Return the probe of a scene of another size, with other views."""
     height = width * 2 // 3
     before = probe.sizes[0][0] * probe.sizes[0][1]
     pixels = width * height / before
@@ -82,7 +83,7 @@ def _raster(cost: RasterCost, pixels: float, gaussians: float, views: float) -> 
 
 
 def table(probe: Probe, settings: Settings, views: int) -> str:
-    """GB of a process (and of its GPU), and hours of a job; a line for each number of Gaussians."""
+    """Return a Markdown table of the GB of a process (and of its GPU) and the hours of a job, by Gaussians and size."""
     lines = [
         f"| Gaussians | {' | '.join(f'{width}x{width * 2 // 3}' for width in WIDTHS)} |",
         f"|---|{'---:|' * len(WIDTHS)}",
@@ -90,7 +91,7 @@ def table(probe: Probe, settings: Settings, views: int) -> str:
     for gaussians in GAUSSIANS:
         cells = []
         for width in WIDTHS:
-            # as much memory as a plan asks for at most: the scene's own, and a machine's usual budget beside it
+            # As much memory as a plan uses at most: the scene's own, plus a machine's usual budget.
             plan = decide(changed(probe, gaussians, width, views), settings, measured=True)
             assert plan.prediction is not None
             cells.append(_cell(plan.prediction))

@@ -20,7 +20,7 @@ from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 
-#: Activations of a 2048x2048 view stay in memory: 1.3 KB a pixel in float32.
+#: Activations of a 2048x2048 view stay in memory: 1.3 KB per pixel in float32.
 MEMORY = 12 << 30
 
 
@@ -53,7 +53,7 @@ def main() -> None:
 
     gradients: dict[str, Tensor] = {}
     seconds: dict[str, list[float]] = {name: [] for name in methods}
-    for _ in range(arguments.repeats):  # in turn, so that a machine that slows down slows all of them
+    for _ in range(arguments.repeats):  # in turn, so that a slow phase of the machine affects all methods
         for name, method in methods.items():
             started = time.perf_counter()
             gradients[name] = method()

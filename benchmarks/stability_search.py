@@ -1,10 +1,10 @@
-"""A random search for jobs that break a bound: scenes, cameras, styles and settings drawn from seeds.
+"""Random search for jobs that violate a bound, with scenes, cameras, styles and settings drawn from seeds.
 
 python -m benchmarks.stability_search [--seconds 600] [--first 0] [--only SEED]
 
-Every number of the sequence is a job (`drawn`): it may be refused with an error of its own, and must otherwise stay
-within the bounds of `sgsst_core.bench.stability.situations`. What breaks one, or fails in another way, is printed with
-its number, by which `--only` runs it again, and stored. What was found has become a case (`job_cases`).
+Each number of the sequence defines a job (`drawn`). The job may be refused with an error of its own; otherwise it must
+stay within the bounds of `sgsst_core.bench.stability.situations`. Violations and other failures are printed and stored
+with their number, which `--only` runs again. Every failure found becomes a case (`job_cases`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sgsst_core.errors import SgsstError
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held
 
-#: Largest coefficient of a color: beyond, a job may say that it diverges.
+#: Largest color coefficient; beyond it, a job may report divergence.
 _MOST = 1e3
 
 
@@ -50,9 +50,10 @@ def main() -> None:
 
 
 def search(seconds: float, first: int = 0) -> tuple[Counter[str], dict[int, str]]:
-    """Run jobs for so many seconds, from a number on: how they ended, and what is wrong with those that broke a bound.
+    """Run jobs for a time, from number `first` on; at least one job is run.
 
-    At least one job is run.
+    Returns:
+        How often each outcome occurred, and the problem of each job that violated a bound.
     """
     ended: Counter[str] = Counter()
     found: dict[int, str] = {}
@@ -68,7 +69,11 @@ def search(seconds: float, first: int = 0) -> tuple[Counter[str], dict[int, str]
 
 
 def outcome(situation: Situation) -> tuple[str, str | None]:
-    """How a job ended ("within its bounds", the error that refused it, "broken"), and what is wrong, if anything is."""
+    """Run a job and classify how it ended.
+
+    Returns:
+        "within its bounds", the name of the error that refused it, or "broken"; and the problem, or None.
+    """
     try:
         result = strain(situation)
     except SgsstError as error:
@@ -82,27 +87,27 @@ def outcome(situation: Situation) -> tuple[str, str | None]:
 
 
 def drawn(number: int) -> Situation:
-    """The job of a number; the same one everywhere."""
+    """Return the job with this number; the same on every machine."""
     rng = random.Random(f"stability {number}")
     settings = _settings(rng)
     scene, style = _scene(rng), _style(rng)
     width, height = _side(rng), _side(rng)
-    # Whether the loss falls is asked where steps are short, and the loss is one that steps are made for.
+    # Whether the loss falls is checked only if steps are short and the loss is one that steps can reduce.
     tame = settings["learning_rate"] <= 0.01 and 0 < settings["content_weight"] <= 3e3 and min(width, height) >= 16
     tame &= min(style.shape[:2]) >= 16 and float(style.std()) > 0.05 and settings["style_loss"] == "sos"
     tame &= settings.get("preserve_colors") is None and float(scene.sh_dc.abs().max()) < 5 and scene.sh_degree == 0
     falls = tame and "scales" not in settings
-    weights = even_network() if number % 2 else None  # even numbers: the original network's sizes of features
+    weights = even_network() if number % 2 else None  # even numbers: feature scale of the original network
     return Situation(scene, style, settings, views(width, height), falls=falls, weights=weights)
 
 
 def _side(rng: random.Random) -> int:
-    """Of a view: mostly those of a few cells, now and then a line or a dot."""
+    """Draw the side of a view: mostly a few feature cells, sometimes less than one."""
     return rng.choice([rng.randint(1, 15), rng.randint(16, 40), rng.randint(16, 40)])
 
 
 def _size(rng: random.Random, low: float, high: float) -> float:
-    """A number whose logarithm is uniform."""
+    """Draw a number whose logarithm is uniform."""
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
@@ -152,7 +157,7 @@ def _style(rng: random.Random) -> Tensor:
 
 
 def _settings(rng: random.Random) -> dict[str, Any]:
-    """Some of what can be chosen; the rest stays as it is."""
+    """Draw some of the settings; the rest keeps its defaults."""
     values: dict[str, Any] = {
         "steps_sos": STEPS,
         "steps_coarse": rng.choice([0, 1, 3]),
@@ -186,7 +191,7 @@ def _settings(rng: random.Random) -> dict[str, Any]:
 
 
 def _tell(number: int) -> None:
-    """Run one job, and say what it is."""
+    """Run one job and describe it."""
     situation = drawn(number)
     scene = situation.scene
     print(f"{len(scene)} Gaussians of degree {scene.sh_degree}, style {tuple(situation.style.shape)}")

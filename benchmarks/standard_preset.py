@@ -1,10 +1,10 @@
-"""The standard preset against the paper's schedule: loss on all views, and processor seconds, of both.
+"""Standard preset against the paper's schedule: loss on all views, and processor seconds, of both.
 
 python -m benchmarks.standard_preset SCENE.ply CAMERAS|orbit:N STYLE NAME [--only paper|standard]
 
 The paper's schedule is scaled to `--steps-coarse` and `--steps-sos` steps, at the paper's learning rate. Seconds are
-those of the process on its cores, so that other work on the machine does not count; run it with one thread. With
-`--only`, the other run's figures are taken from the result file.
+processor seconds, so that other work on the machine does not count; run it with one thread. With `--only`, the other
+run's figures come from the result file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene, write_stylized
 from sgsst_core.stylizing.evaluation import mean_loss
 
-#: Shares of each phase after which all views are evaluated.
+#: Fractions of each phase after which all views are evaluated.
 MARKS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 PAPER_RATE = 2.5e-3
 
@@ -78,9 +78,9 @@ def _stored(name: str) -> dict[str, Any]:
 
 
 def _run(stylizer: Stylizer, own: Tensor) -> list[dict[str, Any]]:
-    """Loss on all views at the marks of the schedule, relative to that of the scene's own colors [n, 3].
+    """Run a job. Returns the loss on all views at the marks, relative to the scene's own colors [n, 3].
 
-    (Not to that of the first step's: `standard` begins with the style's colors.)
+    The loss of the first step is no reference, because `standard` starts from the style's colors.
     """
     views = stylizer.views.covered
     start = stylizer.evaluate(views, own[stylizer.plan.seen])
@@ -101,7 +101,7 @@ def _run(stylizer: Stylizer, own: Tensor) -> list[dict[str, Any]]:
 
 
 def _verdict(results: dict[str, Any]) -> dict[str, Any]:
-    """When the standard preset was as good as the paper's schedule in the end, and what it reached itself."""
+    """Return when the standard preset reached the final loss of the paper's schedule, and its own final loss."""
     last = results["paper"]["points"][-1]
     standard = results["standard"]["points"]
     reached = next((point for point in standard if point["relative"] <= last["relative"]), None)

@@ -1,11 +1,11 @@
-"""What lies behind an object scan, and what its colors begin with: a table of ways, judged by another network.
+"""Training backgrounds and color initializations for object scans, judged by a network that no run optimizes.
 
 python -m benchmarks.training_background SCENE.ply STYLE NAME [--ways background,random+warm,...] [--seeds 0,1]
 
-A way is a training background (background, random, palette), with "+warm" from the style's distribution of colors. All
-of them have the same views around the object and the same steps; what they reach is judged (`sgsst_core.quality.judge`)
-on novel views. Rows are added to benchmarks/results/training_background.json, under NAME; the figures of more seeds are
-means.
+A way is a training background (background, random, palette); "+warm" starts from the style's color distribution. All
+ways have the same views around the object and the same number of steps. Results are judged on novel views
+(`sgsst_core.quality.judge`). Rows are added to benchmarks/results/training_background.json, under NAME; with several
+seeds, figures are means.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sgsst_core.scene.orbit import orbit
 from sgsst_core.stylizing.evaluation import mean_loss
 
 WAYS = ("background", "background+warm", "random", "random+warm", "palette", "palette+warm")
-#: Views that are judged, and those of each way on the sheet.
+#: Number of judged views, and of views per way on the sheet.
 JUDGED, SHOWN = 6, 3
 COLUMNS = ("style", "color_distance", "background_sensitivity", "content", "saturated", "loss", "seconds")
 
@@ -82,7 +82,7 @@ def _settings(way: str) -> dict[str, Any]:
 
 
 def _judge(scene: Scene, style: torch.Tensor, between: list[Camera]) -> Judge:
-    """Of some views between those of the job, evenly spread."""
+    """Make a judge of some views between those of the job, evenly spread."""
     step = max(1, len(between) // JUDGED)
     return Judge(Lpips(), style, scene, make_rasterizer("cpu", scene), between[::step][:JUDGED])
 
@@ -96,7 +96,10 @@ def _row(judge: Judge, sh_dc: torch.Tensor) -> dict[str, float]:
 def _run(
     judge: Judge, scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]
 ) -> tuple[torch.Tensor, dict[str, float]]:
-    """Colors [N, 3], and what is said of them: loss on the background, relative to the start; processor seconds."""
+    """Run a job. Returns its colors [N, 3] and its figures.
+
+    The loss is on the background, relative to the start; seconds are processor seconds.
+    """
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
     start = mean_loss(stylizer.start())
     before = time.process_time()
@@ -113,7 +116,7 @@ def _print(way: str, row: dict[str, float]) -> None:
 
 
 def _store(arguments: argparse.Namespace, ways: dict[str, dict[str, float]]) -> None:
-    """Add the rows of a pair to those that are there."""
+    """Add rows to the stored ones of the pair."""
     path = RESULTS / "training_background.json"
     pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
     told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
@@ -124,7 +127,7 @@ def _store(arguments: argparse.Namespace, ways: dict[str, dict[str, float]]) -> 
 
 
 def _keep(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
-    """A sheet with a row for each way: views on black, and the first one on white. And the colors."""
+    """Write the colors, and a sheet with a row per way: views on black, and the first one on white."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras = judge.cameras[:SHOWN]
     rows = []

@@ -1,9 +1,10 @@
-"""Compile the GPU kernels ahead of time for real targets, without a GPU or a driver, and tell what they take.
+"""Compile the GPU kernels ahead of time for real targets, without a GPU or driver, and report their resource use.
 
     python -m benchmarks.triton_targets [--name triton_targets]
 
-Triton's interpreter accepts what compilation refuses, so that both are needed: the interpreter shows that the kernels
-compute the right numbers, this that they are kernels. Registers and spills are read from what the compilers wrote.
+Triton's interpreter accepts code that does not compile, so both are needed: the interpreter shows that the kernels
+compute the right numbers, and this benchmark that they compile. Registers and spills are read from the compilers'
+output.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ TARGETS = {
 }
 _CUTS = {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN, "K": kernels.BLENDED.value}
 _BLOCK = kernels.PROJECTED.value
-#: Types of the arguments that are no constants, as `sgsst_core.rasterizer.triton` passes them.
+#: Types of the arguments that are not constants, as `sgsst_core.rasterizer.triton` passes them.
 _TYPES = {
     **dict.fromkeys(("means", "quats", "scales", "logits", "colors", "background", "image", "transmittances"), "*fp32"),
     **dict.fromkeys(("image_gradient", "out"), "*fp32"),
@@ -71,7 +72,7 @@ _FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (kept
 
 @dataclass(frozen=True)
 class Target:
-    """A kernel as `sgsst_core.rasterizer` compiles it; `types`: of arguments, where another one than in `_TYPES`."""
+    """Kernel as `sgsst_core.rasterizer` compiles it; `types` overrides `_TYPES` for some arguments."""
 
     kernel: Any
     constants: dict[str, Any]
@@ -92,7 +93,7 @@ def _of_cached_weights(form: str) -> dict[str, Target]:
 
 
 def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
-    """Of features, with position weights."""
+    """Return the kernels that read features, with position weights."""
     features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
     matrix = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
     moments = {**matrix, "SPAN": SPAN_VALUES // channels, "P": POSITIONS}
@@ -113,7 +114,7 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
 
 
 def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
-    """Of what features are summed up in."""
+    """Return the kernels that work on sums over features."""
     entries = block_of_entries(channels)
     block = {"ROWS": entries // block_of_channels(channels), "COLUMNS": block_of_channels(channels)}
     return {
@@ -132,7 +133,7 @@ def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
     }
 
 
-#: Channels of the widest layers, and of the pixels.
+#: Number of channels of the widest layers, and of the pixels.
 _WIDEST, _PIXELS = 512, 3
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _LOSS = {"GRAM": GRAM_WEIGHT, "MEAN": MEAN_WEIGHT, "STD": STD_WEIGHT, "EPS": 2.0**-23}
@@ -167,7 +168,7 @@ KERNELS: dict[str, Target] = {
 
 
 def compile_kernel(name: str, target: str) -> dict[str, Any]:
-    """Registers, spilled bytes or registers, shared memory and seconds of one kernel for one target."""
+    """Compile one kernel for one target. Returns registers, spills, shared memory and seconds."""
     found = KERNELS[name]
     signature = {
         argument: "constexpr" if argument in found.constants else {**_TYPES, **found.types}[argument]
@@ -182,7 +183,7 @@ def compile_kernel(name: str, target: str) -> dict[str, Any]:
 
 
 def _of_nvidia(binary: bytes) -> dict[str, int]:
-    """From the resource usage that `cuobjdump`, which Triton brings, reads from the binary."""
+    """Read the resource usage from a binary with `cuobjdump`, which comes with Triton."""
     tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "kernel.cubin"
@@ -201,14 +202,14 @@ def _of_amd(assembly: str) -> dict[str, int]:
 
 
 def main() -> int:
-    """Compile everything and write the table."""
+    """Compile everything, print and store the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--name", default=None, help="of the file in benchmarks/results; none is written without it")
     arguments = parser.parse_args()
     if os.environ.get("TRITON_INTERPRET") == "1":
         print("TRITON_INTERPRET is set: kernels would be interpreted, not compiled", file=sys.stderr)
         return 2
-    os.environ["TRITON_ALWAYS_COMPILE"] = "1"  # what a cache holds takes no seconds
+    os.environ["TRITON_ALWAYS_COMPILE"] = "1"  # so that seconds are not those of a cache
     table = {name: {target: compile_kernel(name, target) for target in TARGETS} for name in KERNELS}
     for name, targets in table.items():
         for target, used in targets.items():

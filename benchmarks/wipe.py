@@ -1,10 +1,10 @@
-"""An animation around a scene: the original on one side of a line that moves, the stylized one on the other.
+"""Animation around a scene, with the original on one side of a moving line and the stylized scene on the other.
 
 python -m benchmarks.wipe SCENE.ply STYLIZED.ply CAMERAS|orbit:N OUT.webp [--first 0] [--count 8] [--resolution 480]
 
-An orbit of N views is gone around. Of a camera file, so many cameras from the first on are gone through there and back,
-with three views between each two. The line goes over the picture and back once. Quality is lowered until the file is no
-larger than `--bytes`.
+With orbit:N, the camera circles the scene in N views. With a camera file, it moves through `--count` cameras from
+`--first` on and back again, with three extra views between each two. Meanwhile the line crosses the image and returns.
+Quality is lowered until the file is no larger than `--bytes`.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 QUALITIES = (85, 75, 65, 55, 45, 35, 25)
-_LINE = 2  # pixels
+_LINE = 2  # width in pixels
 
 
 def main() -> None:
-    """Render and write."""
+    """Render the frames and write the animation."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("stylized", type=Path)
@@ -59,7 +59,7 @@ def main() -> None:
 
 
 def _painter(scene: Scene, gray: float) -> Callable[[Camera], torch.Tensor]:
-    """Renders views [H, W, 3] of a scene, in 8 bits."""
+    """Return a function that renders views of a scene as 8-bit images [H, W, 3]."""
     rasterizer = make_rasterizer("cpu", scene, background=(gray,) * 3)
 
     def picture(camera: Camera) -> torch.Tensor:
@@ -70,7 +70,7 @@ def _painter(scene: Scene, gray: float) -> Callable[[Camera], torch.Tensor]:
 
 
 def _way(arguments: argparse.Namespace, scene: Scene) -> list[Camera]:
-    """The cameras of all frames; the last is followed by the first."""
+    """Return the cameras of all frames; the first one follows the last."""
     if arguments.cameras.startswith("orbit:"):
         count = int(arguments.cameras.removeprefix("orbit:"))
         return read_views(arguments.cameras, scene, count, arguments.resolution)
@@ -82,7 +82,7 @@ def _way(arguments: argparse.Namespace, scene: Scene) -> list[Camera]:
 
 
 def _smallest(frames: list[Image.Image], milliseconds: int, most: int) -> bytes:
-    """An animated WebP of the best quality that is small enough."""
+    """Encode an animated WebP at the best quality that is small enough."""
     for quality in QUALITIES:
         target = io.BytesIO()
         first, *others = frames

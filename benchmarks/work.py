@@ -1,4 +1,4 @@
-"""What a device would have to do: operations, bytes and launches, counted without computing anything."""
+"""Operations, memory traffic and launches of a GPU program, counted without computing anything."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from torch.utils._pytree import tree_leaves
 
 @dataclass(frozen=True)
 class Work:
-    """One launch.
+    """Work of one launch.
 
     Attributes:
-        operations: on the unit that does them.
-        bytes: to and from memory, if every argument is read once and every result written once.
-        unit: "convolution", "matrix" (products in kernels of the project, TF32 or float32) or "lanes" (instructions of
+        operations: Number of operations on its unit.
+        bytes: Memory traffic in bytes, if every argument is read once and every result written once.
+        unit: "convolution", "matrix" (products in the project's kernels, TF32 or float32) or "lanes" (instructions of
             single threads).
     """
 
@@ -28,21 +28,21 @@ class Work:
     unit: str = "convolution"
 
     def seconds(self, rates: Mapping[str, float]) -> float:
-        """By the roofline: what takes longer, the unit or the memory ("bytes" in the rates, a second each)."""
+        """Return the time by the roofline model: the maximum of compute and memory time, given rates per second."""
         return max(self.operations / rates[self.unit], self.bytes / rates["bytes"])
 
 
-#: Without a launch: memory is reserved, or a value of the host is looked at.
+#: Operations without a launch: they only allocate memory or read a value on the host.
 _FREE = {"empty", "new_empty", "empty_like", "empty_strided", "lift_fresh", "_local_scalar_dense"}
-#: cuDNN computes a ReLU with the convolution before it (`features.vgg`).
+#: cuDNN fuses a ReLU with the convolution before it (`features.vgg`).
 _FUSED = {"relu_"}
 
 
 class Counted(TorchDispatchMode):
-    """Notes every launch in its block, of tensors on the device "meta", which have sizes but no values.
+    """Recorder of all launches on tensors of the device "meta", which have shapes but no values.
 
     Attributes:
-        works: in order.
+        works: Work of each launch, in order.
     """
 
     def __init__(self) -> None:
@@ -65,7 +65,7 @@ def _is_view(func: Any) -> bool:
 
 
 def _operations(name: str, args: Any, result: Any) -> float:
-    """Multiplications and additions of a convolution; what else there is in PyTorch's kernels is bound by bytes."""
+    """Count the multiplications and additions of a convolution; PyTorch's other kernels are memory-bound."""
     if name != "convolution":
         return 0.0
     weight: Tensor = args[1]
@@ -73,5 +73,5 @@ def _operations(name: str, args: Any, result: Any) -> float:
 
 
 def meta(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A tensor that has a size only."""
+    """Return a tensor that has a shape only."""
     return torch.empty(shape, dtype=dtype, device="meta")

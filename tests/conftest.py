@@ -1,4 +1,4 @@
-"""Fixtures that every test package shares."""
+"""Fixtures shared by all tests."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import torch
 
 if not torch.cuda.is_available():
-    # Read when Triton is first imported, by whichever test that is: kernels then run in its interpreter.
+    # Read when Triton is first imported, by whichever test does so; kernels then run in its interpreter.
     os.environ.setdefault("TRITON_INTERPRET", "1")
 
 from sgsst_core.errors import WeightsError
@@ -19,7 +19,7 @@ from tests import networks
 
 
 def pytest_make_parametrize_id(val: object) -> str | None:
-    """Bytes are named by their number: what is in them may hold the time (gzip) and differ between processes."""
+    """Name bytes by their length, because their content (gzip times) may differ between processes."""
     return f"{len(val)}-bytes" if isinstance(val, bytes) else None
 
 
@@ -28,7 +28,7 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Folder with the real scenes, photos and paintings; tests that need it are skipped where it is not."""
+    """Return the folder with real scenes, photos and paintings; tests that need it are skipped if it is missing."""
     if not DATA.is_dir():
         pytest.skip(f"no real scenes at {DATA}: see CONTRIBUTING.md, 'Real data'")
     return DATA
@@ -36,7 +36,7 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """For views so small that waking a second thread takes longer than the work, above all on a busy machine."""
+    """Run PyTorch on one thread, for views so small that waking a second one takes longer than the work."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -45,7 +45,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def vgg16_weights() -> BackboneWeights:
-    """The real VGG16 from the user's cache folder, fetched into it once; a test that cannot get it fails."""
+    """Load the real VGG16 from the user's cache folder, after downloading it there once; fail if that is impossible."""
     try:
         fetch_network_weights("vgg16")
         return load_network_weights("vgg16")
@@ -55,19 +55,19 @@ def vgg16_weights() -> BackboneWeights:
 
 @pytest.fixture(scope="session")
 def tiny_weights() -> BackboneWeights:
-    """A network of VGG16's layers with 16 channels each: where one computation is compared with another one."""
+    """Return VGG16 with 16 channels per layer, for tests that compare two computations."""
     return networks.tiny_weights()
 
 
 @pytest.fixture(scope="session")
 def tiny_cache(vgg16_weights: BackboneWeights, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache folder with the tiny network as vgg16, for `SGSST_CACHE` of other processes. Not to be changed."""
+    """Return a cache folder with the tiny network as vgg16, for `SGSST_CACHE` of other processes. Read-only."""
     return networks.install_tiny_weights(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture(scope="module")
 def tiny_installed(tiny_cache: Path) -> Iterator[Path]:
-    """The tiny network is what is installed: for the command in this process, and processes that it starts."""
+    """Install the tiny network for commands in this process and for processes that it starts."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SGSST_CACHE", str(tiny_cache))
         yield tiny_cache

@@ -1,4 +1,4 @@
-"""A feature network so small that its share of a test can be neglected."""
+"""Feature networks so small that their share of a test's time is negligible."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder, fetch_network_weights
 from sgsst_core.features.vgg import PIXELS
 
-#: Channels of every layer.
+#: Number of channels of every layer.
 CHANNELS = 16
 
 
 @functools.cache
 def tiny_weights(name: Literal["vgg16", "vgg19"] = "vgg16") -> BackboneWeights:
-    """A network's layers with `CHANNELS` channels each and random weights, the same ones in every process.
+    """Return a network's layers with `CHANNELS` channels each and fixed random weights.
 
-    For tests that compare one computation with another one, which any network serves for.
+    It serves for tests that compare two computations, which any network can show.
     """
     return BackboneWeights(
         name=name,
@@ -35,12 +35,12 @@ def tiny_weights(name: Literal["vgg16", "vgg19"] = "vgg16") -> BackboneWeights:
 
 
 def comparing_pixels(weights: BackboneWeights, factor: float = 20.0) -> BackboneWeights:
-    """The same network, whose pixels are compared as well, times a factor."""
+    """Return the same network with the pixels compared too, multiplied by a factor."""
     return replace(weights, scales={**weights.scales, PIXELS: factor})
 
 
 def install_tiny_weights(folder: Path) -> Path:
-    """Make a folder what `SGSST_CACHE` can name: `tiny_weights` as vgg16, and the real weights of LPIPS beside it."""
+    """Install `tiny_weights` as vgg16 and the real weights of LPIPS in a folder, for use as `SGSST_CACHE`."""
     file = folder / "narrow.pth"
     state: dict[str, torch.Tensor] = {}
     for name, (weight, bias) in tiny_weights().convolutions.items():
@@ -52,7 +52,7 @@ def install_tiny_weights(folder: Path) -> Path:
 
 
 def _random_layers(name: str) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-    """Convolutions after He et al. (2015), which keep the features' size from layer to layer."""
+    """Return convolutions after He et al. (2015), which keep the size of features from layer to layer."""
     generator = torch.Generator().manual_seed(16)
     layers, channels = {}, 3
     for block, count in enumerate(BLOCKS[name], start=1):

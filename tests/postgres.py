@@ -1,4 +1,4 @@
-"""A PostgreSQL server for tests and benchmarks, where its programs are installed."""
+"""PostgreSQL server for tests and benchmarks, if PostgreSQL is installed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sqlalchemy import create_engine, text
 
 
 def is_installed() -> bool:
-    """Whether its programs are there."""
+    """Return whether the programs of PostgreSQL are installed."""
     return _programs() is not None
 
 
@@ -73,10 +73,10 @@ class Postgres:
 
 @contextmanager
 def controlled_server(*, durable: bool = False) -> Iterator[Postgres]:
-    """A server that ends with the block.
+    """Run a server within the block. Yields it.
 
     Args:
-        durable: commits are on the disk before they are answered, as they should be where time is measured.
+        durable: Whether commits are on disk before they are acknowledged, as is needed for realistic timing.
     """
     made = Postgres(durable=durable)
     made.start()
@@ -94,7 +94,7 @@ def server(*, durable: bool = False) -> Iterator[str]:
 
 
 def fresh_database(url: str) -> str:
-    """The URL of an empty database on a server."""
+    """Create an empty database on a server and return its URL."""
     name = f"t{os.urandom(6).hex()}"
     engine = create_engine(f"{url}/postgres", isolation_level="AUTOCOMMIT")
     with engine.connect() as connection:

@@ -1,4 +1,4 @@
-"""TF32 on a processor: factors are rounded to its 10 bits, products summed in float32, as NVIDIA's GPUs do it."""
+"""Emulation of NVIDIA's TF32 on a CPU: factors are rounded to 10 bits, products are summed in float32."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from torch import Tensor
 from sgsst_core.features import vgg
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 
-#: Bits of float32's significand that TF32 does not have.
+#: Bits of float32's significand that TF32 lacks.
 _LOST = 13
 
 
 def to_tf32(values: Tensor) -> Tensor:
-    """Float32 values rounded to 10 bits, to nearest and even."""
+    """Round float32 values to 10 bits, to nearest, ties to even."""
     bits = values.view(torch.int32)
     half_and_tie = (1 << _LOST - 1) - 1 + (bits >> _LOST & 1)
     return (bits + half_and_tie & ~((1 << _LOST) - 1)).view(torch.float32)
 
 
 class RoundedToTf32(FeatureNetwork):
-    """A float32 network whose convolutions round their factors.
+    """Float32 network whose convolutions round their factors.
 
     Args:
-        decisions: its ReLU masks and pool positions take the place of those that rounding arrives at.
+        decisions: Network whose ReLU masks and pool positions replace those of the rounded one; None keeps its own.
     """
 
     def __init__(self, *arguments: Any, decisions: FeatureNetwork | None = None) -> None:

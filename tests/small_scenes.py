@@ -1,4 +1,4 @@
-"""Scenes, cameras and files so small that a step of the optimizer takes a few hundredths of a second."""
+"""Scenes, cameras and files so small that an optimizer step takes a few hundredths of a second."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 64, 48
 
 
 def wall(columns: int = 28, rows: int = 22, sh_degree: int = 0) -> Scene:
-    """A wall of flat Gaussians at z = 3 that fills every view of `cameras`."""
+    """Return a wall of flat Gaussians at z = 3 that fills every view of `cameras`."""
     generator = torch.Generator().manual_seed(5)
     x = torch.linspace(-2.4, 2.4, columns)
     y = torch.linspace(-1.9, 1.9, rows)
@@ -37,7 +37,7 @@ def wall(columns: int = 28, rows: int = 22, sh_degree: int = 0) -> Scene:
 
 
 def ball(count: int = 300) -> Scene:
-    """A ball of radius 0.7 at z = 3 with nothing around it, as object scans are."""
+    """Return a ball of radius 0.7 at z = 3 with nothing around it, like an object scan."""
     generator = torch.Generator().manual_seed(6)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     return Scene(
@@ -51,7 +51,7 @@ def ball(count: int = 300) -> Scene:
 
 
 def cameras(count: int = 3, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Cameras side by side at z = 0 that look at (0, 0, 3)."""
+    """Return cameras side by side at z = 0 that look at (0, 0, 3)."""
     target, up = torch.tensor([0.0, 0.0, 3.0]), torch.tensor([0.0, -1.0, 0.0])
     positions = torch.linspace(-0.3, 0.3, count) if count > 1 else torch.zeros(1)
     return [
@@ -61,19 +61,19 @@ def cameras(count: int = 3, width: int = WIDTH, height: int = HEIGHT) -> list[Ca
 
 
 def blind_camera() -> Camera:
-    """A camera that looks the other way."""
+    """Return a camera that looks away from the scene."""
     there = torch.tensor([0.0, 0.0, -3.0])
     up = torch.tensor([0.0, -1.0, 0.0])
     return look_at("blind", torch.zeros(3), there, up, width=WIDTH, height=HEIGHT, focal=WIDTH)
 
 
 def style() -> Tensor:
-    """A style image [96, 80, 3] float32."""
+    """Return a style image [96, 80, 3] float32."""
     return picture(96, 80, seed=1, dtype=torch.float32)
 
 
 def write_files(folder: Path, scene: Scene | None = None, views: list[Camera] | None = None) -> tuple[Path, Path, Path]:
-    """Write scene.ply, cameras.json (INRIA's form) and style.png, and return their paths."""
+    """Write scene.ply, cameras.json (in INRIA's format) and style.png, and return their paths."""
     ply, file, image = folder / "scene.ply", folder / "cameras.json", folder / "style.png"
     write_scene(ply, scene or wall())
     entries = [

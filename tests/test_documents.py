@@ -1,4 +1,4 @@
-"""README, CONTRIBUTING, CHANGELOG and docs/: what they name is there. `make docs` checks the anchors, too."""
+"""Tests that what README, CONTRIBUTING, CHANGELOG and docs/ refer to exists. `make docs` checks the anchors too."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-#: Columns of a line; a table's row cannot be broken.
+#: Maximum line length; rows of a table are exempt, because they cannot be wrapped.
 COLUMNS = 120
-#: Folders whose files a document may name.
+#: Folders with files that a document may refer to.
 FOLDERS = ("sgsst_core", "worker", "service", "api", "tests", "benchmarks", "deploy", "docs")
 
 
 def name_of(document: Path) -> str:
-    """As a test's id."""
+    """Return the id of a document's test."""
     return document.relative_to(ROOT).as_posix()
 
 
 each_document = pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
-#: The changelog names files and modules of before, too.
+#: Excludes the changelog, which also names files and modules of earlier versions.
 each_document_of_today = pytest.mark.parametrize(
     "document", [path for path in DOCUMENTS if path.name != "CHANGELOG.md"], ids=name_of
 )

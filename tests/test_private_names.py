@@ -1,6 +1,6 @@
-"""Names that packages do not promise, and what to do when a new version has taken one away.
+"""Tests that the private names of dependencies that the project uses still exist.
 
-The upper bounds of Ray, PyTorch and uvicorn in pyproject.toml keep such a version out until these tests pass with it.
+The upper bounds of Ray, PyTorch and uvicorn in pyproject.toml exclude a new version until these tests pass with it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN = r"(?!sgsst_core|worker|service|api)"
-#: Private modules and functions that are imported, and private options that are given to a call.
+#: Private modules and functions that are imported, and private options of calls.
 PRIVATE = re.compile(
     rf"^\s*(?:from|import) {OWN}\S*\._\w+|^\s*from {OWN}\S+ import .*\b_\w+|^\s+_[a-z_]+=", re.MULTILINE
 )
@@ -30,7 +30,10 @@ def test_only_these_modules_use_private_names() -> None:
 
 
 def ray_worker() -> str:
-    """Source of Ray's module for drivers. Ray is not imported: it reads how it shall authenticate when it is."""
+    """Return the source of Ray's driver module.
+
+    Ray itself is not imported, because it reads its authentication mode at import.
+    """
     spec = importlib.util.find_spec("ray")
     assert spec is not None
     assert spec.origin is not None
@@ -78,9 +81,9 @@ def test_ray_binds_to_loopback_where_it_is_no_part_of_a_cluster() -> None:
 
 
 def test_the_store_of_ranks_takes_a_socket() -> None:
-    import torch.distributed as dist
+    from torch.distributed.distributed_c10d import TCPStore
 
-    assert "master_listen_fd" in (dist.TCPStore.__init__.__doc__ or ""), (
+    assert "master_listen_fd" in (TCPStore.__init__.__doc__ or ""), (
         "PyTorch's store no longer takes a socket that listens already. Find how it can be bound to one address, and "
         "change `_meet` in worker/ranks/process_group.py; else it listens on every interface, without "
         "authentication."
@@ -88,7 +91,6 @@ def test_the_store_of_ranks_takes_a_socket() -> None:
 
 
 def test_a_process_group_forgets_its_device() -> None:
-    import torch.distributed as dist
 
     assert isinstance(getattr(dist.ProcessGroup, "bound_device_id", None), property), (
         "A process group no longer has bound_device_id. Find how groups of some ranks are made without the others, and "

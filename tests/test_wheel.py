@@ -1,7 +1,7 @@
-"""The wheel, installed into an environment of its own and used from another folder.
+"""Tests of the wheel, installed into an environment of its own and used from another folder.
 
-The environment sees the packages of the one that the tests run in, so that nothing is downloaded, but not this project:
-what the wheel does not bring along is missing there.
+The environment can import the packages of the present one, so nothing is downloaded, but not this project: files that
+the wheel lacks are missing there.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PACKAGES = ("sgsst_core", "worker", "service", "api")
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of this working tree, built in a copy of it: building leaves folders behind."""
+    """Build the wheel in a copy of this working tree, because building leaves folders behind."""
     copy = tmp_path_factory.mktemp("source")
     for name in PACKAGES:
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -43,20 +43,21 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the commands of an environment that the wheel is installed in."""
+    """Install the wheel into a new environment and return the folder of its commands."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False)
     commands = folder / "bin"
     pip = [sys.executable, "-m", "pip", "--python", str(commands / "python"), "--disable-pip-version-check"]
     subprocess.run([*pip, "install", "--quiet", "--no-deps", "--no-index", str(wheel)], check=True)
     packages = sysconfig.get_path("purelib", vars={"base": str(folder), "platbase": str(folder)})
-    # a folder that a .pth file names is searched, but .pth files in it are not read: no editable installation is seen
+    # A .pth file adds a folder to the search path, but .pth files in that folder are not read, so no editable
+    # installation is visible.
     Path(packages, "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
     return commands
 
 
 def run(command: list[str | Path], folder: Path, **variables: str) -> str:
-    """What a command prints that runs in another folder than this project's; it must not fail."""
+    """Run a command in a folder outside this project. Returns its output; fails if the command does."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(command, cwd=folder, env={**environment, **variables}, capture_output=True, text=True)
     assert done.returncode == 0, f"{command}:\n{done.stdout}\n{done.stderr}"

@@ -1,1 +1,1 @@
-"""A fleet in simulation: its jobs, its hosts under a clock of their own, and what is told of them."""
+"""Simulation of a fleet: its jobs, its hosts under a simulated clock, and its figures."""

@@ -1,8 +1,8 @@
-"""What one PostgreSQL takes: a long queue, and everything that a fleet's dispatchers write, by real calls.
+"""Load on one PostgreSQL server from a long queue and from all writes of a fleet's dispatchers, measured by real calls.
 
-Each thing that a dispatcher does is done many times by some threads at once; how often a fleet does it follows from
-its jobs and from the service's own intervals. The server is on this machine, with durable commits, and so are the
-clients: processor seconds are the server's own.
+Each action of a dispatcher runs many times on several threads at once. How often a fleet does it follows from its jobs
+and from the service's own intervals. The server runs on this machine with durable commits, and so do the clients;
+processor seconds are those of the server alone.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from tests.postgres import fresh_database, server
 _SHA = "a" * 64
 _OWNERS, _THREADS, _EACH = 50, 4, 12
 _INPUTS = [{"role": "scene", "name": "scene.ply", "sha256": _SHA, "size": 10**9}]
-#: A preview is published this often (`ServiceSettings.preview_seconds`).
+#: Seconds between previews (`ServiceSettings.preview_seconds`).
 _PREVIEW_SECONDS = 20.0
-#: GPUs of a saturated fleet that are kept for jobs of several (3 % were idle in simulation): there are no more
-#: dispatchers than these that look in vain for what may run beside.
+#: Fraction of a saturated fleet's GPUs that are reserved for jobs on several GPUs (3 % were idle in simulation). At
+#: most this many dispatchers look in vain for a job to backfill.
 _KEPT_GPUS = 0.03
 
 
 def measure(queued: int, gpus: int, dispatchers: int) -> dict[str, Any]:
-    """The lease query, what each call costs, and what a fleet of so many GPUs comes to."""
+    """Measure the lease query and the cost of each call, and extrapolate to a fleet."""
     with server(durable=True) as url, tempfile.TemporaryDirectory() as folder:
         settings = ServiceSettings(data=Path(folder), database=fresh_database(url), lease_seconds=3600)
         store = open_store(settings)
@@ -61,7 +61,7 @@ def _fill(store: Store, queued: int) -> None:
 
 
 def _lease_query(store: Store) -> dict[str, float]:
-    """Milliseconds in which the next job is found: both statements together; `least` is what it takes undisturbed."""
+    """Return the milliseconds to find the next job, for both statements together; `least` is the undisturbed time."""
     took: list[float] = []
     started = 0.0
 
@@ -86,21 +86,24 @@ def _lease_query(store: Store) -> dict[str, float]:
 
 
 def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
-    """Statements, the server's processor time and calls a second of everything that a fleet does, one by one."""
+    """Return the statements, server time and rate of each call that a fleet makes."""
     leases: dict[str, list[Lease]] = {f"host-{number}": [] for number in range(_THREADS)}
 
     def own() -> list[Lease]:
-        """Leases of this thread: no two dispatchers write to one job."""
+        """Return the leases of this thread; no two dispatchers write to the same job."""
         return leases[threading.current_thread().name]
 
     def take(*room: Callable[[Any], Any]) -> None:
         lease = store.leases.take(threading.current_thread().name, *room)
-        while lease is None:  # another one holds the row that is next
+        while lease is None:  # another thread has locked the row that is next
             lease = store.leases.take(threading.current_thread().name, *room)
         own().append(lease)
 
     def keeping(lets_in: bool) -> list[Callable[[Any], Any]]:
-        """There is no room for the next job, which room is kept for; for the one after it there is, or for none."""
+        """Return filters for a job that does not fit, for which GPUs are reserved.
+
+        The job after it may use the reserved GPUs, or no job may.
+        """
         return [lambda job: False, lambda job: True, lambda kept: lambda job: lets_in]
 
     def some() -> Lease:
@@ -172,7 +175,7 @@ def _cost(store: Store, port: int, call: Callable[[], Any]) -> dict[str, float]:
 
 
 def _server_seconds(port: int) -> float:
-    """Processor seconds of all of the server's processes; connections are kept, so that none of them ends."""
+    """Return the processor seconds of all server processes; connections stay open, so none of them ends."""
     seconds = 0.0
     for connection in psutil.net_connections("tcp"):
         if connection.status == psutil.CONN_LISTEN and connection.laddr.port == port and connection.pid:
@@ -185,7 +188,7 @@ def _server_seconds(port: int) -> float:
 
 
 def _fleet(calls: dict[str, dict[str, float]], gpus: int, dispatchers: int) -> dict[str, Any]:
-    """How often a fleet does each, what that comes to, and how many GPUs take all of a core of the server."""
+    """Return how often a fleet makes each call, the total load, and the number of GPUs that saturate a core."""
     demand = Demand(gpus)
     jobs = demand.jobs(0.2, 0)
     a_second = demand.jobs_a_day * gpus / 1000 / 86_400
@@ -216,7 +219,7 @@ def _fleet(calls: dict[str, dict[str, float]], gpus: int, dispatchers: int) -> d
 
 
 def _reports(seconds: float) -> float:
-    """Writes of progress in so many seconds of steps."""
+    """Return the number of progress reports in some seconds of steps."""
     count, now = 0.0, 0.0
     while now < seconds:
         now += progress_seconds(now)

@@ -1,7 +1,7 @@
-"""The jobs of a fleet: how large they are, who sends them and when. Seeded, and nothing else decides them.
+"""Jobs of a simulated fleet: their sizes, owners and arrival times, determined by a seed.
 
-Seconds are those of `service.scheduling.job_size`, which a test holds against `benchmarks.forecast`; a job's own differ
-from them by a factor that its record does not tell.
+Seconds are those of `service.scheduling.job_size`, which a test compares with `benchmarks.forecast`. The actual time of
+a job differs from them by a random factor that its record does not reveal.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from typing import Any
 from service.scheduling.job_size import JobSize, estimated_size
 from sgsst_core.planning.ranks_model import LEAST_GAIN
 
-#: Bytes of a Gaussian of SH 3 in a PLY.
+#: Bytes of a Gaussian with SH of degree 3 in a PLY.
 GAUSSIAN_BYTES = 248
-#: Seconds before a job's first step: process, CUDA and network; bytes a second from the store; the plan, which takes
-#: some time and some steps' worth of it.
+#: Seconds before a job's first step (process, CUDA and network); bytes per second from the store; seconds of planning,
+#: and steps it takes on top.
 _START_SECONDS, _STAGING_BYTES, _PLAN_SECONDS, _PLAN_STEPS = 12.0, 1e9, 6.0, 10
-#: Standard deviation of the logarithm of what a job takes, over what its size says.
+#: Standard deviation of the logarithm of a job's actual time over its predicted one.
 _SPREAD = 0.35
-#: Of the jobs of more than the usual size, those that name a number of workers.
+#: Fraction of the jobs above the usual size that request a number of workers.
 _NAMES_WORKERS = 0.08
-#: Bursts a day, each of one key within a minute, and their jobs.
+#: Bursts per day, each from one key within a minute, and jobs per burst.
 _BURSTS, _BURST_JOBS = 24, 250
-#: How far the rate of arrivals goes up and down in the course of a day.
+#: Relative variation of the arrival rate in the course of a day.
 _SWING = 0.25
 
 
@@ -36,9 +36,11 @@ class Kind:
     """Jobs of about one size.
 
     Attributes:
-        share: of all jobs; None for those that bring the load to what is wanted.
-        sides: longer sides of views, pixels.
-        gaussians: the fewest and the most.
+        name: Name of the kind.
+        preset: Preset of its jobs.
+        share: Fraction of all jobs; None for the kinds that fill the load up to the target.
+        sides: Longer sides of views in pixels.
+        gaussians: Minimum and maximum number of Gaussians.
     """
 
     name: str
@@ -55,17 +57,21 @@ KINDS = (
     Kind("paper", "paper", None, (980, 1600), (1e6, 4e6)),
     Kind("paper, large", "paper", None, (5187,), (3e6, 8e6)),
 )
-#: Of the kinds without a share, the large ones.
+#: Fraction of large jobs among the kinds without a share.
 _LARGE_PAPERS = 0.04
 
 
 @dataclass(frozen=True)
 class SimulatedJob:
-    """A job, as its user sends it and as it will turn out.
+    """Job as its user submits it, with its actual run time.
 
     Attributes:
-        at: seconds from the beginning.
-        factor: what it takes of the seconds that its size says.
+        at: Arrival time in seconds from the start.
+        owner: Key that submits it.
+        kind: Name of its kind.
+        parameters: Parameters of the job.
+        scene_bytes: Size of the scene file.
+        factor: Actual time relative to the predicted one.
     """
 
     at: float
@@ -77,30 +83,30 @@ class SimulatedJob:
 
     @property
     def inputs(self) -> list[dict[str, Any]]:
-        """As the store keeps them."""
+        """Inputs as the store records them."""
         return [{"role": "scene", "name": "scene.ply", "sha256": "a" * 64, "size": self.scene_bytes}]
 
     @property
     def size(self) -> JobSize:
-        """What there is to do."""
+        """Predicted amount of work."""
         return _size(self.parameters["preset"], self.parameters["resolution"], self.scene_bytes)
 
     @property
     def steps(self) -> int:
-        """Of both phases."""
+        """Number of steps in both phases."""
         return self.size.steps_coarse + self.size.steps_sos
 
     def seconds(self, gpus: int) -> float:
-        """Of all steps on so many GPUs."""
+        """Return the seconds of all steps on a number of GPUs."""
         return self.factor * self.size.seconds(gpus)
 
     def start_seconds(self) -> float:
-        """Before the first step of an attempt."""
+        """Return the seconds before the first step of an attempt."""
         planning = _PLAN_SECONDS + _PLAN_STEPS * self.seconds(1) / max(self.steps, 1)
         return _START_SECONDS + self.scene_bytes / _STAGING_BYTES + planning
 
     def planned(self, offered: int) -> int:
-        """GPUs that its plan takes of those offered: the fewest with which no more would be worth it."""
+        """Return how many of the offered GPUs its plan uses: the fewest beyond which more gain too little."""
         if self.parameters.get("workers"):
             return offered
         seconds = [self.seconds(gpus) for gpus in range(1, offered + 1)]
@@ -115,13 +121,15 @@ def _size(preset: str, side: int, scene_bytes: int) -> JobSize:
 
 @dataclass(frozen=True)
 class Demand:
-    """What is asked of a fleet.
+    """Demand on a fleet.
 
     Attributes:
-        gpus: of the fleet.
-        load: GPU seconds of the jobs on one GPU each, over those that there are.
-        jobs_a_day: of all keys together, for a fleet of 1,000 GPUs; smaller ones get their part.
-        keys: that send them; the first of them alone sends `greedy` of all jobs, at once.
+        gpus: Number of GPUs of the fleet.
+        load: GPU seconds requested, with each job on one GPU, relative to those available.
+        jobs_a_day: Jobs per day of all keys together, for a fleet of 1,000 GPUs; smaller fleets get a proportional
+            number.
+        keys: Number of keys that submit jobs.
+        greedy: Fraction of all jobs that the first key submits at once.
     """
 
     gpus: int
@@ -131,7 +139,7 @@ class Demand:
     greedy: float = 0.05
 
     def jobs(self, hours: float, seed: int) -> list[SimulatedJob]:
-        """In the order of their arrival."""
+        """Return the jobs of some hours in the order of their arrival."""
         chance = random.Random(seed)
         count = round(self.jobs_a_day * self.gpus / 1000 * hours / 24)
         shares = self.shares(chance)
@@ -146,7 +154,7 @@ class Demand:
         return sorted(jobs, key=lambda job: job.at)
 
     def _times(self, count: int, seconds: float, chance: random.Random) -> Iterator[tuple[float, str | None]]:
-        """When jobs come; with the key where they come in a burst."""
+        """Yield the arrival times of jobs, with the key for jobs in a burst."""
         greedy = round(self.greedy * count)
         for _ in range(greedy):
             yield 0.3 * seconds + chance.uniform(0, 60), "key_000"
@@ -164,7 +172,7 @@ class Demand:
                 yield at, None
 
     def shares(self, chance: random.Random) -> list[float]:
-        """Of each kind, so that all jobs together make the load."""
+        """Return the fraction of each kind, such that all jobs together make up the load."""
         means = [_mean_seconds(kind, chance) for kind in KINDS]
         given = sum(kind.share or 0.0 for kind in KINDS)
         wanted = self.load * 1000 * 86_400 / self.jobs_a_day

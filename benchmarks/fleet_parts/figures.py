@@ -1,4 +1,4 @@
-"""What a simulated fleet has done: use of its GPUs, waits by size and by key, what failures cost."""
+"""Figures of a simulated fleet: GPU utilization, waits by size and by key, cost of failures."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 from benchmarks.fleet_parts.simulation import Fleet, Record
 
-#: A job that waits longer than its own work, or than this, has starved.
+#: A job has starved if it waits longer than this plus its own run time.
 _STARVED_SECONDS = 3600.0
 
 
 def figures(fleet: Fleet, seconds: float, warm_up: float) -> dict[str, Any]:
-    """All of them; GPU seconds and waits after the warm-up."""
+    """Return all figures; GPU seconds and waits count from the end of the warm-up."""
     records = list(fleet.records.values())
     counted = [record for record in records if record.job.at >= warm_up]
     gpus = sum(host.gpus for host in fleet.hosts)
@@ -42,12 +42,12 @@ def figures(fleet: Fleet, seconds: float, warm_up: float) -> dict[str, Any]:
 
 
 def _wait(record: Record, now: float) -> float:
-    """Seconds until the first attempt; so far, where it has not begun."""
+    """Return the seconds until the first attempt, or so far if it has not started."""
     return (now if record.started is None else record.started) - record.job.at
 
 
 def spread(values: Iterable[float]) -> dict[str, float]:
-    """Percentiles of seconds."""
+    """Return percentiles of seconds."""
     found = sorted(values)
     if not found:
         return {}
@@ -68,7 +68,7 @@ def _by(records: Sequence[Record], now: float, name: Any) -> dict[str, Any]:
 
 
 def _keys(records: Sequence[Record], now: float) -> dict[str, Any]:
-    """The greedy key, those with the most jobs, and of all others how their keys fare."""
+    """Return the waits of the greedy key, of the keys with most jobs, and a summary of all other keys."""
     groups = _grouped(records, lambda record: record.job.owner)
     greedy = groups.pop("key_000", [])
     others = {key: spread(_wait(record, now) for record in own) for key, own in groups.items()}

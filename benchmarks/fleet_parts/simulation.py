@@ -1,9 +1,9 @@
-"""Hosts under a simulated clock: the service's own queue, turns, leases and packing decide, and only time is made up.
+"""Hosts under a simulated clock, with the service's own queue, fairness, leases and packing.
 
-Each host has a dispatcher. A dispatcher asks for work when it has room and something may be there for it, within the
-half second in which a real one looks again; looks that find nothing are not simulated, but counted by
-`benchmarks.fleet_parts.database`. Leases are not renewed but hold until a host fails, and run out as late as they
-would have; the same goes for checkpoints, of which the last one before a failure is published.
+Each host has a dispatcher. A dispatcher asks for work when it has free GPUs and there may be a job for it, within the
+half second in which a real one polls. Polls that find nothing are not simulated, but counted by
+`benchmarks.fleet_parts.database`. Leases are not renewed: they hold until a host fails, and then expire as late as they
+really would. Likewise, only the last checkpoint before a failure is published.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ from service.store.leases import Lease, Published
 from service.store.tables import ReservationRow
 
 LEASE_SECONDS, CHECKPOINT_SECONDS, POLL_SECONDS = 30.0, 60.0, 0.5
-#: Seconds after which a host looks again that has room, but for none of the jobs that wait (`POLL_SECONDS` in truth).
+#: Seconds after which a host polls again if it has free GPUs but fits none of the waiting jobs (a real one uses
+#: `POLL_SECONDS`).
 _LOOK_AGAIN = 10.0
-#: A failed host is back after so many seconds, at least and at most.
+#: Minimum and maximum seconds until a failed host is back.
 _REPAIR_SECONDS = (600.0, 3600.0)
 _EPOCH = 1_700_000_000.0
 _SHA = "a" * 64
@@ -43,13 +44,14 @@ _SHA = "a" * 64
 
 @dataclass
 class Record:
-    """What became of a job.
+    """Record of a job.
 
     Attributes:
-        started: when its first attempt began.
+        started: Time at which its first attempt started.
         offered, planned: GPUs of its last attempt.
-        held: GPU seconds, of all attempts; `lost` of them for nothing.
-        done: share of its steps that is saved.
+        held: GPU seconds of all attempts.
+        lost: GPU seconds of work that was lost.
+        done: Fraction of its steps that is saved.
     """
 
     job: SimulatedJob
@@ -65,7 +67,7 @@ class Record:
 
 @dataclass
 class Attempt:
-    """A job that holds GPUs of a host."""
+    """Attempt of a job that holds GPUs of a host."""
 
     record: Record
     lease: Lease
@@ -77,7 +79,7 @@ class Attempt:
 
     @property
     def holding(self) -> Holding:
-        """As a real attempt tells it: nothing before its steps, and then what is right."""
+        """Holding as a real attempt reports it: without an end before its first step, then with the right one."""
         if self.ends is None:
             return Holding(self.grant)
         pace = None if self.record.attempts > 1 else self.record.job.factor
@@ -86,7 +88,7 @@ class Attempt:
 
 @dataclass
 class Host:
-    """A machine with its dispatcher; `alive` counts its lives, so that what was due in an earlier one is void."""
+    """Machine with its dispatcher; `life` counts its restarts, so that events of an earlier life are ignored."""
 
     dispatcher: Dispatcher
     gpus: int
@@ -98,12 +100,12 @@ class Host:
 
     @property
     def held(self) -> list[Holding]:
-        """What its jobs have."""
+        """Holdings of its jobs."""
         return [attempt.holding for attempt in self.running.values()]
 
     @property
     def free(self) -> int:
-        """GPUs that no job holds."""
+        """Number of GPUs that no job holds."""
         return self.gpus - sum(len(attempt.grant.gpus) for attempt in self.running.values()) if self.up else 0
 
 
@@ -111,9 +113,11 @@ class Fleet:
     """Hosts, their store and a clock.
 
     Args:
-        folder: of the store, in memory by preference.
-        hosts: how many, of `gpus_each` GPUs.
-        host_days: mean days between failures of a host.
+        folder: Folder of the store, preferably in memory.
+        hosts: Number of hosts.
+        gpus_each: GPUs per host.
+        host_days: Mean days between failures of a host.
+        seed: Seed of the random choices.
     """
 
     def __init__(self, folder: Path, hosts: int, gpus_each: int, host_days: float, seed: int) -> None:
@@ -129,7 +133,7 @@ class Fleet:
         self._number = 0
         self._doing = ""
         self._waiting = 0
-        # leases hold as long as the simulation lasts: `_run_out` ends those of hosts that have failed
+        # Leases last as long as the simulation; `_run_out` ends those of failed hosts.
         settings = ServiceSettings(data=folder, lease_seconds=1e9, log_format="text")
         self.store: Store = open_store(settings, lambda: _EPOCH + self.now)
         self._prepare_store()
@@ -152,14 +156,16 @@ class Fleet:
         self.statements[self._doing] += 1
 
     def run(self, jobs: list[SimulatedJob], seconds: float, warm_up: float, patience: float = math.inf) -> float:
-        """Let the jobs come; GPU seconds before the warm-up's end do not count.
+        """Run the simulation; GPU seconds before the end of the warm-up do not count.
 
         Args:
-            seconds: to simulate.
-            patience: seconds that this may take; what has been simulated by then has to do.
+            jobs: Jobs that arrive.
+            seconds: Seconds to simulate.
+            warm_up: Seconds of the warm-up.
+            patience: Maximum seconds of computing, after which the simulation stops early.
 
         Returns:
-            Seconds that were simulated.
+            Seconds simulated.
         """
         started = time.perf_counter()
         self._at(warm_up, self._forget_held)
@@ -197,7 +203,7 @@ class Fleet:
         return self.now + self._chance.uniform(0, POLL_SECONDS)
 
     def _do(self, what: str) -> None:
-        """Statements from now on are for this."""
+        """Attribute the following statements to this action."""
         self._doing = what
         self.calls[what] += 1
 
@@ -210,7 +216,7 @@ class Fleet:
         self._at(self._soon(), self._somebody_looks)
 
     def _somebody_looks(self) -> None:
-        """Hosts with room look for work, in the order in which they happen to."""
+        """Let hosts with free GPUs poll for work, in random order."""
         hosts = [host for host in self.hosts if host.free and host.keeps_room_for is None]
         self._chance.shuffle(hosts)
         for host in hosts:
@@ -219,7 +225,7 @@ class Fleet:
             self._look(host)
 
     def _look(self, host: Host) -> None:
-        """A dispatcher takes what it finds room for, as the real one does in each round."""
+        """Let a dispatcher take every job that fits, as the real one does in each round."""
         while host.free and self._waiting:
             self._do("lease")
             found = host.dispatcher.next_job(host.held)
@@ -302,7 +308,7 @@ class Fleet:
         self._at(self.now + self._chance.uniform(*_REPAIR_SECONDS), lambda: self._repair(host))
 
     def _lose(self, attempt: Attempt) -> None:
-        """What was done since the last checkpoint is lost, and the time before the first step."""
+        """Record as lost the work since the last checkpoint, or all of it before the first step."""
         record = attempt.record
         self._account(attempt)
         gpus = len(attempt.grant.gpus)
@@ -340,5 +346,5 @@ class Fleet:
 
 
 def _trust_the_memory(connection: Any, _record: Any) -> None:
-    """Nobody needs the simulated store after a power cut."""
+    """Turn off durability, which a simulated store does not need."""
     connection.execute("PRAGMA synchronous=OFF")

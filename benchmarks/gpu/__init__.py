@@ -1,5 +1,5 @@
-"""What a GPU does, in one command: `python -m benchmarks.gpu`. Each module but `inputs`, `part` and `clock` is a part.
+"""Benchmark of a GPU in one command: `python -m benchmarks.gpu`.
 
-A part is a function `run(sizes, found)`. It runs in a process of its own, so that one that fails, hangs or poisons the
-device leaves the others alone, and peaks of memory do not mix.
+Each module except `inputs`, `part` and `clock` is a part: a function `run(sizes, found)`. It runs in a process of its
+own, so that a part that fails, hangs or breaks the device does not affect the others, and peaks of memory do not mix.
 """

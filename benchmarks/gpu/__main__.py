@@ -1,11 +1,11 @@
-"""Everything about the GPU of this machine: correctness, seconds, bytes, in one command and one file.
+"""Measure the GPU of this machine (correctness, seconds, bytes), in one command and one file.
 
     python -m benchmarks.gpu [--quick] [--only PART ...] [--gaussians 1000000,3000000,6000000] [--out FILE.json]
 
-Needs PyTorch, Triton, NumPy, SciPy, Numba, psutil and safetensors; what needs more (pydantic for a job's settings,
-plyfile for a real scene) is skipped with the reason where that is missing. Takes less than nine minutes. Without a GPU
-it runs in small sizes through Triton's interpreter, which shows that the benchmark works, not how fast anything is.
-Results are in benchmarks/results/gpu_<device>.json. The exit status is 1 if a part has failed.
+Needs PyTorch, Triton, NumPy, SciPy, Numba, psutil and safetensors. Parts that need more (pydantic for a job's settings,
+plyfile for a real scene) are skipped with the reason if it is missing. Takes less than nine minutes. Without a GPU it
+runs small sizes in Triton's interpreter, which tests the benchmark but says nothing about speed. Results are in
+benchmarks/results/gpu_DEVICE.json. The exit status is 1 if a part has failed.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ import torch
 from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.machine import RESULTS, write_result
 
-#: Seconds that each part may take; 535 in all. The first to run on the CPU compiles its kernels.
+#: Time limit of each part in seconds, 535 in all. The first part that runs on the CPU compiles its kernels.
 BUDGETS = {"parity": 60, "raster": 100, "network": 40, "step": 90, "curve": 120, "ranks": 45, "tests": 80}
-#: Times as long without a GPU, where a processor may have others to serve, and seconds say nothing.
+#: Factor on the limits without a GPU, where the processor may be busy and seconds mean nothing.
 _PATIENCE = 5
-#: Packages of this repository: one that is missing is an error, not a reason to skip.
+#: Packages of this repository. A missing one is an error, not a reason to skip a part.
 _OWN = ("api", "benchmarks", "service", "sgsst_core", "tests", "worker")
 
 
 def main() -> int:
-    """Run all parts, or one of them for the process that runs all."""
+    """Run all parts, or the single part that this process was started for."""
     arguments = parse()
     if not torch.cuda.is_available():
-        os.environ["TRITON_INTERPRET"] = "1"  # read when kernels are first imported, which is in the parts' processes
+        os.environ["TRITON_INTERPRET"] = "1"  # read when kernels are first imported, in the parts' processes
     if arguments.findings:
         return run_part(arguments.only[0], arguments)
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
@@ -58,7 +58,7 @@ def main() -> int:
 
 
 def parse() -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small sizes; always so without a GPU")
     parser.add_argument("--only", nargs="+", choices=tuple(BUDGETS), metavar="PART", help=", ".join(BUDGETS))
@@ -71,7 +71,7 @@ def parse() -> argparse.Namespace:
 
 
 def sizes_of(arguments: argparse.Namespace) -> Sizes:
-    """What was asked for."""
+    """Return the requested sizes."""
     sizes = QUICK if arguments.quick else Sizes()
     if arguments.gaussians:
         sizes = replace(sizes, gaussians=tuple(int(count) for count in arguments.gaussians.split(",")))
@@ -79,12 +79,12 @@ def sizes_of(arguments: argparse.Namespace) -> Sizes:
 
 
 def in_a_process(part: str, budget: float) -> dict[str, Any]:
-    """Status, seconds and findings of a part; those until its end, where its time was up."""
+    """Run a part in a process. Returns status, seconds and findings, which may be incomplete if time ran out."""
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         path, errors = Path(folder) / "findings.json", Path(folder) / "errors.txt"
         command = [sys.executable, "-m", "benchmarks.gpu", *_without_parts(sys.argv[1:]), "--only", part]
-        with errors.open("w") as stderr:  # a session of its own: what the part has started ends with it
+        with errors.open("w") as stderr:  # in a session of its own, so that its child processes end with it
             process = subprocess.Popen([*command, "--findings", path], stderr=stderr, start_new_session=True)
             try:
                 status = process.wait(budget)
@@ -101,14 +101,14 @@ def in_a_process(part: str, budget: float) -> dict[str, Any]:
 
 
 def _without_parts(arguments: list[str]) -> list[str]:
-    """The options that parts share."""
+    """Return the options that all parts share."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--only", nargs="+")
     return parser.parse_known_args(arguments)[1]
 
 
 def run_part(part: str, arguments: argparse.Namespace) -> int:
-    """One part, in this process; its findings end with how it ended."""
+    """Run one part in this process; its last finding is its status."""
     found = Findings(arguments.findings)
     try:
         importlib.import_module(f"benchmarks.gpu.{part}").run(sizes_of(arguments), found)
@@ -125,7 +125,7 @@ def run_part(part: str, arguments: argparse.Namespace) -> int:
 
 
 def print_part(part: str, result: dict[str, Any]) -> None:
-    """A part as lines of a table."""
+    """Print a part as lines of a table."""
     print(f"\n{part}: {result['status']}, {result['seconds']} s")
     if "reason" in result:
         print(f"  {result['reason']}")
@@ -134,7 +134,7 @@ def print_part(part: str, result: dict[str, Any]) -> None:
 
 
 def leaves(found: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
-    """Values with their path; of long lists the ends."""
+    """Return all values with their paths; long lists are shortened to their ends."""
     lines: list[tuple[str, Any]] = []
     for name, value in found.items():
         if isinstance(value, dict):

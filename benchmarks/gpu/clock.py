@@ -1,4 +1,4 @@
-"""Seconds and bytes on a device."""
+"""Time and memory measurements on a device."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sgsst_core.timing import wait_for
 
 
 def seconds(action: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Median of so many calls, after one that does not count: between events on a GPU, by the clock on a CPU."""
+    """Return the median time of some calls after a warm-up call, by events on a GPU and by the clock on a CPU."""
     action()
     return statistics.median(_once(action, device) for _ in range(repeats))
 
@@ -32,7 +32,7 @@ def _once(action: Callable[[], object], device: torch.device) -> float:
 
 
 def waited_seconds(action: Callable[[], object], device: torch.device) -> float:
-    """Wall-clock seconds of one call, until the device has done all of it."""
+    """Return the wall-clock seconds of one call, until the device has finished it."""
     wait_for(device)
     started = time.perf_counter()
     action()
@@ -41,12 +41,12 @@ def waited_seconds(action: Callable[[], object], device: torch.device) -> float:
 
 
 def forget_peak(device: torch.device) -> None:
-    """Begin to measure peaks anew, with nothing held that is not in use."""
+    """Free unused memory and reset the peak."""
     if device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
 
 
 def peak_bytes(device: torch.device) -> int | None:
-    """Most bytes of the device in use at a time; None on a CPU."""
+    """Return the peak of allocated memory on the device in bytes, or None on a CPU."""
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None

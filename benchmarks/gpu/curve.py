@@ -1,4 +1,4 @@
-"""A run of many steps on the device and on the CPU: the loss follows the same curve.
+"""Loss curve of a run of many steps on the GPU, compared with that of the CPU.
 
 The CPU's run is a process that sees no GPU; both run at the same time.
 """
@@ -24,16 +24,16 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-#: Largest difference from the CPU's loss, as a share of it. Means over rounds of all views are compared, because Adam
-#: moves colors with gradients of rounding's size as far as any others, and single losses scatter by as much.
+#: Largest relative difference from the CPU's loss. Means over rounds of all views are compared: Adam moves a color as
+#: far for a gradient that is only rounding error as for any other, so single losses scatter by as much.
 BOUND = 1e-3
 VIEWS = 6
-#: The paper's. At 0.02, losses of runs whose colors begin 3e-7 apart come to differ by a percent.
+#: Learning rate of the paper. At 0.02, losses of runs whose initial colors differ by 3e-7 end up a percent apart.
 LEARNING_RATE = 2.5e-3
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Compare step by step."""
+    """Compare the losses step by step."""
     quick = sizes == QUICK
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "losses.json"
@@ -54,14 +54,14 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def largest_difference(losses: list[float], expected: list[float], window: int) -> float:
-    """Of the geometric means of so many steps, as a share."""
+    """Return the largest relative difference of geometric means over windows of steps."""
     differences = [math.log(a / b) for a, b in zip(losses, expected, strict=True)]
     starts = range(0, len(differences) - window + 1, window)
     return max(abs(sum(differences[start : start + window])) / window for start in starts)
 
 
 def follow(sizes: Sizes, rasterizer: str | None) -> tuple[str, list[float]]:
-    """The scene's name, and the loss of every step."""
+    """Run the job. Returns the scene's name and the loss of every step."""
     steps, side = sizes.curve
     name, scene, cameras = inputs(side, small=sizes == QUICK)
     settings = make_settings(
@@ -75,7 +75,7 @@ def follow(sizes: Sizes, rasterizer: str | None) -> tuple[str, list[float]]:
 
 
 def inputs(side: int, *, small: bool) -> tuple[str, Scene, list[Camera]]:
-    """A real scene where it is there and can be read, else a synthetic one."""
+    """Return a real scene if it is present and readable, otherwise a synthetic one."""
     folder = DATA / "scenes" / "snowmiku_plush"
     if not small and (folder / "cameras.json").is_file():
         try:
@@ -90,12 +90,12 @@ def inputs(side: int, *, small: bool) -> tuple[str, Scene, list[Camera]]:
 
 
 def synthetic(side: int, small: bool) -> tuple[Scene, list[Camera]]:
-    """A ball that fills the views."""
+    """Return a ball that fills the views."""
     return surface_scene(60 if small else 20_000, degree=1), views(1 if small else VIEWS, side, side * 3 // 4)
 
 
 def main(arguments: list[str]) -> None:
-    """The CPU's run: write its losses to the file named first."""
+    """Run on the CPU and write the losses to the file given first."""
     sizes: Any = QUICK if "--quick" in arguments else Sizes()
     Path(arguments[0]).write_text(json.dumps(follow(sizes, "cpu")[1]))
 

@@ -1,4 +1,4 @@
-"""Scenes, views, pictures and weights, generated from seeds, so that nothing has to be there."""
+"""Scenes, views, images and weights that are generated from seeds, so that no files are needed."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
 
-#: Standard deviation of a Gaussian over the distance to its neighbors: some thirty reach each point, as in scans.
+#: Standard deviation of a Gaussian over the distance to its neighbors. Some thirty reach each point, as in scans.
 _OVERLAP = 1.0
 _CHANNELS = (64, 128, 256, 512, 512)
 
 
 def surface_scene(count: int, degree: int = 0, seed: int = 0) -> Scene:
-    """Gaussians on a ball of radius 1, each as large as its share of the surface, with opacities as scans have."""
+    """Return Gaussians on a ball of radius 1, sized to cover it, with opacities like those of scans."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -38,7 +38,7 @@ def surface_scene(count: int, degree: int = 0, seed: int = 0) -> Scene:
 
 
 def views(count: int, width: int, height: int) -> list[Camera]:
-    """Cameras around the ball, which fills most of the height."""
+    """Return cameras around the ball, which fills most of the height."""
     up, center = torch.tensor([0.0, -1.0, 0.0]), torch.zeros(3)
     angles = torch.arange(count) * (2 * math.pi / max(count, 1))
     return [
@@ -51,7 +51,7 @@ def views(count: int, width: int, height: int) -> list[Camera]:
 
 
 def texture(height: int, width: int, seed: int = 0) -> Tensor:
-    """A picture [height, width, 3] float32 in 0..1 with structure at several sizes."""
+    """Return an image [height, width, 3] float32 in 0 to 1 with structure at several sizes."""
     generator = torch.Generator().manual_seed(seed)
     planes = torch.zeros((1, 3, height, width))
     for cell, strength in ((64, 0.5), (16, 0.3), (4, 0.2)):
@@ -61,9 +61,9 @@ def texture(height: int, width: int, seed: int = 0) -> Tensor:
 
 
 def network_weights() -> BackboneWeights:
-    """The installed weights of VGG19 or VGG16; where there are none, random ones of VGG19, which take as long.
+    """Return the installed weights of VGG19 or VGG16, or random ones of VGG19, which take the same time.
 
-    After He et al. (2015), which keeps the size of features from layer to layer.
+    Random weights follow He et al. (2015), which keeps the size of features from layer to layer.
     """
     try:
         return load_network_weights("auto")
@@ -72,7 +72,7 @@ def network_weights() -> BackboneWeights:
 
 
 def small_weights() -> BackboneWeights:
-    """Random weights of VGG16's layers with 16 channels each, for the interpreter's sizes."""
+    """Return random weights of VGG16's layers with 16 channels each, small enough for the interpreter."""
     return _random_weights("vgg16", (16,) * 5)
 
 

@@ -1,4 +1,4 @@
-"""TFLOP/s of the feature network, forward and backward, and their share of what the device can do."""
+"""Throughput of the feature network in TFLOP/s, forward and backward, and its fraction of the device's peak."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.gpu.part import QUICK, Findings, Sizes, device
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride, use_whole_float32
 
-#: Dense TFLOP/s by the data sheets, by a part of the device's name. The PCIe form of the H100 is a slower one.
+#: Dense TFLOP/s from the data sheets, by a substring of the device's name. The PCIe version of the H100 is slower.
 PEAKS: dict[str, dict[str, float]] = {
     "H200": {"bfloat16": 989, "tf32": 495, "float32": 67},
     "H100": {"bfloat16": 989, "tf32": 495, "float32": 67},
@@ -24,7 +24,7 @@ PEAKS: dict[str, dict[str, float]] = {
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """One square picture through the network in every precision that there is."""
+    """Measure the network on a square image in every available precision."""
     weights = small_weights() if sizes == QUICK else network_weights()
     found.add("network", f"{weights.name}, {weights.source}")
     found.add("side", sizes.network)
@@ -45,7 +45,7 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def precisions(weights: BackboneWeights) -> dict[str, Callable[[], FeatureNetwork]]:
-    """The network by the name of its precision; float32 first."""
+    """Return functions that make the network, by name of the precision; float32 comes first."""
     found: dict[str, dict[str, Any]] = {"float32": {}, "bfloat16": {"dtype": torch.bfloat16}}
     if "tf32" in inspect.signature(FeatureNetwork).parameters:
         found["tf32"] = {"tf32": True}
@@ -67,7 +67,7 @@ def _passes(network: FeatureNetwork, picture: Tensor) -> dict[str, Callable[[], 
 
 
 def flop(weights: BackboneWeights, side: int) -> float:
-    """Multiplications and additions of one pass over side x side pixels; back to the pixels they are as many."""
+    """Count the operations of one pass over side x side pixels; the backward pass has as many."""
     deepest = layer_stride(STYLE_LAYERS[-1])
     total = 0.0
     for name, (weight, _) in weights.convolutions.items():
@@ -78,7 +78,7 @@ def flop(weights: BackboneWeights, side: int) -> float:
 
 
 def share(tflops: float, precision: str) -> float | None:
-    """Of the device's peak; None where that is not known."""
+    """Return the fraction of the device's peak, or None if the peak is unknown."""
     if device().type != "cuda":
         return None
     name = torch.cuda.get_device_name(device())

@@ -1,4 +1,4 @@
-"""Every rasterizer that works here against `reference` in float64: image, coverage, color gradient."""
+"""Image, coverage and color gradient of every available rasterizer against `reference` in float64."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
-#: Relative distance from a cut-off within which float32 may decide otherwise, and bounds of images and gradients.
-#: gsplat projects in float32 and takes exponentials with the fast intrinsic.
+#: Relative distance from a cutoff within which float32 may decide otherwise, and bounds for images and for gradients.
+#: gsplat projects in float32 and computes exponentials with the fast intrinsic.
 RASTERIZERS: dict[RasterizerName, tuple[float, float, float]] = {
     "triton": (2e-5, 1e-5, 5e-6),
     "cached": (2e-5, 1e-5, 5e-6),
@@ -25,7 +25,7 @@ BACKGROUND = (1.0, 0.25, 0.5)
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Compare on one view; what cannot be used here is named with the reason, which for `triton` is a failure."""
+    """Compare the rasterizers on one view. One that is unavailable is skipped with the reason, except for `triton`."""
     gaussians, width, height = sizes.parity
     scene, camera = surface_scene(gaussians, degree=3), views(1, width, height)[0]
     for name, bounds in RASTERIZERS.items():
@@ -41,7 +41,7 @@ def run(sizes: Sizes, found: Findings) -> None:
 def compare(
     fast: Rasterizer, scene: Scene, camera: Camera, bounds: tuple[float, float, float], found: Findings
 ) -> None:
-    """Errors outside pixels where a cut-off hangs by a thread; how many of those make a step is told."""
+    """Compare with the reference, except at pixels very close to a cutoff; those that jump are counted."""
     close, image_bound, gradient_bound = bounds
     alpha_max = getattr(fast, "alpha_max", None)
     options = {} if alpha_max is None else {"alpha_max": alpha_max}

@@ -1,4 +1,4 @@
-"""What parts share: their sizes, and what they find, on disk after every entry."""
+"""Sizes and findings of the parts; findings are written to disk after every entry."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import torch
 
 @dataclass(frozen=True)
 class Sizes:
-    """How large everything is.
+    """Sizes of all measurements.
 
     Attributes:
-        gaussians: of the synthetic scenes, smallest first.
-        view: (width, height) in which they are rendered.
+        gaussians: Numbers of Gaussians of the synthetic scenes, in ascending order.
+        view: (width, height) of their renders.
         steps: (width, height, Gaussians) of SOS steps.
-        step_repeats: steps that count.
-        parity: (Gaussians, width, height) of what `reference` draws too.
-        network: pixels of the side of the picture that goes through the network.
+        step_repeats: Number of steps that are timed.
+        parity: (Gaussians, width, height) of the comparison with `reference`.
+        network: Side in pixels of the image for the network.
         curve: (steps, longer side in pixels) of the run that the CPU repeats.
-        repeats: of what is timed.
+        repeats: Repetitions of each timed call.
     """
 
     gaussians: tuple[int, ...] = (1_000_000, 3_000_000, 6_000_000)
@@ -36,7 +36,7 @@ class Sizes:
     repeats: int = 20
 
 
-#: Through the interpreter, in seconds.
+#: Sizes that take seconds in the interpreter.
 QUICK = Sizes(
     gaussians=(60, 120),
     view=(48, 32),
@@ -50,15 +50,15 @@ QUICK = Sizes(
 
 
 def device() -> torch.device:
-    """What is measured: the GPU, or without one the CPU with Triton's interpreter."""
+    """Return the GPU, or the CPU (with Triton's interpreter) if there is none."""
     return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
 
 
 class Findings:
-    """What a part has found so far, written to a file at every entry: a part that is ended keeps what it has.
+    """Findings of a part, written to a file after every entry, so that a part that is stopped keeps what it has.
 
     Args:
-        path: of the JSON file.
+        path: Path of the JSON file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -68,7 +68,7 @@ class Findings:
         self._write()
 
     def add(self, name: str, value: Any) -> None:
-        """Put a value for JSON under a name; "a/b" is b inside of a."""
+        """Add a JSON-serializable value; the name "a/b" nests b in a."""
         *groups, last = name.split("/")
         place = self.entries
         for group in groups:
@@ -77,7 +77,7 @@ class Findings:
         self._write()
 
     def check(self, name: str, error: float, bound: float) -> None:
-        """An error that must not exceed its bound: the part fails otherwise, once it has ended."""
+        """Add an error with its bound; if it exceeds the bound, the part counts as failed after it has finished."""
         passed = math.isfinite(error) and error <= bound
         self.add(name, {"error": error if math.isfinite(error) else str(error), "bound": bound, "passed": passed})
         if not passed:

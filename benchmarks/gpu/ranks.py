@@ -1,6 +1,6 @@
-"""Two ranks on one device give what one rank gives.
+"""Two ranks on one device compared with one rank.
 
-NCCL refuses two ranks on one GPU, so that gloo carries the tensors: this is about results, not about speed.
+NCCL refuses two ranks on one GPU, so gloo transfers the tensors: this checks results, not speed.
 """
 
 from __future__ import annotations
@@ -23,14 +23,16 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from worker.ranks.process_group import ProcessGroupCollectives
 
 RANKS, STEPS = 2, 3
-#: Of the first step's gradient, in the Euclidean norm. Near-ties of max pooling may fall the other way.
+#: Relative error bound of the first step's gradient, in the Euclidean norm. Near-ties of max pooling may be resolved
+#: differently.
 GRADIENT_BOUND = 1e-4
-#: Of the colors' change, likewise: Adam moves colors with gradients of rounding's size as far as any others.
+#: Relative error bound of the change in color. It is larger, because Adam moves a color as far for a gradient that is
+#: only rounding error as for any other.
 COLORS_BOUND = 1e-2
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Compare the gradient of the first step, and the colors after a few."""
+    """Compare the gradient of the first step, and the colors after some steps."""
     expected_gradient, expected = follow(ALONE, sizes)
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -47,7 +49,7 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
-    """Gradient of a view before the first step, and colors [N, 3] after all of them."""
+    """Return the gradient of a view before the first step, and the colors [N, 3] after the last."""
     quick = sizes == QUICK
     settings = make_settings(
         "standard", steps_coarse=0, steps_sos=STEPS, early_stop=False, keep=("ranks", "unseen"), rebalance=False,
@@ -70,7 +72,7 @@ def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
 
 
 def run_rank(rank: int, address: str, folder: str, sizes: Sizes) -> None:
-    """One rank; writes what it has found."""
+    """Run one rank and save its results."""
     if device().type == "cpu":
         torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"tcp://{address}", rank=rank, world_size=RANKS)
@@ -83,5 +85,5 @@ def run_rank(rank: int, address: str, folder: str, sizes: Sizes) -> None:
 
 
 def _error(found: Tensor, expected: Tensor, start: Tensor) -> float:
-    """Relative to how far it is from the start."""
+    """Return the error relative to the distance of the expected value from the start."""
     return float((found.double() - expected.double()).norm() / (expected.double() - start.double()).norm())

@@ -1,4 +1,4 @@
-"""Seconds and bytes of the rasterizer and of spherical harmonics, by number of Gaussians."""
+"""Time and memory of the rasterizer and of spherical harmonics, by number of Gaussians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DEGREE = 3
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """All sizes without kept weights first: those may take the rest of the time."""
+    """Measure all sizes, first without cached weights, because those may use up the time."""
     found.add("view", sizes.view)
     cameras = views(2, *sizes.view)
     for count in sizes.gaussians:
@@ -34,9 +34,9 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def _anew(scene: Scene, cameras: list[Camera], place: str, repeats: int, found: Findings) -> None:
-    """Survey, lists, forward and backward with weights computed anew."""
-    rasterizer = TritonRasterizer(scene, device=device(), max_list_bytes=0)  # holds the lists of the last view only
-    survey(scene, cameras, rasterizer)  # compiles
+    """Measure survey, intersections, forward and backward pass without cached weights."""
+    rasterizer = TritonRasterizer(scene, device=device(), max_list_bytes=0)  # caches the last view only
+    survey(scene, cameras, rasterizer)  # compilation
     looked = waited_seconds(lambda: survey(scene, cameras, rasterizer), device())
     found.add(f"{place}/survey_seconds_a_view", looked / len(cameras))
     both = seconds(lambda: [rasterizer.lists(camera) for camera in cameras], device(), repeats)
@@ -57,14 +57,14 @@ def _passes(rasterizer: Rasterizer, camera: Camera, place: str, repeats: int, fo
 
 def _operands(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(2)
-    scene: Scene = rasterizer.scene  # type: ignore[attr-defined]  # all of them have one
+    scene: Scene = rasterizer.scene  # type: ignore[attr-defined]  # every rasterizer has a scene
     colors = torch.rand((len(scene), 3), generator=generator)
     pixels = torch.randn((camera.height, camera.width, 3), generator=generator)
     return colors.to(rasterizer.device), pixels.to(rasterizer.device)
 
 
 def _harmonics(scene: Scene, camera: Camera, place: str, repeats: int, found: Findings) -> None:
-    """Of the kernel, which a GPU takes; in the interpreter it is asked for by name."""
+    """Measure the kernel that a GPU uses; the interpreter must be asked for it explicitly."""
     sh_rest, means = held(scene.sh_rest).to(device()), scene.means.to(device())
     taken = seconds(lambda: kernel_rest_colors(sh_rest, means, camera, DEGREE), device(), repeats)
     found.add(f"{place}/seconds", taken)
@@ -72,7 +72,7 @@ def _harmonics(scene: Scene, camera: Camera, place: str, repeats: int, found: Fi
 
 
 def _kept(scene: Scene, camera: Camera, place: str, repeats: int, found: Findings) -> None:
-    """Computing and keeping a view's weights, and both passes with them."""
+    """Measure the computation of a view's cached weights, and both passes with them."""
     forget_peak(device())
     rasterizer = make_rasterizer("cached", scene, device=device())
     colors, _ = _operands(rasterizer, camera)

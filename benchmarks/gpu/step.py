@@ -1,4 +1,4 @@
-"""SOS steps of small and of the largest views: seconds by part, and peak memory against the plan."""
+"""SOS steps on small and on the largest views: seconds by part, and peak memory against the plan."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Precision, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 
-#: Steps that prepare views, and let libraries choose their algorithms.
+#: Warm-up steps, in which views are prepared and libraries choose their algorithms.
 _WARM = 2
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Every size, in every precision on a GPU."""
+    """Measure every size, on a GPU in every precision."""
     precisions: tuple[Precision, ...] = get_args(Precision) if device().type == "cuda" else ("float32",)
     for width, height, gaussians in sizes.steps:
         scene = surface_scene(gaussians, degree=3)

@@ -1,4 +1,4 @@
-"""The tests that are marked `gpu`, as pytest runs them."""
+"""Tests marked `gpu`, run by pytest."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typing import Any
 from benchmarks.gpu.part import Findings, Sizes
 
 ROOT = Path(__file__).resolve().parents[2]
-#: What pytest ends with when every test passed, and when none was selected.
+#: Exit statuses of pytest if every test passed, and if none was selected.
 _FINE = (0, 5)
-#: How a test fails, or a file cannot be read, where something is missing on this machine that is no fault of a GPU's.
+#: Error texts of tests and files that need something this machine lacks, which says nothing about its GPU.
 _MISSING = ("ModuleNotFoundError", "the tests need VGG16")
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Run them, and sort their outcomes.
+    """Run the tests and sort their outcomes.
 
     Raises:
-        RuntimeError: pytest itself has failed.
+        RuntimeError: If pytest itself has failed.
     """
-    del sizes  # a test has its own
+    del sizes  # tests have their own sizes
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "results.xml"
         command = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-p", "no:cacheprovider", "--tb=short"]
@@ -41,12 +41,12 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def marked_files() -> list[Path]:
-    """Files in which a test may be marked."""
+    """Return the test files that mention the mark."""
     return sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.gpu" in path.read_text("utf-8"))
 
 
 def outcome(case: Any) -> tuple[str, str, str]:
-    """Name, "passed", "failed" or "skipped", and why, of an element of pytest's XML."""
+    """Return name, outcome ("passed", "failed" or "skipped") and reason from an element of pytest's XML."""
     name = f"{case.get('classname')}.{case.get('name')}".strip(".")
     problem = next((part for part in case if part.tag in ("failure", "error", "skipped")), None)
     if problem is None:

@@ -1,1 +1,1 @@
-"""Measurements that a user can repeat on a scene and machine of their own."""
+"""Benchmarks that users can run on their own scenes and machines."""

@@ -1,10 +1,10 @@
-"""Error against run time: variants of one job with the same time budget, judged by one exact loss.
+"""Error against run time: variants of one job with the same time budget, measured by the same exact loss.
 
 Every variant gets the same seconds of optimization. At the same moments its colors are evaluated on all views by the
-float32 loss of all scales (`exact.ExactTwin`), which is the paper's, whatever a variant itself optimizes; evaluation
-does not count. Nor does preparing the views, once for each, which in a short budget would hide the rest; its seconds
-are stated. All variants are in memory at once. What lies on the Pareto front reaches its error sooner than anything
-else does.
+float32 loss of all scales (`exact.ExactTwin`), which is the paper's loss, whatever the variant itself optimizes.
+Evaluation does not count as run time. Neither does preparing each view once, which would dominate a short budget; its
+time is reported separately. All variants are in memory at the same time. A variant on the Pareto front reaches its
+error sooner than every other one.
 """
 
 from __future__ import annotations
@@ -35,17 +35,18 @@ from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.schedule import Phase
 from sgsst_core.stylizing.stylizer import Stylizer
 
-#: The budget is cut into so many slices, and the variants take turns: where the machine is slower for a while, it is
-#: slower for all of them.
+#: Number of slices of the time budget. Variants take turns slice by slice, so a slow phase of the machine affects all
+#: of them.
 SLICES = 32
 #: Slices after which the variants are evaluated.
 MOMENTS = (1, 2, 4, 8, 16, 32)
-#: Share of the time that phase 1 gets where a variant has one: about as much as in the standard preset.
+#: Fraction of the time for phase 1, if a variant has one: about as much as in the standard preset.
 PHASE_1 = 0.15
-#: Of the variant with pruning: Gaussians that all views together show in less than a pixel.
+#: Threshold of the variant with pruning: Gaussians whose blend weights in all views sum to less than a pixel.
 PRUNE_WEIGHT = 1.0
 
-#: Phases of a variant with n scales: (name, scale from the coarsest or None for all, share of the time).
+#: Function that returns the phases of a variant for n scales, as (name, scale counted from the coarsest or None for
+#: all, fraction of the time).
 Shares = Callable[[int], list[tuple[str, int | None, float]]]
 
 
@@ -74,10 +75,10 @@ class Variant:
     """One way to run the job.
 
     Attributes:
-        name: for `--variants`.
-        what: for people.
-        shares: its phases.
-        settings: on top of the standard preset.
+        name: Name for `--variants`.
+        what: Description for people.
+        shares: Function that returns the phases.
+        settings: Settings that override the standard preset.
     """
 
     name: str
@@ -126,7 +127,7 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class Point:
-    """A variant's colors at one moment; losses are relative to the unstylized scene's."""
+    """Losses of a variant at one moment, relative to the unstylized scene."""
 
     seconds: float
     step: int
@@ -136,24 +137,24 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """What a variant reached; no points where it was left out for the reason."""
+    """Results of a variant; without points if it was skipped, for the reason in `left_out`."""
 
     variant: Variant
     points: list[Point]
-    preparation: float = 0.0  # seconds
+    preparation: float = 0.0  # in seconds
     left_out: str | None = None
-    sh_dc: Tensor | None = None  # [N, 3], at the end
+    sh_dc: Tensor | None = None  # final colors [N, 3]
 
 
 class _TimedStylizer(Stylizer):
-    """A stylizer whose phases and learning rate follow the clock instead of the count of steps."""
+    """Stylizer whose phases and learning rate follow the clock instead of the step count."""
 
     budget: float
     shares: list[tuple[str, int | None, float]]
 
     @property
     def phase(self) -> Phase:
-        """The phase that the time belongs to."""
+        """Phase at the present time."""
         end = 0.0
         for stage, scale, share in self.shares[:-1]:
             end += share * self.budget
@@ -163,15 +164,15 @@ class _TimedStylizer(Stylizer):
         return Phase(stage, 1, scale)
 
     def share_done(self) -> float:
-        """Of the time."""
+        """Return the elapsed fraction of the time budget."""
         return min(self.seconds / self.budget, 1.0)
 
 
 def choose_variants(names: Sequence[str]) -> list[Variant]:
-    """The variants of some names; all of them for none.
+    """Return the variants with the given names, or all variants if there are none.
 
     Raises:
-        SettingsError: no such variant.
+        SettingsError: If a name is unknown.
     """
     unknown = [name for name in names if name not in VARIANTS]
     if unknown:
@@ -190,12 +191,17 @@ def error_time(
     progress: Callable[[Variant, Point], None] = lambda variant, point: None,
     **settings: Any,
 ) -> list[Curve]:
-    """Run variants on one scene, each for so many seconds.
+    """Run variants on one scene, each with the same time budget.
 
     Args:
-        seconds: of optimization, for each variant.
-        progress: called after each evaluation.
-        settings: for all variants, on top of the standard preset.
+        scene: Scene to stylize.
+        cameras: Cameras of the views.
+        style: Style image [H, W, 3].
+        variants: Variants to run.
+        seconds: Seconds of optimization per variant.
+        weights: Weights of the feature network; None loads the default ones.
+        progress: Function called after each evaluation.
+        settings: Settings for all variants that override the standard preset.
     """
     base = make_settings("standard", **settings)
     share = (base.memory_limit or default_memory_limit()) // (len(variants) + 1)
@@ -226,7 +232,7 @@ def _begin(
     base: Settings,
     weights: BackboneWeights | None,
 ) -> tuple[Curve, _TimedStylizer | None]:
-    """A variant that is ready to run, or the reason why it is left out."""
+    """Return a variant that is ready to run, or a curve with the reason why it is skipped."""
     settings = base.model_copy(update=variant.settings)
     stylizer = _TimedStylizer.planned(*inputs, settings, weights=weights)
     reason = _reason_to_leave_out(settings, stylizer)
@@ -238,7 +244,7 @@ def _begin(
 
 
 def _prepare(stylizer: _TimedStylizer) -> float:
-    """Prepare every view and the style as the first steps would; returns the seconds."""
+    """Prepare every view and the style as the first steps would. Returns the seconds it took."""
     started = time.perf_counter()
     for index in stylizer.views.covered:
         chosen = stylizer.scales(index)
@@ -260,7 +266,7 @@ def _reason_to_leave_out(settings: Settings, stylizer: Stylizer) -> str | None:
 
 
 def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point]]:
-    """The points that no other point beats in both seconds and loss, by seconds."""
+    """Return the points that no other point beats in both seconds and loss, ordered by seconds."""
     front: list[tuple[str, Point]] = []
     points = [(curve.variant.name, point) for curve in curves for point in curve.points]
     for name, point in sorted(points, key=lambda item: (item[1].seconds, item[1].relative)):
@@ -270,7 +276,7 @@ def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point]]:
 
 
 def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
-    """For JSON."""
+    """Return the curves and their Pareto front as JSON-serializable values."""
     return {
         "variants": {
             curve.variant.name: {
@@ -296,15 +302,15 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
     }
 
 
-#: As many as have no divisor in common with the number of colors: the pairs of both last for 42 variants.
+#: Their number has no divisor in common with the number of colors, so 42 variants have distinct pairs of both.
 _MARKERS = "osD^vP*"
 
 
 def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
-    """Write a PNG: loss against seconds, both axes logarithmic, the mean of the scales and each scale beside it.
+    """Write a PNG of loss against seconds, both axes logarithmic: the mean over scales, and each scale beside it.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     shown = [curve for curve in curves if curve.points]
     scales = sorted({scale for curve in shown for point in curve.points for scale in point.by_scale})
@@ -324,7 +330,13 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], scale: int | None) -> Floats:
-    """Draw the loss of a scale (None: the mean of the scales) against seconds, one line a curve; returns the losses."""
+    """Draw loss against seconds, one line per curve. Returns the losses.
+
+    Args:
+        axes: Axes to draw on.
+        curves: Curves to draw.
+        scale: Scale of the loss; None for the mean over scales.
+    """
     seconds = [column([point.seconds for point in curve.points]) for curve in curves]
     losses = [
         column([point.relative if scale is None else point.by_scale.get(scale) for point in curve.points])

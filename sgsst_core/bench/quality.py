@@ -1,8 +1,8 @@
-"""How good the results of several ways to run one job are, after the same seconds each.
+"""Quality of the results of several ways to run one job, with the same time budget each.
 
-Variants are those of `error_time`. What they have reached is judged by a network that none of them optimizes (`Judge`),
-on views between the job's cameras, beside the loss that is left, and beside the unstylized scene and a transfer of
-colors alone. A variant on the front has no other with both more style and more content.
+Variants are those of `error_time`. Their results are judged on novel views by a network that none of them optimizes
+(`Judge`), along with the remaining loss. The unstylized scene and a transfer of colors alone are judged for comparison.
+A variant is on the front if no other has both more style and more content.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.warm_start import warm_start
 
-#: What is judged beside the variants.
+#: Names of the outcomes that are judged along with the variants.
 UNSTYLIZED, TRANSFER = "unstylized", "transfer"
-#: Views of the sheet.
+#: Number of views on the sheet.
 _SHOWN = 3
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One way to run the job, and what came of it.
+    """Result of one way to run the job.
 
     Attributes:
-        name: of the variant, or `UNSTYLIZED`, or `TRANSFER`.
-        what: for people.
-        sh_dc: [N, 3], its colors.
-        judgment: of the views between the cameras.
-        short, long: consistency of views 1 and 7 apart; None where there is no such pair.
-        loss: that is left, relative to the unstylized scene's; None where it was not asked.
-        steps: that were made.
-        seconds: of optimization.
+        name: Name of the variant, or `UNSTYLIZED`, or `TRANSFER`.
+        what: Description for people.
+        sh_dc: Colors [N, 3].
+        judgment: Judgment on the novel views.
+        short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
+        loss: Remaining loss, relative to the unstylized scene; None if it was not measured.
+        steps: Number of steps.
+        seconds: Seconds of optimization.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Outcome:
     seconds: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the fields except the colors as JSON-serializable values."""
         ranges = {"short": self.short, "long": self.long}
         return {
             "name": self.name,
@@ -86,13 +86,13 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Quality:
-    """What was compared.
+    """Result of a comparison.
 
     Attributes:
-        outcomes: the unstylized scene, the transfer, and the variants.
-        curves: the variants' losses against seconds; of those that could not run, why.
-        judge: judges further colors of the scene.
-        style: the style image [H, W, 3].
+        outcomes: Unstylized scene, color transfer, and the variants.
+        curves: Losses of the variants against seconds, or the reason why one could not run.
+        judge: Judge for further colors of the scene.
+        style: Style image [H, W, 3].
     """
 
     outcomes: list[Outcome]
@@ -101,7 +101,7 @@ class Quality:
     style: Tensor
 
     def front(self) -> list[Outcome]:
-        """Stylized outcomes that no other one beats in both style and content, by style."""
+        """Return the stylized outcomes that no other one beats in both style and content, ordered by style."""
         front: list[Outcome] = []
         stylized = [outcome for outcome in self.outcomes if outcome.name != UNSTYLIZED]
         for outcome in sorted(stylized, key=lambda one: (one.judgment.style, one.judgment.content)):
@@ -110,7 +110,7 @@ class Quality:
         return front
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the comparison as JSON-serializable values."""
         return {
             "views": [camera.name for camera in self.judge.cameras],
             "outcomes": [outcome.as_dict() for outcome in self.outcomes],
@@ -130,17 +130,21 @@ def compare_quality(
     progress: Callable[[Variant, Point], None] = lambda variant, point: None,
     **settings: Any,
 ) -> Quality:
-    """Run variants on one scene, each for so many seconds, and judge them.
+    """Run variants on one scene, each with the same time budget, and judge the results.
 
     Args:
-        style: [H, W, 3] in 0..1.
-        seconds: of optimization, for each variant.
-        progress: called after each evaluation of the loss.
-        settings: for all variants, on top of the standard preset.
+        scene: Scene to stylize.
+        cameras: Cameras of the views.
+        style: Style image [H, W, 3] in 0 to 1.
+        variants: Variants to run.
+        seconds: Seconds of optimization per variant.
+        weights: Weights of the feature network; None loads the default ones.
+        progress: Function called after each evaluation of the loss.
+        settings: Settings for all variants that override the standard preset.
 
     Raises:
-        WeightsError: AlexNet is not installed.
-        SettingsError: no view between the cameras can be judged.
+        WeightsError: If AlexNet is not installed.
+        SettingsError: If no novel view can be judged.
     """
     lpips = load_lpips_or_none()
     if lpips is None:
@@ -178,7 +182,7 @@ def compare_quality(
 
 
 def novel_view_names(stylizer: Stylizer) -> NovelViews:
-    """Views between a job's cameras, of its whole scene."""
+    """Make the novel views of a job, with its whole scene."""
     exact = ExactLoss(stylizer, "sos")
     return NovelViews(
         stylizer.views.cameras,
@@ -193,10 +197,10 @@ def novel_view_names(stylizer: Stylizer) -> NovelViews:
 
 
 def write_plot(path: Path, quality: Quality, title: str) -> None:
-    """Write a PNG: style against content, the front dashed; down and left is better.
+    """Write a PNG of style against content, with the front dashed; lower left is better.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7, 5), dpi=110, layout="constrained")
@@ -216,10 +220,10 @@ def write_plot(path: Path, quality: Quality, title: str) -> None:
 
 
 def write_sheet(path: Path, quality: Quality) -> None:
-    """Write a JPEG: the style, and a row for each outcome, of some views on black and the first one on white.
+    """Write a JPEG with the style and a row per outcome: some views on black, and the first one on white.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     cameras = quality.judge.cameras[:_SHOWN]
     rows = []

@@ -1,1 +1,1 @@
-"""Judging a scene and a result: novel views, consistency, exactness, findings about inputs."""
+"""Quality of inputs and results: findings, novel views, multi-view consistency, and comparison with exact gradients."""

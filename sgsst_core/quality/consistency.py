@@ -1,11 +1,11 @@
-"""Multi-view consistency: how much a scene's pictures differ where two cameras see the same point of it.
+"""Multi-view consistency: how much the images of two cameras differ where both see the same surface.
 
-View j is warped into view i by the scene's own rendered depth and compared with it where both see the same surface:
-RMSE, and LPIPS averaged over the same pixels. Short range compares neighbors, long range views 7 apart (the two ranges
-of Huang et al., "Learning to Stylize Novel Views", ICCV 2021).
+View j is warped into view i by the rendered depth and compared where both see the same surface: by RMSE, and by LPIPS
+averaged over the same pixels. Short range compares adjacent views, long range views 7 apart (the two ranges of Huang et
+al., "Learning to Stylize Novel Views", ICCV 2021).
 
-A scene without style has a distance above zero as well: view-dependent colors, interpolation (the warped view is
-a little smoother), and depth that is a mean over translucent Gaussians. Numbers are to be read before and after
+The distance of an unstylized scene is above zero too, for three reasons: colors depend on the view, interpolation
+smooths the warped view a little, and depth is a mean over translucent Gaussians. Compare the values before and after
 stylization.
 """
 
@@ -23,20 +23,21 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Views between the two of a pair.
+#: Distance of a pair's two views in the list of views.
 SHORT_RANGE, LONG_RANGE = 1, 7
-#: A pixel has a depth where the Gaussians cover more of it than this; below, the background mixes into its color.
+#: Coverage above which a pixel's depth counts as known. With less coverage, the background mixes into its color.
 COVERED = 0.9
-#: Depths of one surface in two views differ by no more than this share. On scans of objects the colors' error begins
-#: to rise at 0.01, where one limb hides another; on a scene trained from few photos, whose translucent Gaussians have
-#: no one depth, only at 0.05, and there a smaller value compares fewer pixels and gives nearly the same RMSE.
+#: Maximum relative difference of the depths of one surface in two views. In scans of objects, color errors grow from
+#: 0.01 on, where one limb hides another. In a scene trained from few photos, whose translucent Gaussians have no single
+#: depth, they grow only from 0.05 on; smaller values compare fewer pixels and give nearly the same RMSE.
 DEPTH_TOLERANCE = 0.02
-#: Of an interpolated pixel, what may come from outside the view, from uncovered pixels or from another surface: enough
-#: for rounding of a position that falls on a pixel center, too little to be seen in 8 bits.
+#: Maximum weight, in an interpolated pixel, of source pixels that do not count (outside the view, uncovered, or on
+#: another surface). It allows for the rounding error of positions at pixel centers, and is too small to be visible in 8
+#: bits.
 _FOREIGN_SHARE = 1e-3
-#: With a smaller share of pixels to compare, a pair says nothing about the scene.
+#: Fraction of comparable pixels below which a pair has no RMSE or LPIPS.
 MINIMUM_COMPARED = 0.01
-#: Pixels warped at a time; some twenty values are held for each.
+#: Pixels warped at a time. Each needs memory for some twenty values.
 _BAND_PIXELS = 1 << 20
 #: Gaussians whose depths are computed at a time.
 _GAUSSIANS = 1 << 18
@@ -46,14 +47,13 @@ ImageSource = Callable[[int], Tensor]
 
 @dataclass(frozen=True)
 class PairConsistency:
-    """One pair of views.
+    """Consistency of one pair of views.
 
     Attributes:
-        first, second: indices of the views; the second was warped into the first.
-        compared: share of the first view's pixels that could be compared.
-        rmse: root mean square difference of the colors (0..1) over those pixels; None where they are too few.
-        lpips: LPIPS averaged over those pixels; None where they are too few, the view is too small for it, or it was
-            not asked for.
+        first, second: Indices of the views; the second is warped into the first.
+        compared: Fraction of the first view's pixels that could be compared.
+        rmse: Root mean square difference of the colors (0 to 1) over those pixels; None if there are too few.
+        lpips: LPIPS averaged over those pixels; None if there are too few, the view is too small, or LPIPS is off.
     """
 
     first: int
@@ -65,35 +65,35 @@ class PairConsistency:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Pairs of views `gap` apart, ordered by their first view; means are over the pairs that have a value."""
+    """Consistency of all pairs of views `gap` apart, ordered by first view. Means skip pairs without a value."""
 
     gap: int
     pairs: list[PairConsistency]
 
     @property
     def rmse(self) -> float | None:
-        """Mean RMSE; None where no pair could be compared."""
+        """Mean RMSE, or None if no pair could be compared."""
         return _mean([pair.rmse for pair in self.pairs])
 
     @property
     def lpips(self) -> float | None:
-        """Mean LPIPS; None where no pair has one."""
+        """Mean LPIPS, or None if no pair has one."""
         return _mean([pair.lpips for pair in self.pairs])
 
     @property
     def compared(self) -> float:
-        """Mean share of pixels that could be compared, over all pairs; 0 without pairs."""
+        """Mean fraction of pixels that could be compared, over all pairs; 0 without pairs."""
         return _mean([pair.compared for pair in self.pairs]) or 0.0
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What is seen of a view's geometry.
+    """Rendered depth of a view.
 
     Attributes:
-        depth: [H, W] float32, mean camera-space z of the Gaussians in a pixel weighted by their blend weights, world
-            units; 1 where it is not known.
-        known: [H, W] bool, covered by more than `COVERED`.
+        depth: Mean camera-space z [H, W] of the Gaussians in each pixel, weighted by blend weight, in world units,
+            float32; 1 where unknown.
+        known: Mask [H, W] bool of the pixels covered by more than `COVERED`.
     """
 
     depth: Tensor
@@ -110,28 +110,29 @@ def consistency(
     *,
     at_most: int | None = None,
 ) -> Consistency:
-    """Consistency of a scene's pictures over all pairs of views (i, i + gap).
+    """Compute the consistency of a scene's images over all pairs of views (i, i + gap).
 
     Args:
-        images: picture [H, W, 3] of a view by its index, compared as a screen shows it: clamped to 0..1.
-        cameras: one for each view, neighbors in space being neighbors in the list.
-        rasterizer: of the scene's geometry.
-        scene: whose geometry says where views overlap.
-        gap: `SHORT_RANGE`, `LONG_RANGE` or any other distance in the list, at least 1.
-        lpips: evaluates LPIPS; None leaves it out.
-        at_most: compare only so many pairs, evenly spread.
+        images: Function that returns the image [H, W, 3] of a view, given its index. Images are clamped to 0 to 1, as
+            on screen.
+        cameras: Camera of each view; cameras adjacent in the list are close in space.
+        rasterizer: Rasterizer of the scene's geometry.
+        scene: Scene whose geometry determines where views overlap.
+        gap: Distance of two compared views in the list: `SHORT_RANGE`, `LONG_RANGE` or any other, at least 1.
+        lpips: LPIPS network; None skips LPIPS.
+        at_most: Maximum number of pairs, evenly spread over the list; None compares all.
 
     Returns:
-        One entry for each pair; none where there are no more views than `gap`.
+        One entry per pair; no entries if there are at most `gap` views.
 
     Raises:
-        SettingsError: gap or at_most below 1.
-        ValueError: a picture is not of its camera's size, or holds NaN or infinity.
+        SettingsError: If `gap` or `at_most` is below 1.
+        ValueError: If an image does not have its camera's size, or contains NaN or infinity.
     """
     views: dict[int, tuple[Tensor, DepthMap]] = {}
     results = []
-    # Chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...): each pair shares a view with the one before it, so that
-    # a view is rendered once and two are held, whatever the gap.
+    # Pairs are visited chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...). Each pair shares a view with the one
+    # before it, so every view is rendered once and only two are in memory, whatever the gap.
     for i, j in sorted(view_pairs(len(cameras), gap, at_most), key=lambda pair: (pair[0] % gap, pair[0])):
         views = {k: views.get(k) or _look(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
         (image, depth), (other, other_depth) = views[i], views[j]
@@ -141,31 +142,32 @@ def consistency(
 
 
 def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[int, int]]:
-    """Pairs (i, i + gap) of `count` views; at most so many, evenly spread.
+    """Return the pairs (i, i + gap) of `count` views, or `at_most` of them, evenly spread.
 
     Raises:
-        SettingsError: gap or at_most below 1.
+        SettingsError: If `gap` or `at_most` is below 1.
     """
     if gap < 1 or (at_most is not None and at_most < 1):
         raise SettingsError(f"Pairs of views {gap} apart, at most {at_most}: both numbers must be at least 1.")
     total = max(count - gap, 0)
     parts = total if at_most is None else min(at_most, total)
-    firsts = [(2 * part + 1) * total // (2 * parts) for part in range(parts)]  # the middle of each of equal parts
+    firsts = [(2 * part + 1) * total // (2 * parts) for part in range(parts)]  # middle of each of `parts` equal parts
     return [(i, i + gap) for i in firsts]
 
 
 def expected_depth(scene: Scene, camera: Camera, rasterizer: Rasterizer) -> DepthMap:
-    """Depth of a view, from the rasterizer itself: it is linear in the colors, and z is a color like any other.
+    """Render the depth of a view.
 
-    Numerator (sum of w z) and denominator (sum of w) are channels of one image, so that whatever rounding the blend
-    weights have falls out of their ratio. What the background adds is the image of black Gaussians.
+    Rendering is linear in the colors, and z can be rendered like a color. The weighted sum of z and the sum of weights
+    are two channels of one image, so rounding errors of the blend weights cancel in their ratio. The image of black
+    Gaussians is subtracted to remove the background.
     """
     pose = camera.world_to_camera.double()
     colors = torch.zeros((len(scene), 3), dtype=rasterizer.dtype)
     colors[:, 1] = 1
     for start in range(0, len(scene), _GAUSSIANS):
         part = slice(start, start + _GAUSSIANS)
-        # float64: in a world moved far away both terms are large
+        # In float64, because both terms are large in a world far from its origin.
         colors[part, 0] = (scene.means[part].double() @ pose[2, :3] + pose[2, 3]).to(rasterizer.dtype)
     sums = rasterizer.render(colors, camera) - rasterizer.render(torch.zeros_like(colors), camera)
     weighted, weights = sums[..., 0], sums[..., 1]
@@ -175,14 +177,15 @@ def expected_depth(scene: Scene, camera: Camera, rasterizer: Rasterizer) -> Dept
 
 
 def project_pixels(
-    depth: Tensor,  # [h, W] of rows of the camera's view
+    depth: Tensor,  # [h, W], rows of the camera's view
     first_row: int,
     camera: Camera,
     other: Camera,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Where pixel centers at a depth lie in another view: x, y in pixels and z there, each [h, W] float64.
+    """Return the positions in another view of pixel centers at a given depth.
 
-    x and y are without meaning where z <= 0, behind the other camera; they are finite there too.
+    The result is x and y in pixels and z, each [h, W] float64. If z <= 0 (behind the other camera), x and y are
+    meaningless but finite.
     """
     device = depth.device
     pose, other_pose = camera.world_to_camera.double(), other.world_to_camera.double()
@@ -200,15 +203,15 @@ def project_pixels(
 
 @dataclass(frozen=True)
 class Warp:
-    """The pixels of a view that another view sees as well, and how they are interpolated there.
+    """Pixels of a view that another view sees too, and how to interpolate them there.
 
-    It follows from the geometry alone, and so is the same for all colors of a scene.
+    A warp depends on the geometry alone, so it holds for all colors of a scene.
 
     Attributes:
         size: (H, W) of the view.
-        pixels: [P] int64, which of its H W pixels, row by row.
-        sources: [4, P] int32, the four pixels of the other view around each.
-        weights: [4, P] float32, sum 1.
+        pixels: Indices [P] of the view's pixels, row by row, int64.
+        sources: Indices [4, P] of the four surrounding pixels in the other view, int32.
+        weights: Interpolation weights [4, P], with sum 1 per pixel, float32.
     """
 
     size: tuple[int, int]
@@ -218,11 +221,11 @@ class Warp:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes."""
+        """Memory use in bytes."""
         return sum(t.numel() * t.element_size() for t in (self.pixels, self.sources, self.weights))
 
     def apply(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """The other view's picture [H', W', 3] as the view would see it: [H, W, 3], and where that is valid, [H, W]."""
+        """Warp the other view's image [H', W', 3]. Returns an image [H, W, 3] and a mask [H, W] of its valid pixels."""
         flat = image.reshape(-1, 3)
         colors = flat.new_zeros((len(self.pixels), 3))
         for source, weight in zip(self.sources, self.weights, strict=True):
@@ -243,12 +246,12 @@ def find_warp(
     *,
     tolerance: float = DEPTH_TOLERANCE,
 ) -> Warp:
-    """How another view's picture is brought into the view of `camera`.
+    """Compute the warp of another view into the view of `camera`.
 
-    A pixel's point, from its own depth, is projected into the other view and the four pixels around it are
+    Each pixel's point, at its own depth, is projected into the other view, and the four pixels around it are
     interpolated. One of the four counts only if it lies within the view, has a known depth, and that depth agrees with
-    the point's within the relative tolerance; otherwise the other view sees something else there (occlusion), or an
-    edge runs between the four. Where more than a trace of the weight does not count, the pixel is left out.
+    the point's within the relative tolerance. Otherwise the other view sees something else there (occlusion), or an
+    edge runs between the four. If those that do not count have more than a trace of the weight, the pixel is omitted.
     """
     pixels, sources, weights = [], [], []
     step = max(1, _BAND_PIXELS // camera.width)
@@ -274,9 +277,9 @@ def warp(
     *,
     tolerance: float = DEPTH_TOLERANCE,
 ) -> tuple[Tensor, Tensor]:
-    """Another view's picture as `camera` would see it: [H, W, 3] in its dtype, and where that is valid, [H, W] bool.
+    """Warp another view's image into the view of `camera`: image [H, W, 3] in its dtype, and validity mask [H, W] bool.
 
-    See `find_warp`; invalid pixels are 0.
+    See `find_warp`. Invalid pixels are 0.
     """
     return find_warp(other_depth, other, depth, camera, tolerance=tolerance).apply(image)
 
@@ -288,7 +291,10 @@ def _around(
     z: Tensor,  # [P] float64
     tolerance: float,
 ) -> tuple[Tensor, Tensor]:
-    """The four pixels around each position [4, P] int32 and their weights [4, P] float32: 0 where depths disagree."""
+    """Return the indices [4, P] int32 and weights [4, P] float32 of the four pixels around each position.
+
+    Weights are 0 if the depths disagree.
+    """
     height, width = depth.depth.shape
     left, top = (x - 0.5).floor(), (y - 0.5).floor()
     across, down = ((x - 0.5) - left).float(), ((y - 0.5) - top).float()
@@ -308,10 +314,10 @@ def _around(
 
 
 def shown(image: Tensor, camera: Camera, device: torch.device) -> Tensor:
-    """A picture [H, W, 3] of a view as a screen shows it, clamped to 0..1, on a device.
+    """Return an image [H, W, 3] of a view as a screen shows it: clamped to 0 to 1, on the given device.
 
     Raises:
-        ValueError: it is not of the camera's size, or holds NaN or infinity.
+        ValueError: If it does not have the camera's size, or contains NaN or infinity.
     """
     image = image.detach().to(device)
     if tuple(image.shape) != (camera.height, camera.width, 3):
@@ -326,7 +332,7 @@ def shown(image: Tensor, camera: Camera, device: torch.device) -> Tensor:
 def compare(
     first: int, second: int, image: Tensor, warped: Tensor, valid: Tensor, lpips: Lpips | None
 ) -> PairConsistency:
-    """Distances of a view's picture [H, W, 3] and another one warped into it, where that is valid, [H, W]."""
+    """Compare a view's image [H, W, 3] with another one warped into it, where the mask `valid` [H, W] is true."""
     count = int(valid.sum())
     compared = count / valid.numel()
     if count == 0 or compared < MINIMUM_COMPARED:
@@ -334,7 +340,7 @@ def compare(
     rmse = float((image[valid].double() - warped[valid].double()).square().mean().sqrt())
     distance = None
     if lpips is not None and min(valid.shape) >= lpips.minimum_side:
-        # Elsewhere the view stands for itself: a hole's edge would be seen by the features of valid pixels beside it.
+        # Invalid pixels are filled with the view's own, so the features of valid pixels see no edge of a hole.
         filled = torch.where(valid[..., None], warped, image)
         distances = lpips.distance(image, filled).map
         distance = float(distances[valid.to(distances.device)].mean(dtype=torch.float64))
@@ -342,7 +348,7 @@ def compare(
 
 
 def _look(image: Tensor, camera: Camera, rasterizer: Rasterizer, scene: Scene) -> tuple[Tensor, DepthMap]:
-    """Picture and depth of a view."""
+    """Return the image and the depth map of a view."""
     return shown(image, camera, rasterizer.device), expected_depth(scene, camera, rasterizer)
 
 

@@ -1,7 +1,7 @@
-"""The exact twin of a job: the same loss without its approximations, to measure them against.
+"""Exact loss and gradient of a job, as the reference for measuring its approximations.
 
-Features in float32, every Gaussian that a view shows, blend weights computed anew. (float32 itself is within 1e-6 of
-the float64 reference: tests/sgsst_core/test_sos.py.)
+Features are float32, every Gaussian with any blend weight in a view counts, and blend weights are recomputed at each
+use. float32 itself is within 1e-6 of the float64 reference (tests/sgsst_core/loss/test_sos.py).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sgsst_core.stylizing.views import Views
 
 
 def approximations(stylizer: Stylizer) -> list[str]:
-    """What makes a job's gradient differ from the exact one by more than rounding; empty where nothing does."""
+    """List the approximations that change a job's gradient by more than rounding; empty if there are none."""
     found = []
     if stylizer.network.precision != "float32":
         found.append("TF32 convolutions" if stylizer.network.tf32 else f"{stylizer.network.precision} features")
@@ -43,13 +43,13 @@ def approximations(stylizer: Stylizer) -> list[str]:
 
 
 def uncached_rasterizer(stylizer: Stylizer) -> Rasterizer:
-    """What computes a job's blend weights anew; kept ones lie above it."""
+    """Return the rasterizer that computes the job's blend weights, without a cache in front of it."""
     rasterizer = stylizer.views.rasterizer
     return rasterizer.uncached if isinstance(rasterizer, CachedRasterizer) else rasterizer
 
 
 def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
-    """One of another scene with a job's settings, that keeps its lists in the bytes that the job's lists leave."""
+    """Make a rasterizer of another scene with the job's settings, whose cache fits beside the job's in memory."""
     settings, job = stylizer.settings, uncached_rasterizer(stylizer)
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
     if isinstance(job, CpuRasterizer | TritonRasterizer) and job.name == stylizer.plan.uncached:
@@ -59,15 +59,15 @@ def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
 
 @dataclass(frozen=True)
 class GradientError:
-    """A color gradient against the exact one.
+    """Error of a color gradient relative to the exact one.
 
     Attributes:
-        step: after which it was measured.
-        view: name of the camera.
-        relative_error: |g - exact| / |exact|, Euclidean, over the optimized Gaussians.
-        cosine: of the angle between the two.
-        seconds: of the gradient as the job computes it.
-        seconds_exact: of the exact one.
+        step: Number of steps before the measurement.
+        view: Name of the camera.
+        relative_error: |g - exact| / |exact| in the Euclidean norm, over the optimized Gaussians.
+        cosine: Cosine of the angle between the two.
+        seconds: Time to compute the gradient as the job does.
+        seconds_exact: Time to compute the exact gradient.
     """
 
     step: int
@@ -78,16 +78,16 @@ class GradientError:
     seconds_exact: float
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the fields as JSON-serializable values."""
         return asdict(self)
 
 
 class ExactLoss:
-    """A job's loss in float32.
+    """Loss of a job in float32.
 
     Args:
-        stylizer: the job; it is not changed.
-        style_loss: another one than the job's, for jobs with different ones to be compared; None for the job's.
+        stylizer: Job, which is not changed.
+        style_loss: Style loss, to compare jobs that use different ones; None for the job's own.
     """
 
     def __init__(self, stylizer: Stylizer, style_loss: StyleLossName | None = None) -> None:
@@ -107,7 +107,7 @@ class ExactLoss:
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
 
     def style_targets(self, camera: Camera) -> StyleTargets:
-        """What the style asks of views of the camera's size."""
+        """Return the style targets for views of the camera's size."""
         size = (camera.height, camera.width)
         if size not in self._style_targets:
             styles = self._stylizer.styles.to(self.loss.network.device)
@@ -116,12 +116,12 @@ class ExactLoss:
 
 
 class ExactTwin(ExactLoss):
-    """Evaluates loss and gradient of a job's colors exactly.
+    """Exact loss and gradient of a job's colors.
 
     Args:
-        stylizer: the job; it is not changed.
-        memory: bytes that view targets may take.
-        style_loss: as for `ExactLoss`.
+        stylizer: Job, which is not changed.
+        memory: Memory budget in bytes for view targets.
+        style_loss: Style loss, as for `ExactLoss`.
     """
 
     def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
@@ -146,11 +146,15 @@ class ExactTwin(ExactLoss):
         )
 
     def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:
-        """Mean SOS loss over views of colors [N, 3] of the whole scene, split by scale."""
+        """Return the mean SOS loss over views, by scale, for colors [N, 3] of the whole scene."""
         return evaluate(self.views, self.style_targets, indices, sh_dc[self.shown].to(self.views.rasterizer.device))
 
     def gradient(self, index: int, sh_dc: Tensor, scales: list[int]) -> tuple[Tensor, float]:
-        """dE/dsh_dc [N, 3] of colors [N, 3] of the whole scene, and the seconds it took with its targets at hand."""
+        """Compute dE/dsh_dc [N, 3] for colors [N, 3] of the whole scene.
+
+        Returns:
+            The gradient, and the seconds it took, not counting the view's targets.
+        """
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
         gradient = torch.zeros_like(sh_dc)
         values = sh_dc[self.shown].to(self.views.rasterizer.device)
@@ -163,10 +167,10 @@ class ExactTwin(ExactLoss):
         return gradient, time.perf_counter() - started
 
     def gradient_error(self, *, start: bool = False) -> GradientError:
-        """Compare the job's gradient of its latest view with the exact one, at the colors that it would end with now.
+        """Compare the job's gradient for its latest view with the exact one, at the colors the job would return now.
 
         Args:
-            start: compare that of the first view at the unstylized colors, whatever the present ones are.
+            start: Whether to compare at the unstylized colors instead, for the first view.
         """
         stylizer = self._stylizer
         if start or not stylizer.history:

@@ -1,6 +1,7 @@
-"""What is extreme in a scene, its views and its style, before a long job: counts, the worst one, and what is done.
+"""Warnings about extreme values in a scene, its views and its style, to be read before a long job.
 
-Nothing here is an error. What cannot be used at all is refused where it is read.
+Each finding has a count, the worst case and its consequence. None of them is an error: input that cannot be used at all
+is refused by the reader.
 """
 
 from __future__ import annotations
@@ -26,31 +27,32 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
-#: Trained quaternions are of any length around 1; far beyond, training or export went wrong.
+#: Plausible lengths of trained quaternions. Outside this range, training or export went wrong.
 QUATERNION_LENGTHS = (1e-3, 1e3)
-#: Relative to the scene's extent: larger than all of it, and too small for any view to resolve.
+#: Sizes relative to the scene's extent: larger than the whole scene, and too small for any view to resolve.
 LARGE_SCALE, SMALL_SCALE = 1.0, 1e-7
-#: Longest to middle axis. Flat discs are usual, needles are not.
+#: Ratio of the longest to the middle axis. Flat discs are common, needles are not.
 NEEDLE = 1e3
-#: exp(177)^4 overflows float64, and with it the determinant of the projected covariance.
+#: Log scale above which the determinant of the projected covariance overflows: exp(177)^4 exceeds float64.
 OVERFLOW_SCALE = 177.0
-#: Coefficients of trained scenes stay within a few units; 20 is a color of 6.
+#: SH coefficients of trained scenes stay within a few units; 20 corresponds to a color of 6.
 LARGE_COEFFICIENT = 20.0
-#: Scene extents from the world's origin at which float32 positions step by a thousandth of the extent.
+#: Distance from the world's origin, in scene extents, at which float32 positions are a thousandth of the extent apart.
 FAR_WORLD = 1e4
 #: Total blend weight below which a Gaussian changes no view by a gray level.
 HARDLY_SEEN = 1.0 / 255.0
-#: Degrees; beyond, the perspective bends so much within one Gaussian that its linearization is coarse.
+#: Fields of view in degrees. Beyond the wide one, perspective is so strong within one Gaussian that its linearization
+#: is inaccurate.
 WIDE, NARROW = 140.0, 1.0
-#: Share of a view without Gaussians that is worth telling.
+#: Fraction of a view without Gaussians from which on it is reported.
 UNCOVERED = 0.01
-#: A style image longer than this many times its width.
+#: Aspect ratio of a style image beyond which it is reported.
 LONG_STYLE = 4.0
-#: Standard deviation of a style image's values below which it has no texture: one gray level.
+#: Standard deviation of a style image below which it has no texture: one gray level.
 FLAT_STYLE = 1.0 / 255.0
-#: Points that the extent of the scene is taken from.
+#: Number of points that the scene's extent is estimated from.
 _SAMPLE = 50_000
-#: Gaussians that are looked at together: some tens of bytes in float64 for each of them.
+#: Gaussians processed at a time; each needs some tens of bytes in float64.
 _PART = 1 << 17
 
 Subject = Literal["scene", "views", "style"]
@@ -58,14 +60,14 @@ Subject = Literal["scene", "views", "style"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is extreme.
+    """One extreme property of the input.
 
     Attributes:
-        subject: of what.
-        what: is extreme about it.
-        count, total: how many, of how many.
-        worst: which one most, and its value; empty where there is nothing to name.
-        done: what becomes of it.
+        subject: Part of the input.
+        what: Description of the property.
+        count, total: Number of affected items, and of all items.
+        worst: Worst item and its value; empty if there is nothing to name.
+        done: Consequence for the job.
     """
 
     subject: Subject
@@ -84,19 +86,23 @@ def findings_of(
     near: float,
     looked: Survey | None = None,
 ) -> list[Finding]:
-    """What is extreme in a scene that was read with `drop_invalid`, its views, and a style if given.
+    """Return the findings about a scene read with `drop_invalid`, its views, and its style if given.
 
     Args:
-        looked: a survey of the cameras, which need not be looked at again then.
+        file: Scene file.
+        cameras: Cameras of the views.
+        style: Style image [H, W, 3] or mixture; None skips the style.
+        near: Distance of the near plane in world units.
+        looked: Survey of the cameras, if there is one already; None renders them.
     """
-    rasterizer = make_rasterizer("cpu", file.scene, near=near)  # builds nothing yet
+    rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: builds nothing yet
     found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, looked=looked)]
     pictures = () if style is None else StyleMixture.of(style).pictures
     return [*found, *(finding for picture in pictures for finding in style_findings(picture, cameras))]
 
 
 def scene_findings(file: SceneFile) -> list[Finding]:
-    """What is extreme in a scene that was read with `drop_invalid`; indices are rows of the file."""
+    """Return the findings about a scene read with `drop_invalid`; indices are rows of the file."""
     scene = _Scene(file)
     return [
         *scene.invalid(),
@@ -108,13 +114,14 @@ def scene_findings(file: SceneFile) -> list[Finding]:
     ]
 
 
-#: Of one part of a scene, for each question: which of its n Gaussians are extreme [n] bool, and their values [n].
+#: Function that checks a slice of n Gaussians. For each question it returns a mask [n] bool of the extreme ones, and
+#: their values [n].
 _Look = Callable[[slice], Sequence[tuple[Tensor, Tensor]]]
 
 
 @dataclass(frozen=True)
 class _Question:
-    """What is asked of every Gaussian; the worst has the largest, or the smallest, value."""
+    """Property checked for every Gaussian; the worst one has the largest, or the smallest, value."""
 
     what: str
     done: str
@@ -122,16 +129,16 @@ class _Question:
 
 
 class _Scene:
-    """A scene, looked at part by part, so that no copy in float64 is made of all of it; and its extent."""
+    """Scene with its extent, checked slice by slice to avoid a float64 copy of the whole scene."""
 
     def __init__(self, file: SceneFile) -> None:
         self.file, self.scene = file, file.scene
         self.center, self.extent = scene_extent(file.scene)
 
     def ask(self, look: _Look, *questions: _Question, subject: Subject = "scene") -> list[Finding]:
-        """A finding for each question that some Gaussian is an answer to, from a look at each part of the scene."""
+        """Check the scene slice by slice, and return a finding for each question that applies to any Gaussian."""
         counts = [0] * len(questions)
-        worst = [(-math.inf, -1, math.nan)] * len(questions)  # value to compare by, Gaussian, value
+        worst = [(-math.inf, -1, math.nan)] * len(questions)  # (value to compare, Gaussian, value)
         for part in _parts(len(self.scene)):
             for place, (extreme, value) in enumerate(look(part)):
                 count = int(extreme.sum())
@@ -149,7 +156,7 @@ class _Scene:
         ]
 
     def _row(self, index: int) -> int:
-        """The file's row of a Gaussian."""
+        """Return the row of a Gaussian in the file."""
         return index if self.file.kept is None else int(np.flatnonzero(self.file.kept)[index])
 
     def invalid(self) -> list[Finding]:
@@ -249,7 +256,11 @@ class _Scene:
 
 
 def scene_extent(scene: Scene) -> tuple[Tensor, float]:
-    """Median position [3] float64, and the 98 % quantile of the distances to it (1 for a scene of one point)."""
+    """Return the scene's center and extent.
+
+    The center is the median position [3] float64. The extent is the 98 % quantile of the distances to it, or 1 if that
+    is 0.
+    """
     points = scene.means[:: max(1, len(scene) // _SAMPLE)].double()
     center = points.median(dim=0).values
     extent = float(torch.quantile((points - center).norm(dim=1), 0.98))
@@ -259,10 +270,14 @@ def scene_extent(scene: Scene) -> tuple[Tensor, float]:
 def view_findings(
     file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float, looked: Survey | None = None
 ) -> list[Finding]:
-    """What is extreme in the views, and which Gaussians they do not show.
+    """Return the findings about the views, and about the Gaussians that no view shows.
 
     Args:
-        looked: a survey of the cameras; without one each of them is rendered, forwards and back.
+        file: Scene file.
+        cameras: Cameras of the views.
+        rasterizer: Rasterizer of the scene.
+        near: Distance of the near plane in world units.
+        looked: Survey of the cameras; None renders each of them, forward and backward.
     """
     if looked is not None and looked.uncovered is not None:
         shown = [*_uncovered(looked.uncovered, cameras), *_seldom_seen(file, looked.total_blend_weights)]
@@ -274,7 +289,7 @@ def view_findings(
 def _of_views(
     what: str, values: list[float], extreme: list[bool], cameras: Sequence[Camera], done: str
 ) -> list[Finding]:
-    """A finding for the views that are extreme; the worst has the largest value."""
+    """Return a finding about the extreme views, if there are any; the worst one has the largest value."""
     if not any(extreme):
         return []
     index = max((i for i, is_extreme in enumerate(extreme) if is_extreme), key=lambda i: values[i])
@@ -323,7 +338,7 @@ def _lenses(cameras: Sequence[Camera]) -> list[Finding]:
 
 
 def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]:
-    """Cameras with Gaussians closer than the near plane."""
+    """Report cameras with Gaussians closer than the near plane."""
     centers = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(camera.center[None].double() for camera in cameras)])
     close = [float(count) for count in closer(scene.means, centers, near)]
     return _of_views(
@@ -336,16 +351,16 @@ def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]
 
 
 def closer(means: Tensor, centers: Tensor, distance: float) -> list[int]:
-    """How many of the points [N, 3] are closer than a distance to each of some centers [V, 3] float64.
+    """Count the points [N, 3] within a distance of each center [V, 3] float64.
 
-    Points are first held against all centers by their x alone, which hardly any of them passes.
+    Points are first compared with all centers by x alone, which rules out almost all of them.
     """
     along = centers[:, 0].sort().values.contiguous()
     counts = [0] * len(centers)
     for part in _parts(len(means)):
         points = means[part].double()
         x = points[:, 0].contiguous()
-        reach = distance * (1 + 1e-9) + 1e-12 * x.abs()  # more than rounding takes away
+        reach = distance * (1 + 1e-9) + 1e-12 * x.abs()  # includes a margin for rounding
         points = points[torch.searchsorted(along, x + reach, right=True) > torch.searchsorted(along, x - reach)]
         for view in range(len(centers) if len(points) else 0):
             counts[view] += int(((points - centers[view]).norm(dim=1) < distance).sum())
@@ -353,7 +368,7 @@ def closer(means: Tensor, centers: Tensor, distance: float) -> list[int]:
 
 
 def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -> list[Finding]:
-    """Total blend weights, and each view's uncovered share."""
+    """Render all views, and report uncovered views and hardly seen Gaussians."""
     blend_weights = torch.zeros(len(file.scene), dtype=torch.float64)
     uncovered: list[float] = []
     refused: list[str] = []
@@ -377,7 +392,7 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
 
 
 def _uncovered(shares: list[float], cameras: Sequence[Camera]) -> list[Finding]:
-    """Views that see nothing, or not everywhere, from each one's share of uncovered pixels."""
+    """Report views that see nothing or leave pixels uncovered, given each view's fraction of uncovered pixels."""
     return [
         *_of_views(
             "see no Gaussian",
@@ -397,7 +412,7 @@ def _uncovered(shares: list[float], cameras: Sequence[Camera]) -> list[Finding]:
 
 
 def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
-    """Gaussians that no view shows or hardly any, from their total blend weights [N]."""
+    """Report Gaussians that are hardly or never seen, given their total blend weights [N]."""
 
     def look(part: slice) -> list[tuple[Tensor, Tensor]]:
         weights = blend_weights[part]
@@ -419,7 +434,7 @@ def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
 
 
 def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
-    """What is extreme in a style image [H, W, 3]."""
+    """Return the findings about a style image [H, W, 3]."""
     height, width = int(style.shape[0]), int(style.shape[1])
     found = []
     spread = float(style.double().std(dim=(0, 1), correction=0).max())
@@ -442,7 +457,7 @@ def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
 
 
 def _large_coefficients(values: Tensor | StoredHarmonics) -> _Look:
-    """Which Gaussians have large coefficients among theirs of values [N, K, 3]."""
+    """Return a check for large SH coefficients in values [N, K, 3]."""
     if isinstance(values, StoredHarmonics):
         sizes = values.largest()
         return lambda part: [(sizes[part] > LARGE_COEFFICIENT, sizes[part])]
@@ -457,5 +472,5 @@ def _large_coefficients(values: Tensor | StoredHarmonics) -> _Look:
 
 
 def _parts(count: int) -> list[slice]:
-    """So many rows, by parts."""
+    """Split `count` rows into slices."""
     return [slice(start, min(start + _PART, count)) for start in range(0, count, _PART)]

@@ -1,9 +1,9 @@
-"""How a stylized scene looks, judged by a network that no run optimizes.
+"""Independent judgment of a stylized scene, by features that no job optimizes.
 
-A job's own loss cannot tell whether its result is good: it is what was minimized. AlexNet's features (those of LPIPS)
-are not, and so its Gram matrices say how near a picture's textures are to the style's, its distances how much is left
-of the content, and plain colors how near the palette is. Only what Gaussians cover counts, and every view is judged
-on black and on white behind them: an object scan has no surround of its own.
+A job minimizes its own loss, so that loss cannot show whether the result is good. AlexNet (the network of LPIPS) is
+never optimized: its Gram matrices show how close textures are to the style's, its features how much content is left.
+Plain color statistics show how close the colors are. Only the area that Gaussians cover counts. Every view is judged on
+a black and on a white background, because the background of an object scan is arbitrary.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from sgsst_core.scene.pyramid import style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.regions import JobStyles
 
-#: Longer side in pixels at which views are judged: figures of one scene at several resolutions can be compared, and a
-#: view of many megapixels costs no more than one of one.
+#: Longer side in pixels of judged views. Results for one scene at several resolutions stay comparable, and a view of
+#: many megapixels costs no more than a view of one.
 JUDGED_SIDE = 1024
-#: Behind the Gaussians, in turn.
+#: Background colors, each judged in turn.
 _BEHIND = (0.0, 1.0)
-#: Views that Gaussians cover by less than this share are not judged.
+#: Minimum coverage of judged views.
 _LEAST_COVERAGE = 1e-3
-#: Colors are compared in steps of 8 bits.
+#: Color distances are in 8-bit levels.
 _LEVELS = 255.0
 
 
 @dataclass(frozen=True)
 class Judgment:
-    """Means over views, and over black and white behind them.
+    """Means over views, and over a black and a white background.
 
     Attributes:
-        style: mean over AlexNet's five layers of |G - G_style| / |G_style|, Frobenius norms of Gram matrices (mean over
-            positions of F F^T); 0 is the style's texture.
-        color_distance: Frechet distance of the RGB colors, in levels of 8 bits: sqrt(|m - m_style|^2 + tr(C + C_style -
-            2 (C C_style)^1/2)); 0 is the style's mean and covariance.
-        content: LPIPS (AlexNet) against the unstylized scene; 0 is the same picture.
-        features: mean over the layers of 1 - cosine of AlexNet's features against the unstylized scene's.
-        background_sensitivity: mean over views of how much `style` differs between black and white.
-        saturated: share of the Gaussians of whose color a channel is outside [0, 1].
+        style: Mean over AlexNet's five layers of |G - G_style| / |G_style|, with Frobenius norms of Gram matrices (mean
+            over positions of F F^T); 0 for the style's own texture.
+        color_distance: Frechet distance of the RGB colors in 8-bit levels: sqrt(|m - m_style|^2 + tr(C + C_style - 2 (C
+            C_style)^1/2)); 0 for the style's own mean and covariance.
+        content: LPIPS (AlexNet) against the unstylized scene; 0 for the same image.
+        features: Mean over layers of 1 - cosine between AlexNet's features and the unstylized scene's.
+        background_sensitivity: Mean over views of the difference in `style` between black and white background.
+        saturated: Fraction of the Gaussians with a color channel outside [0, 1].
     """
 
     style: float
@@ -65,21 +65,21 @@ class Judgment:
 
 
 class Judge:
-    """Judges colors of one scene by one style.
+    """Judge of the colors of one scene by one style.
 
     Args:
-        lpips: with AlexNet.
-        style: a picture [H, W, 3] in 0..1, or several with their weights: the mixture's Gram matrices and palette. Of
-            regions, `style` and `color_distance` are means of each region's by their shares of a view; frozen ones have
-            none.
-        scene: unstylized.
-        rasterizer: of the scene.
-        cameras: of the views; larger ones than `JUDGED_SIDE` are judged at that size. Those that see next to nothing
-            are left out, and so are those too small for AlexNet (a side below 31 pixels).
-        background: [3], what the rasterizer has behind the Gaussians.
+        lpips: LPIPS with AlexNet.
+        style: Image [H, W, 3] in 0 to 1, or a weighted mixture of several, whose Gram matrices and color statistics are
+            mixed. With regions, `style` and `color_distance` are means over the regions, weighted by their fraction of
+            a view; frozen regions do not count.
+        scene: Unstylized scene.
+        rasterizer: Rasterizer of the scene.
+        cameras: Cameras of the views. Views larger than `JUDGED_SIDE` are judged at that size. Views that see almost
+            nothing, or are too small for AlexNet (a side below 31 pixels), are skipped.
+        background: Background color [3] of the rasterizer.
 
     Attributes:
-        cameras: those that are judged; without any there is no judgment.
+        cameras: Cameras of the judged views; if empty, there is no judgment.
     """
 
     def __init__(
@@ -107,10 +107,10 @@ class Judge:
 
     @torch.no_grad()
     def judge(self, sh_dc: Tensor) -> Judgment | None:
-        """Of colors sh_dc [N, 3]; None without views.
+        """Judge colors `sh_dc` [N, 3]. Returns None if there are no views.
 
         Raises:
-            ValueError: a picture holds NaN or infinity.
+            ValueError: If an image contains NaN or infinity.
         """
         if not self.cameras:
             return None
@@ -124,12 +124,12 @@ class Judge:
 
     @torch.no_grad()
     def pictures(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
-        """Pictures [H, W, 3] of colors sh_dc [N, 3] on black and on white."""
+        """Render colors `sh_dc` [N, 3] on black and on white, as images [H, W, 3]."""
         image, coverage = self._render(sh_dc.detach().to(self._rasterizer.device), camera)
         return [self._on(image, coverage, camera, behind) for behind in _BEHIND]
 
     def _view(self, camera: Camera, sh_dc: Tensor) -> list[tuple[float, float, float, float]]:
-        """(style, color_distance, content, features) on black and on white."""
+        """Return (style, color_distance, content, features) on black and on white."""
         image, coverage = self._render(sh_dc, camera)
         before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
         weights = coverage.to(self._lpips.device)
@@ -150,24 +150,27 @@ class Judge:
         return found
 
     def _covered(self, camera: Camera) -> float:
-        """Share of a view that is judged."""
+        """Return the fraction of a view that is judged."""
         if self._maps is not None:
             return float(self._maps.render(camera).sum(dim=2).mean())
         return float(self._rasterizer.coverage(camera).mean())
 
     def _render(self, sh_dc: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Image [H, W, 3] over the rasterizer's background, and coverage [H, W]."""
+        """Return the image [H, W, 3] over the rasterizer's background, and the coverage [H, W]."""
         rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)
         if self.scene.sh_degree:
             rest = rest_colors(self._sh_rest, self._means, camera)
         return self._rasterizer.render(view_colors(sh_dc, rest), camera), self._rasterizer.coverage(camera)
 
     def _on(self, image: Tensor, coverage: Tensor, camera: Camera, behind: float) -> Tensor:
-        """The picture with another color behind the Gaussians."""
+        """Return the image with another background color."""
         return shown(image + (1 - coverage)[..., None] * (behind - self._background), camera, self._lpips.device)
 
     def _parts(self, camera: Camera, coverage: Tensor) -> list[tuple[_StyleJudge, Tensor, float]]:
-        """Each style with its position weights [h, w] and its share of a view: a region's own, or what is covered."""
+        """Return each style's judge with its position weights [h, w] and its fraction of the judged area.
+
+        There is one entry per region in view, or one for the whole covered area without regions.
+        """
         if self._maps is None:
             return [(self._judges[0], coverage, 1.0)]
         weights = [share.to(coverage) for share in self._maps.render(camera).unbind(2)]
@@ -177,7 +180,7 @@ class Judge:
 
 
 class _StyleJudge:
-    """Judges pictures by one style."""
+    """Judge of images by one style."""
 
     def __init__(self, lpips: Lpips, style: StyleMixture) -> None:
         self._lpips = lpips
@@ -187,11 +190,16 @@ class _StyleJudge:
         self._targets: dict[tuple[int, int], list[Tensor]] = {}
 
     def color_distance(self, picture: Tensor, weights: Tensor) -> float:
-        """Frechet distance of the colors of a picture [H, W, 3] with position weights [H, W]."""
+        """Return the Frechet distance of the colors of an image [H, W, 3] with position weights [H, W]."""
         return frechet_distance(_moments(picture.reshape(-1, 3), weights.reshape(-1)), self._palette)
 
     def distance(self, features: list[Tensor], weights: Tensor) -> float:
-        """Relative distance of Gram matrices of a picture's features [h, w, c] by layer, position weights [H, W]."""
+        """Return the mean relative distance of Gram matrices over the layers of an image.
+
+        Args:
+            features: Features [h, w, c] of the image, by layer.
+            weights: Position weights [H, W].
+        """
         targets = self._grams((int(weights.shape[0]), int(weights.shape[1])))
         distances = []
         for values, target in zip(features, targets, strict=True):
@@ -200,7 +208,7 @@ class _StyleJudge:
         return fmean(distances)
 
     def _grams(self, view: tuple[int, int]) -> list[Tensor]:
-        """The style's Gram matrices at the size that it has in the loss of such a view; at least AlexNet's least."""
+        """Return the style's Gram matrices at the size that the loss uses for such a view, or AlexNet's minimum."""
         if view not in self._targets:
             every = [self._grams_of(picture, view) for picture in self._style.pictures]
             self._targets[view] = [
@@ -210,7 +218,7 @@ class _StyleJudge:
         return self._targets[view]
 
     def _grams_of(self, picture: Tensor, view: tuple[int, int]) -> list[Tensor]:
-        """Of one picture of the style."""
+        """Return the Gram matrices of one image of the style."""
         height, width = style_size((picture.shape[0], picture.shape[1]), view)
         enlarged = max(1.0, self._lpips.minimum_side / min(height, width))
         features = self._lpips.features(resize_area(picture, (round(height * enlarged), round(width * enlarged))))
@@ -218,31 +226,36 @@ class _StyleJudge:
 
 
 def saturated(sh_dc: Tensor) -> float:
-    """Share of colors sh_dc [N, 3] of which a channel is outside [0, 1], where no screen shows it."""
+    """Return the fraction of colors `sh_dc` [N, 3] with a channel outside [0, 1], which no screen can show."""
     colors = 0.5 + SH_C0 * sh_dc.double()
     return float(((colors < 0) | (colors > 1)).any(dim=1).double().mean())
 
 
 def frechet_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float:
-    """Of two normal distributions of colors (mean [3], covariance [3, 3]) in 0..1, in levels of 8 bits."""
+    """Return the Frechet distance of two normal distributions of colors, in 8-bit levels.
+
+    Args:
+        first: Mean [3] and covariance [3, 3] of colors in 0 to 1.
+        second: Same for the other distribution.
+    """
     (mean, covariance), (other_mean, other) = first, second
     other_mean, other = other_mean.to(mean), other.to(covariance)
     root = _square_root(covariance)
-    # The trace of (C C')^1/2; rounding may put the eigenvalue of a direction without spread below 0.
+    # Trace of (C C')^1/2. Rounding can make the eigenvalue of a direction without spread negative.
     shared = torch.linalg.eigvalsh(root @ other @ root).clamp_min(0).sqrt().sum()
     spread = covariance.trace() + other.trace() - 2 * shared
     return _LEVELS * float(((mean - other_mean).square().sum() + spread.clamp_min(0)).sqrt())
 
 
 def _square_root(matrix: Tensor) -> Tensor:
-    """Of a symmetric positive semidefinite matrix."""
+    """Return the square root of a symmetric positive semidefinite matrix."""
     values, vectors = torch.linalg.eigh(matrix)
     root: Tensor = vectors * values.clamp_min(0).sqrt() @ vectors.T
     return root
 
 
 def _moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean [3] and covariance [3, 3], float64, of colors [n, 3]."""
+    """Return the weighted mean [3] and covariance [3, 3] of colors [n, 3] in float64."""
     colors, weights = colors.double(), weights.double()
     total = weights.sum()
     mean = colors.T @ weights / total
@@ -251,15 +264,15 @@ def _moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pooled(coverage: Tensor, features: Tensor) -> Tensor:
-    """Coverage [H, W], averaged over what each of the features' cells [h, w, c] has of the picture: [h, w]."""
+    """Average coverage [H, W] over the area of each cell of features [h, w, c], giving [h, w]."""
     height, width = features.shape[:2]
     return F.adaptive_avg_pool2d(coverage[None, None].to(features.dtype), (height, width))[0, 0]
 
 
 def _gram(features: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean of F F^T over the positions of features [h, w, c], [c, c] float64.
+    """Return the weighted mean of F F^T over the positions of features [h, w, c], as [c, c] float64.
 
-    The sums of a layer are made in the features' precision: positions of one picture, all terms at least 0.
+    Sums run in the precision of the features, which is enough here: they cover one image, and all terms are at least 0.
     """
     flat = features.flatten(0, 1)
     weighted = flat * weights.reshape(-1, 1).to(flat)
@@ -267,7 +280,10 @@ def _gram(features: Tensor, weights: Tensor) -> Tensor:
 
 
 def _turned(x: Tensor, y: Tensor, coverage: Tensor) -> float:
-    """Weighted mean of 1 - cosine of two pictures' features [h, w, c]; where both are zero nothing has changed."""
+    """Return the weighted mean of 1 - cosine between the features [h, w, c] of two images.
+
+    Positions where both are zero count as unchanged.
+    """
     differences = (unit_features(x) - unit_features(y)).square().sum(dim=2) / 2
     return _weighted_mean(differences, _pooled(coverage, x))
 

@@ -1,7 +1,7 @@
-"""LPIPS, the learned perceptual distance of two images, as a number and as a map.
+"""LPIPS, a learned perceptual distance between two images, as a number and as a map.
 
 Zhang, Isola, Efros, Shechtman, Wang, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR
-2018, equation 1: features of five layers are scaled to unit length at every position, and
+2018, equation 1. Features of five layers are scaled to unit length at every position, and
 
     d(x, y) = sum over layers l of the mean over positions of sum over channels c of w_lc (x_lc - y_lc)^2
 
@@ -25,15 +25,15 @@ from sgsst_core.features.vgg import FeatureNetwork, layer_stride
 
 LpipsNetwork = Literal["alex", "vgg16"]
 
-#: The last ReLU of each block, which LPIPS looks at.
+#: Layers that LPIPS compares: the last ReLU of each block.
 _VGG16_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
-#: (stride, padding) of AlexNet's convolutions (Krizhevsky 2014, the one-tower form that torchvision has).
+#: (stride, padding) of AlexNet's convolutions (Krizhevsky 2014, the one-tower version of torchvision).
 _ALEX_CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
-#: Convolutions of AlexNet in front of which a 3x3 max pool of stride 2 stands, counted from 1.
+#: Convolutions of AlexNet that follow a 3x3 max pool of stride 2, counted from 1.
 _ALEX_POOLED = (2, 3)
-#: Shorter side in pixels below which the deepest layer has no cell at all.
+#: Minimum length in pixels of the shorter side. On smaller images the deepest layer has no cell.
 _MINIMUM_SIDE = {"alex": 31, "vgg16": layer_stride("relu5_3")}
-#: Added to a feature vector's length, as published: a dead position stays zero instead of becoming 0/0.
+#: Added to the length of feature vectors, as in the published code: zero vectors stay zero instead of becoming 0/0.
 _LENGTH_EPS = 1e-10
 
 
@@ -42,9 +42,9 @@ class PerceptualDistance:
     """LPIPS of two images.
 
     Attributes:
-        mean: the published number, 0 for equal images.
-        map: [H, W], each layer's distances upsampled bilinearly to the pixels, summed over the layers (published as
-            `spatial`); its mean over pixels is `mean` but for the upsampling at the border.
+        mean: LPIPS as published; 0 for equal images.
+        map: Distance per pixel [H, W]: each layer's distances upsampled bilinearly and summed over layers (published as
+            `spatial`). Its mean differs from `mean` only by the upsampling at the border.
     """
 
     mean: float
@@ -52,17 +52,18 @@ class PerceptualDistance:
 
 
 class Lpips:
-    """Evaluates LPIPS.
+    """LPIPS network.
 
     Args:
         network: "alex", which the authors recommend as a metric, or "vgg16".
-        dtype: torch.float32, or torch.float64 (reference).
-        device: where features are computed.
-        folder: of the weights; None is the cache folder.
+        dtype: torch.float32, or torch.float64 for the reference.
+        device: Device that features are computed on.
+        folder: Folder of the weights; None for the cache folder.
 
     Raises:
-        SettingsError: no such network.
-        WeightsError: the weights are missing, corrupt, or of a VGG16 with other channels than the published one.
+        SettingsError: If the network is unknown.
+        WeightsError: If the weights are missing or corrupt, or belong to a VGG16 with other channels than the published
+            one.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class Lpips:
         self.network = network
         self.dtype = dtype
         self.device = torch.device(device)
-        #: Images whose shorter side has fewer pixels have no distance.
+        #: Minimum length in pixels of an image's shorter side.
         self.minimum_side = _MINIMUM_SIDE[network]
         tensors = {name: tensor.to(self.device, dtype) for name, tensor in load_perceptual(network, folder).items()}
         self._heads = [tensors[f"linear{layer}.weight"] for layer in range(1, 6)]
@@ -88,10 +89,10 @@ class Lpips:
 
     @torch.no_grad()
     def distance(self, first: Tensor, second: Tensor) -> PerceptualDistance:
-        """Distance of two images [H, W, 3] of one size, values 0..1, any floating dtype.
+        """Compute the distance between two images [H, W, 3] of the same size, with values 0 to 1 in any floating dtype.
 
         Raises:
-            ValueError: shapes differ or are no images, or a side is shorter than `minimum_side`.
+            ValueError: If the shapes differ or are not those of images, or a side is shorter than `minimum_side`.
         """
         if first.shape != second.shape or first.ndim != 3 or first.shape[2] != 3:
             raise ValueError(f"LPIPS of shapes {tuple(first.shape)} and {tuple(second.shape)}: two images [H, W, 3]")
@@ -104,11 +105,14 @@ class Lpips:
 
     @torch.no_grad()
     def features(self, image: Tensor) -> list[Tensor]:
-        """Features [h, w, c] of the five layers of an image [H, W, 3], values 0..1, sides at least `minimum_side`."""
+        """Return the features [h, w, c] of the five layers for an image [H, W, 3] with values 0 to 1.
+
+        The sides of the image must be at least `minimum_side`.
+        """
         return self._layers(image.to(self.device, self.dtype))
 
     def between(self, first: list[Tensor], second: list[Tensor], size: tuple[int, int]) -> PerceptualDistance:
-        """Distance of two images of a size (height, width) by their `features`."""
+        """Compute the distance between two images of size (height, width) from their `features`."""
         mean, spatial = 0.0, torch.zeros(size, dtype=self.dtype, device=self.device)
         for x, y, head in zip(first, second, self._heads, strict=True):
             distances = ((unit_features(x) - unit_features(y)).square_() @ head)[None, None]
@@ -118,23 +122,23 @@ class Lpips:
 
 
 def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> Lpips | None:
-    """LPIPS with AlexNet in float32, or None where its weights (which come with VGG16's) are not installed.
+    """Load LPIPS with AlexNet in float32, or return None if its weights (installed along with VGG16's) are missing.
 
     Raises:
-        WeightsError: the weights are installed, but corrupt.
+        WeightsError: If the weights are installed but corrupt.
     """
     installed = any(entry.name == "lpips_alex" and entry.path for entry in list_network_weights(folder))
     return Lpips(device=device, folder=folder) if installed else None
 
 
 def unit_features(features: Tensor) -> Tensor:
-    """Features [h, w, c] scaled to unit length at every position."""
+    """Scale features [h, w, c] to unit length at every position."""
     lengths: Tensor = torch.linalg.vector_norm(features, dim=2, keepdim=True)
     return features / (lengths + _LENGTH_EPS)
 
 
 def _alexnet(tensors: dict[str, Tensor]) -> Callable[[Tensor], list[Tensor]]:
-    """AlexNet's five ReLU outputs [h, w, c] as a function of pixels [H, W, 3]."""
+    """Return a function from pixels [H, W, 3] to AlexNet's five ReLU outputs [h, w, c]."""
 
     def features(rgb: Tensor) -> list[Tensor]:
         x = (rgb * tensors["input_scale"] + tensors["input_shift"]).permute(2, 0, 1).unsqueeze(0)
@@ -153,7 +157,7 @@ def _alexnet(tensors: dict[str, Tensor]) -> Callable[[Tensor], list[Tensor]]:
 def _vgg16(
     heads: list[Tensor], folder: Path | None, dtype: torch.dtype, device: torch.device
 ) -> Callable[[Tensor], list[Tensor]]:
-    """VGG16's last ReLU of each block [h, w, c] as a function of pixels [H, W, 3]."""
+    """Return a function from pixels [H, W, 3] to the output [h, w, c] of the last ReLU of each VGG16 block."""
     network = FeatureNetwork(load_network_weights("vgg16", folder), _VGG16_LAYERS, dtype, device)
     if [network.channels(layer) for layer in _VGG16_LAYERS] != [len(head) for head in heads]:
         raise WeightsError(

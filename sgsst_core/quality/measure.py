@@ -1,4 +1,4 @@
-"""What a run measures at moments between its steps: novel views, and its approximations against exact."""
+"""Measurements between the steps of a run: novel views, and the error of the job's approximations."""
 
 from __future__ import annotations
 
@@ -31,17 +31,18 @@ from sgsst_core.stylizing.stylizer import Stylizer
 
 
 class Measurements:
-    """Measures a job; pass an object of this as `loop.Callbacks.measure`.
+    """Measurements of a job; pass an instance as `loop.Callbacks.measure`.
 
-    Everything is built at first use. Results go to `Stylizer.measured`, one entry a moment, ready for JSON: "step",
-    "novel_views" and "approximation" (None if there is nothing to measure), "seconds". The moment of step 0
-    is measured together with the one after it, from the unstylized colors, so that the first step need not wait. How
-    much is measured is the plan's, or less where the first view takes longer than it thought: decided once, by the
-    first rank, and kept in the first entry with what a moment takes after it ("level", "again"). The last entry holds
-    what the result is "judged" to be (`Judgment`, "before" and "after"), where AlexNet is installed.
+    Everything is built at first use. Results are appended to `Stylizer.measured`, one JSON-serializable entry per
+    moment: "step", "novel_views" and "approximation" (None if there is nothing to measure), "seconds". The unstylized
+    scene (step 0) is measured together with the next moment, so that the first step need not wait.
+
+    The plan decides how much is measured. If the first view takes longer than predicted, the first rank reduces this
+    once; the first entry records the decision and the seconds of a later moment ("level", "again"). The last entry
+    holds the `Judgment` of the result ("judged", with "before" and "after") if AlexNet is installed.
 
     Args:
-        stylizer: the job, at any step.
+        stylizer: Job, at any step.
     """
 
     def __init__(self, stylizer: Stylizer) -> None:
@@ -53,30 +54,30 @@ class Measurements:
 
     @property
     def exact(self) -> ExactTwin:
-        """The exact twin."""
+        """Exact loss and gradient of the job."""
         if self._exact is None:
             self._exact = ExactTwin(self._stylizer, measuring_memory(self._stylizer.memory))
         return self._exact
 
     @property
     def level(self) -> Level:
-        """How much is measured."""
+        """Level that decides how much is measured."""
         measured = self._stylizer.measured
-        # Entries of before there were levels: all.
+        # Checkpoints without a level measured everything.
         return LEVELS[measured[0].get("level", 0) if measured else self._stylizer.plan.measuring]
 
     @property
     def moments(self) -> list[int]:
-        """Steps after which the job is measured; none without a share of its time."""
+        """Steps after which the job is measured; empty if measuring is off."""
         stylizer = self._stylizer
         return self.level.moments(stylizer.total) if stylizer.settings.measure else []
 
     def due(self, step: int) -> bool:
-        """Whether the job is to be measured after so many steps."""
+        """Return whether to measure the job after the given step."""
         return step > 0 and step in self.moments
 
     def seconds_left(self, step: int) -> float:
-        """What the moments from so many steps on will take, and the loss before and after."""
+        """Predict the seconds of the measurements from a step on, including the loss before and after the job."""
         expected, measured = self._stylizer.plan.prediction, self._stylizer.measured
         done = {entry["step"] for entry in measured}
         left = sum((moment >= step or not measured) and moment not in done for moment in self.moments)
@@ -92,7 +93,7 @@ class Measurements:
         return left * max(price, 0.0) + losses
 
     def evaluate(self, *, unstylized: bool = False) -> Evaluation:
-        """Exact loss on the evaluation views, of the present colors or of the unstylized scene."""
+        """Return the exact loss on the evaluation views, for the present colors or the unstylized scene."""
         stylizer = self._stylizer
         if unstylized and not self.approximated:
             return stylizer.start()
@@ -103,7 +104,7 @@ class Measurements:
             return self.exact.evaluate(stylizer.evaluation_views, colors)
 
     def at_the_end(self) -> None:
-        """Measure the last moment, wherever the job has ended, unless that has been done."""
+        """Measure the last moment, at whatever step the job stopped, unless it has been measured already."""
         if self.moments:
             with self._stylizer.measuring():
                 self._measure_start()
@@ -113,16 +114,19 @@ class Measurements:
                 self._judge()
 
     def __call__(self, stylizer: Stylizer) -> None:
-        """Measure now; the start too, where it is to be and has not been."""
+        """Measure now. Measure the unstylized scene too if it is due and still missing."""
         if stylizer.step == stylizer.total:
-            stylizer.stylized()  # the result, which is not made for measuring
+            stylizer.stylized()  # the result is needed anyway, so its time does not count as measuring
         with stylizer.measuring():
             self._measure_start()
-            if self.due(stylizer.step):  # as the first view's price has it
+            if self.due(stylizer.step):  # decided again, because the first view's time can change it
                 self._measure(start=False)
 
     def _judge(self) -> None:
-        """Judge the result and the unstylized scene, into the last entry ("judged"); the first rank's alone."""
+        """Judge the result and the unstylized scene on the first rank.
+
+        The judgment is added to the last entry as "judged".
+        """
         stylizer, novel_views = self._stylizer, self._novel_views_of_job()
         if novel_views.lpips is None or stylizer.collectives.rank:
             return
@@ -138,12 +142,12 @@ class Measurements:
             self._measure(start=True)
 
     def _measure(self, *, start: bool) -> None:
-        """One moment: the present one, or the unstylized scene's."""
+        """Measure one moment: the present colors, or the unstylized scene."""
         stylizer, started = self._stylizer, time.perf_counter()
         approximation = self.exact.gradient_error(start=start).as_dict() if self.approximated else None
         own: dict[str, Any] = {}
         if not stylizer.measured:
-            stylized = stylizer.stylized()  # its seconds are a moment's, and it is kept for the one that follows
+            stylized = stylizer.stylized()  # timed as part of a moment, and cached for the next one
             seconds = time.perf_counter() - started
             own = self._first(stylizer.scene.sh_dc if start else stylized, seconds)
         moment = self._moment(stylizer.scene.sh_dc if start else stylizer.stylized(), own, start=start)
@@ -153,7 +157,13 @@ class Measurements:
         stylizer.measured.append(entry)
 
     def _moment(self, colors: Tensor, own: dict[str, Any], *, start: bool) -> dict[str, Any] | None:
-        """Novel views with colors [N, 3]; None without any. `own`: what the first entry holds."""
+        """Measure the novel views with colors [N, 3]. Returns None if there are none.
+
+        Args:
+            colors: Colors `sh_dc` [N, 3].
+            own: Fields of the first entry, which are completed in place; empty for later entries.
+            start: Whether the colors are those of the unstylized scene.
+        """
         stylizer, novel_views = self._stylizer, self._novel_views_of_job()
         if own:
             own["novel_view_names"] = [novel_views.cameras[index].name for index in novel_views.views]
@@ -162,12 +172,19 @@ class Measurements:
         if not novel_views.views:
             return None
         measured = novel_views.measure(colors.to(novel_views.rasterizer.device))
-        if not start and (not stylizer.measured or stylizer.measured[0]["step"]):  # no start to compare it with
+        if not start and (
+            not stylizer.measured or stylizer.measured[0]["step"]
+        ):  # without a measured start, there is nothing to compare with
             measured = replace(measured, gram_relative=None)
         return measured.as_dict(0, 0.0) if start else measured.as_dict(stylizer.step, stylizer.seconds)
 
     def _first(self, colors: Tensor, seconds: float) -> dict[str, Any]:
-        """How much is measured, from what one view of it takes; seconds: of a moment beside its views."""
+        """Decide how much to measure, by timing one view. Returns the fields "level" and "again" of the first entry.
+
+        Args:
+            colors: Colors `sh_dc` [N, 3] to measure with.
+            seconds: Time of a moment apart from its views.
+        """
         stylizer, place = self._stylizer, self._stylizer.plan.measuring
         again = 0.0
         if LEVELS[place].views and LEVELS[place].start:
@@ -182,11 +199,16 @@ class Measurements:
         return {"level": place, "again": again}
 
     def _trial(self, colors: Tensor, seconds: float) -> tuple[NovelViews, Prices]:
-        """One view of colors [N, 3], measured, and its price; seconds: of a moment beside its views."""
-        lpips = load_lpips_or_none(self._stylizer.network.device)  # is not what a view takes
+        """Measure one view, and return it with the time it took.
+
+        Args:
+            colors: Colors `sh_dc` [N, 3] to measure with.
+            seconds: Time of a moment apart from its views.
+        """
+        lpips = load_lpips_or_none(self._stylizer.network.device)  # loaded before the clock starts: not a cost per view
         clock = [time.perf_counter()]
         novel_views = self._make(1, lpips)
-        for _ in range(2 if novel_views.views else 0):  # the first time its lists, depth and warps are made
+        for _ in range(2 if novel_views.views else 0):  # the first pass includes intersections, depth and warps
             clock.append(time.perf_counter())
             novel_views.measure(colors.to(novel_views.rasterizer.device))
         clock.append(time.perf_counter())
@@ -194,19 +216,22 @@ class Measurements:
         return novel_views, Prices(max(clock[-2] - clock[0] - again, 0.0), again, seconds)
 
     def _affordable(self, place: int, prices: Prices) -> int:
-        """The level that these prices allow, from the plan's on.
+        """Return the first level, from the plan's on, that is affordable at the measured times.
 
-        Nothing is compiled in them: steps have been made by then.
+        The times include no compilation, because some steps have already run.
         """
         stylizer, expected = self._stylizer, self._stylizer.plan.prediction
         if expected is None:
             return place
         allowed = novel_view_seconds(stylizer.settings.measure, expected)
-        # One view has been prepared by now: that it be measured at the end costs little.
+        # One view has been prepared by now, so measuring it at the end costs little.
         return min(choose_level(prices, allowed, stylizer.total, place), NOTHING - 1)
 
     def _source_of_statistics(self) -> Stylizer | ExactLoss:
-        """What has network and style targets to measure Gram distances with: exact ones, whatever the job optimizes."""
+        """Return the source of network and style targets for Gram distances.
+
+        It is exact, and has them even if the job optimizes another loss.
+        """
         if not has_statistics(self._stylizer.settings.style_loss):
             return ExactLoss(self._stylizer, "sos")
         return self.exact if self._stylizer.network.precision != "float32" else self._stylizer
@@ -217,7 +242,7 @@ class Measurements:
         return self._novel_views
 
     def _make(self, views: int, lpips: Lpips | None = None) -> NovelViews:
-        """Novel views, at most so many."""
+        """Make novel views, at most `views` of them."""
         stylizer = self._stylizer
         if self._seen_by is None:
             scene = stylizer.scene.without_zero_bands()

@@ -1,8 +1,8 @@
-"""Quality on views that were never trained on, measured at moments of a run.
+"""Quality on novel views, measured at intervals during a run.
 
-No camera is taken away from the training: novel views lie halfway between neighboring cameras. What is measured is
-how far their style is from the style image's (the Gram terms of the SOS loss) and how well they agree with each other
-(multi-view consistency). Geometry is frozen, so that coverage and warps are the same at every moment and are kept.
+Novel views lie halfway between neighboring cameras, so no camera has to be held out of training. Two measures are
+computed: the distance of their style from the style image's (the Gram terms of the SOS loss), and how well they agree
+with each other (multi-view consistency). Geometry is frozen, so coverage and warps never change and are cached.
 """
 
 from __future__ import annotations
@@ -39,31 +39,31 @@ from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.regions import RegionMaps
 
-#: Views whose Gram distance is measured, and pairs of each range that are compared, at most.
+#: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
 MOST_VIEWS = 4
-#: Two cameras farther apart than so many median steps are no neighbors: the capture was broken off between them.
+#: Distance in median steps beyond which two cameras are not neighbors: the capture was interrupted between them.
 JUMP = 4.0
-#: Nor are two that are turned against each other by more than this, about the field of view of a photo: halfway between
-#: them, nothing need be in view that either sees.
+#: Rotation between two cameras beyond which they are not neighbors, about the field of view of a photo. Halfway between
+#: such cameras, nothing that either sees need be in view.
 LARGEST_TURN = math.radians(60)
-#: Median depth and coverage of a novel view are at least the smaller of its neighbors' divided by this, and at most
-#: the larger times this. Inside an object or behind a wall they are not; on the chord of an arc of 60 degrees they
-#: change by no more than a third.
+#: Factor by which the median depth and coverage of a novel view may fall outside the range of its neighbors'. Inside an
+#: object or behind a wall they fall farther outside; on the chord of an arc of 60 degrees they change by at most a
+#: third.
 LIKENESS = 2.0
-#: Longer side in pixels at which that is looked at.
+#: Longer side in pixels of the small renders for this check.
 _OUTLOOK_SIDE = 160
-#: Gaussians that are looked at there: of larger scenes evenly chosen ones, so much larger that they cover as much.
+#: Maximum number of Gaussians in this check. Larger scenes are sampled; the sample is enlarged to cover the same area.
 _OUTLOOK_GAUSSIANS = 250_000
-#: cos(60 degrees) of a camera file has been rounded.
+#: Tolerance for the rounding of rotations in camera files.
 _COSINE_ROUNDING = 1e-6
 
 
 def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
-    """The pairs that novel cameras lie between: each two neighbors; neighbors in space follow each other.
+    """Return the pairs of neighboring cameras to place novel cameras between.
 
-    The list's order counts. Where the next camera is mostly no neighbor (see `JUMP` and `LARGEST_TURN`) the list is
-    not in the order of a capture, and a walk from each camera to the nearest one takes its place. Fewer than two
-    cameras have nothing between them, and neither have two of one pose.
+    Cameras are taken in the order of the list. If most adjacent cameras are not neighbors (see `JUMP` and
+    `LARGEST_TURN`), the list is not in capture order, and a walk that always continues to the nearest remaining camera
+    replaces it. The result is empty for fewer than two cameras, and omits pairs with the same pose.
     """
     if len(cameras) < 2:
         return []
@@ -87,7 +87,14 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
 
 
 def _walk(centers: Tensor, rotations: Tensor) -> list[int]:
-    """An order of cameras [n, 3], [n, 3, 3] that goes to the nearest one left, similarly turned ones first."""
+    """Return an order of the cameras that always continues to the nearest one left.
+
+    Cameras with a similar rotation take precedence.
+
+    Args:
+        centers: Camera centers [n, 3].
+        rotations: Camera rotations [n, 3, 3].
+    """
     left = torch.ones(len(centers), dtype=torch.bool)
     left[0] = False
     order = [0]
@@ -101,19 +108,19 @@ def _walk(centers: Tensor, rotations: Tensor) -> list[int]:
 
 
 def _similarly_turned(rotations: Tensor, rotation: Tensor) -> Tensor:
-    """Whether rotations [..., 3, 3] differ from one by no more than `LARGEST_TURN`, [...] bool."""
+    """Return whether rotations [..., 3, 3] differ from a given one by at most `LARGEST_TURN`, as [...] bool."""
     cosine = ((rotations * rotation).sum(dim=(-2, -1)) - 1) / 2  # trace(A B^T) = 1 + 2 cos(angle)
     return cosine >= math.cos(LARGEST_TURN) - _COSINE_ROUNDING
 
 
 @dataclass(frozen=True)
 class NovelViewMoment:
-    """What one measurement gives.
+    """Result of one measurement.
 
     Attributes:
-        gram: scale to Gram distance, the mean over views of sum over layers of w_G mean((G - G_v)^2) (see `loss`).
-        gram_relative: mean of `gram` over the scales, relative to the run's first measurement; None without views.
-        short, long: consistency of views 1 and 7 apart; None where there is no such pair.
+        gram: Gram distance by scale: mean over views of the sum over layers of w_G mean((G - G_v)^2) (see `loss`).
+        gram_relative: Mean of `gram` over scales, relative to the run's first measurement; None without views.
+        short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
     """
 
     gram: dict[int, float]
@@ -122,7 +129,7 @@ class NovelViewMoment:
     long: Consistency | None
 
     def as_dict(self, step: int, seconds: float) -> dict[str, Any]:
-        """The measurement after `step` iterations and `seconds` of optimization, as values that JSON can hold."""
+        """Return the measurement after `step` steps and `seconds` of optimization as JSON-serializable values."""
         return {
             "step": step,
             "seconds": seconds,
@@ -133,30 +140,31 @@ class NovelViewMoment:
 
 
 class NovelViews:
-    """Measures the novel views of one job.
+    """Measurements on the novel views of one job.
 
     Args:
-        cameras: of the job.
-        covered: indices of those that see anything.
-        scene: what is stylized. Gaussians that it lacks are missing in the novel views too.
-        rasterizer: of the scene. Best one of its own: a `cached` one that the job uses as well would keep the weights
-            of novel views in the place of views that come again in every round.
-        loss: gives network, memory and partition; it is not used itself, so that its timer does not run.
-        style_targets: the style's statistics for views of a camera's size, in the loss's units.
-        weighted: weigh statistics by rendered coverage, as the job does.
-        lpips: None leaves LPIPS out.
-        first: `HeldOutMoment.gram` of the run's first measurement, where a session before this one has made it.
-        most: views whose Gram distance is measured, and pairs of each range that are compared, at most.
-        memory: bytes that coverage, colors, warps and pictures may take; what does not fit is computed again.
-        rasterizer_of: makes one of a part of the scene, for a first look at the views of a large one; None looks at
-            all of it.
-        maps: renders the share of each region, which `style_targets` are those of; None where the scene has none.
+        cameras: Cameras of the job.
+        covered: Indices of the cameras that see anything.
+        scene: Scene to stylize. Gaussians missing from it are missing in the novel views too.
+        rasterizer: Rasterizer of the scene, preferably not shared with the job: in a shared `cached` rasterizer,
+            weights of novel views would displace those of views that recur in every round.
+        loss: Loss that supplies network, memory budget and partition. It is not evaluated, so its timer does not run.
+        style_targets: Function that returns the style statistics for views of a camera's size, in the loss's units.
+        weighted: Whether to weight statistics by rendered coverage, as the job does.
+        lpips: LPIPS network; None skips LPIPS.
+        first: `NovelViewMoment.gram` of the run's first measurement, for a resumed run; None if there is none yet.
+        most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
+        memory: Memory budget in bytes for coverage, colors, warps and images. What does not fit is recomputed.
+        rasterizer_of: Function that makes a rasterizer of a sample of the scene, for the first check of the views of a
+            large one; None uses the whole scene.
+        maps: Region maps that match `style_targets`; None if the scene has no regions.
 
     Attributes:
-        cameras: all novel views.
-        views: indices of those whose Gram distance is measured, at most 4; without any there is nothing to measure.
-        pairs: gap to the pairs of views that are compared, at most 4 each.
-        first: see above; set by the first measurement.
+        cameras: All novel views.
+        views: Indices of the views whose Gram distance is measured, at most `most`. If empty, there is nothing to
+            measure.
+        pairs: Pairs of views to compare, at most `most`, by gap.
+        first: As above; set by the first measurement.
     """
 
     def __init__(
@@ -206,17 +214,19 @@ class NovelViews:
     def _choose(
         self, parents: list[tuple[Camera, Camera]], most: int
     ) -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
-        """Views and pairs to measure, evenly spread over the novel views; those inside of something are dropped."""
+        """Choose the views and pairs to measure, evenly spread; views from inside an object are dropped."""
         count = len(self.cameras)
         pairs = {gap: view_pairs(count, gap, most) for gap in (SHORT_RANGE, LONG_RANGE)}
-        # the first views of the short pairs: they have to be rendered anyway, and are as even
+        # Views start with the first ones of the short pairs: these are rendered anyway and spread just as evenly.
         views = [i for i, _ in pairs[SHORT_RANGE]] or list(range(min(count, most)))
         used = {*views, *(index for chosen in pairs.values() for pair in chosen for index in pair)}
         rough, rasterizer = self.scene, self.rasterizer
         if self._rasterizer_of is not None and len(rough) > _OUTLOOK_GAUSSIANS:
             rough = sampled(rough, _OUTLOOK_GAUSSIANS)
             rasterizer = self._rasterizer_of(rough)
-        looks: dict[CameraKey, tuple[float, float | None]] = {}  # a camera is the neighbor of two
+        looks: dict[
+            CameraKey, tuple[float, float | None]
+        ] = {}  # by camera, because a camera is a neighbor of two views
 
         def outlook(view: Camera) -> tuple[float, float | None]:
             key = camera_key(view)
@@ -232,7 +242,7 @@ class NovelViews:
     def _is_clear(
         self, camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[[Camera], tuple[float, float | None]]
     ) -> bool:
-        """Whether a novel camera sees much the same as its neighbors do, rather than the inside of something."""
+        """Return whether a novel camera sees much the same as its neighbors, not the inside of an object."""
         (covered, depth), *others = (outlook(view) for view in (camera, *parents))
         return (
             covered > 0
@@ -242,10 +252,10 @@ class NovelViews:
 
     @torch.no_grad()
     def measure(self, sh_dc: Tensor) -> NovelViewMoment:
-        """Measure the scene with colors sh_dc [N, 3].
+        """Measure the scene with colors `sh_dc` [N, 3].
 
         Raises:
-            ValueError: a picture holds NaN or infinity.
+            ValueError: If an image contains NaN or infinity.
         """
         pictures: Shelf[int, Tensor] = Shelf(self._picture_memory, _tensor_bytes)
         sh_dc = sh_dc.detach().to(self.rasterizer.device)
@@ -264,7 +274,7 @@ class NovelViews:
         )
 
     def _picture(self, index: int, sh_dc: Tensor) -> Tensor:
-        """Picture [H, W, 3] of a novel view, as a screen shows it."""
+        """Render a novel view as a screen shows it, [H, W, 3]."""
         camera = self.cameras[index]
         if self.scene.sh_degree == 0:
             rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)
@@ -273,7 +283,7 @@ class NovelViews:
         return shown(self.rasterizer.render(view_colors(sh_dc, rest), camera), camera, self.rasterizer.device)
 
     def _gram(self, picture: Callable[[int], Tensor]) -> dict[int, float]:
-        """Scale to Gram distance, the mean over the views that have the scale."""
+        """Compute the Gram distance by scale, as the mean over the views that have the scale."""
         values: dict[int, list[float]] = {}
         for index in self.views:
             image, coverage = picture(index), None
@@ -298,13 +308,13 @@ class NovelViews:
         return Consistency(gap, results)
 
     def _warp(self, i: int, j: int) -> Warp:
-        """How view j's picture is brought into view i."""
+        """Compute the warp of view j into view i."""
         depth, other = (expected_depth(self.scene, self.cameras[k], self.rasterizer) for k in (i, j))
         return find_warp(other, self.cameras[j], depth, self.cameras[i])
 
 
 def _outlook(camera: Camera, scene: Scene, rasterizer: Rasterizer) -> tuple[float, float | None]:
-    """Mean coverage of a view, 0 if nothing can be seen, and median depth where it is known."""
+    """Return the mean coverage of a view, 0 if it sees nothing, and its median depth, None if unknown."""
     small = resized(camera, min(_OUTLOOK_SIDE, camera.side))
     coverage = rasterizer.coverage(small)
     seen = sees_something(coverage)
@@ -314,7 +324,7 @@ def _outlook(camera: Camera, scene: Scene, rasterizer: Rasterizer) -> tuple[floa
 
 
 def _alike(value: float, others: list[float]) -> bool:
-    """Whether a value is not far outside the others' range; true where there are none."""
+    """Return whether a value is within or near the range of the others; true if there are no others."""
     return not others or min(others) / LIKENESS <= value <= LIKENESS * max(others)
 
 

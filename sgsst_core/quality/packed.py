@@ -1,4 +1,4 @@
-"""What a packed scene file loses: pictures of it against pictures of the scene that was packed."""
+"""Quality loss of compressed scene files, measured by comparing renders with those of the original scene."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
-#: Views that are looked at, and their longer side in pixels.
+#: Number of compared views, and their longer side in pixels.
 _VIEWS, _SIDE = 3, 256
 
 
 @dataclass(frozen=True)
 class PackedLoss:
-    """A packed file beside the scene that it holds.
+    """Quality loss of a compressed file relative to the scene it contains.
 
     Attributes:
-        name: of the file.
-        form: of the file.
-        size: bytes.
-        views: names of the views that were compared.
-        psnr: peak signal-to-noise ratio of their pictures, colors clamped to 0..1, in dB; None where all are equal.
+        name: Name of the file.
+        form: Format of the file.
+        size: Size in bytes.
+        views: Names of the compared views.
+        psnr: Peak signal-to-noise ratio of their images in dB, with colors clamped to 0 to 1; None if all are equal.
     """
 
     name: str
@@ -37,13 +37,13 @@ class PackedLoss:
     psnr: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the values for the JSON report."""
         psnr = None if self.psnr is None else round(self.psnr, 2)
         return {"name": self.name, "format": self.form, "bytes": self.size, "views": self.views, "psnr_db": psnr}
 
     @property
     def text(self) -> str:
-        """In words."""
+        """One-line description of the result."""
         psnr = "the same pictures as" if self.psnr is None else f"{self.psnr:.1f} dB PSNR against"
         return f"{self.form}, {self.size / 1e6:.1f} MB, {psnr} the PLY"
 
@@ -56,15 +56,17 @@ def measure_packed(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     near: float,
 ) -> PackedLoss:
-    """Read a packed file back, and compare small pictures of some of the views, rendered on the CPU.
+    """Read a compressed file back and compare small renders of some views on the CPU.
 
     Args:
-        path: the file.
-        scene: that was packed.
-        cameras: to choose from, at least one.
+        path: Compressed file.
+        scene: Scene that was compressed.
+        cameras: Cameras to choose views from, at least one.
+        background: Background color.
+        near: Distance of the near plane in world units.
 
     Raises:
-        SceneError: the file cannot be read.
+        SceneError: If the file cannot be read.
     """
     back = read_scene(path)
     pairs = [make_rasterizer("cpu", each, background=background, near=near) for each in (scene, back.scene)]

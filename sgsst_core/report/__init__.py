@@ -1,1 +1,1 @@
-"""What a job tells in the end: the document, its page and its figures."""
+"""Reports of finished jobs: JSON document, HTML page, charts and contact sheet."""

@@ -1,4 +1,4 @@
-"""How charts are drawn: one style, logarithmic axes with plain numbers, and the chart of the loss."""
+"""Drawing of charts: common style, logarithmic axes with plain numbers, and the loss chart."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sgsst_core.report.history import (
 )
 from sgsst_core.report.palette import GRID, INK, color_of
 
-#: Of every chart, for `matplotlib.rc_context`.
+#: Style of all charts, for `matplotlib.rc_context`.
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "report",
@@ -51,7 +51,7 @@ STYLE: dict[Any, Any] = {
     "ytick.color": INK,
     "legend.frameon": False,
 }
-#: What the y axis of a chart of the loss says.
+#: Label of the y axis of loss charts.
 RELATIVE_LOSS = "loss, relative to the unstylized scene"
 _PHASE_NAMES = {"coarse": "coarsest scale", "sos": "all scales"}
 
@@ -59,10 +59,13 @@ _PHASE_NAMES = {"coarse": "coarsest scale", "sos": "all scales"}
 def draw_loss(figure: Figure, against: Against, history: History, moments: Sequence[dict[str, Any]]) -> None:
     """Draw the loss of each scale and their mean, relative to the start, and the Gram distance of novel views.
 
-    Lines are running means over one round of views; the range of the values lies faintly behind.
+    Lines are running means over one round of views, with the range of the values shaded behind.
 
     Args:
-        moments: measurements of novel views.
+        figure: Figure to draw on.
+        against: Quantity of the x axis.
+        history: History of the job.
+        moments: Measurements of novel views.
     """
     axes = figure.subplots()
     mark_phases(axes, history, against)
@@ -84,10 +87,11 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
     """Write the chart of the loss against seconds as a PNG.
 
     Args:
-        report: as `build_report` makes it; its history may be empty.
+        path: Path of the PNG.
+        report: Report from `build_report`; its history may be empty.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 4.8), dpi=120, layout="constrained")
@@ -98,32 +102,33 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
 
 
 def scale_name(scale: int) -> str:
-    """What people read for a scale."""
+    """Return the display name of a scale."""
     return f"scale {scale} (1/{1 << scale})" if scale else "scale 0 (full size)"
 
 
 def draw_line(axes: Axes, history: History, against: Against, values: Floats, color: str, label: str) -> None:
-    """A running mean over one round of views, phase by phase, and behind it the range of the values [steps]."""
+    """Draw a running mean over one round of views, phase by phase, in front of the range of the values [steps]."""
     for _, part in history.phases:
         line = thinned(history.x[against][part], values[part], history.round_length, history.place_width(against))
         if not len(line.x):
             continue
         axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.18, linewidth=0.7)
         axes.plot(line.x, line.mean, color=color, label=label, marker="o" if len(line.x) == 1 else None)
-        label = "_"  # one legend entry for all phases; matplotlib leaves out names that begin so
+        label = "_"  # one legend entry for all phases: matplotlib skips labels that start with an underscore
 
 
 def draw_points(axes: Axes, x: Floats, values: Floats, **look: Any) -> None:
-    """Points [n] that may lie on the border of the axes.
+    """Draw points [n] that may lie on the border of the axes.
 
-    None at all are not drawn: to the layout, a line without points that is not clipped reaches to the figure's corner.
+    Nothing is drawn without points, because matplotlib's layout extends an unclipped empty line to the corner of the
+    figure.
     """
     if len(x):
         axes.plot(x, values, clip_on=False, **look)
 
 
 def mark_phases(axes: Axes, history: History, against: Against) -> None:
-    """Name the phases above the axes, the first from its start and the last to its end, and divide them by lines."""
+    """Label the phases above the axes, the first at its start and the last at its end, with lines between them."""
     transform = axes.get_xaxis_transform()
     borders = [history.limits[against][0]]
     for _, part in history.phases[1:]:
@@ -141,7 +146,7 @@ def mark_phases(axes: Axes, history: History, against: Against) -> None:
 
 
 def set_log_x(axes: Axes, limits: tuple[float, float], label: str) -> None:
-    """A logarithmic x axis."""
+    """Make the x axis logarithmic."""
     axes.set_xscale("log")
     axes.set_xlim(*limits)
     axes.set_xlabel(label)
@@ -149,7 +154,7 @@ def set_log_x(axes: Axes, limits: tuple[float, float], label: str) -> None:
 
 
 def set_log_y(axes: Axes, drawn: Sequence[Floats]) -> None:
-    """A logarithmic y axis that shows all that was drawn, arrays [n]."""
+    """Make the y axis logarithmic, with limits that include all drawn arrays [n]."""
     limits = log_limits(joined(drawn), 1.2)
     axes.set_yscale("log")
     axes.set_ylim(*limits)
@@ -157,7 +162,7 @@ def set_log_y(axes: Axes, drawn: Sequence[Floats]) -> None:
 
 
 def _set_ticks(axis: Axis, limits: tuple[float, float]) -> None:
-    """Plain numbers: decades, with 2 and 5 between them where there are few, and a linear choice within a decade."""
+    """Set ticks with plain numbers: decades, plus 2 and 5 if there are few, and linear ones within a decade."""
     decades = math.log10(limits[1]) - math.log10(limits[0])
     axis.set_minor_locator(NullLocator())
     if decades < 0.8:
@@ -170,7 +175,7 @@ def _set_ticks(axis: Axis, limits: tuple[float, float]) -> None:
 
 
 def draw_legend(figure: Figure, in_row: int = 3) -> None:
-    """What the lines of a figure are, each name once, in rows below it; nothing where none has a name."""
+    """Draw a legend below the figure, with each label once; nothing if there are no labels."""
     named: dict[str, Artist] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

@@ -1,4 +1,4 @@
-"""The contact sheet: the style, and some views before and after, side by side."""
+"""Contact sheets: style images and renders of some views, side by side as a JPEG."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 
-#: Pixels of the sheet: height of a picture, the style's width at most, gaps, and the labels' text.
+#: Sizes in pixels: height of an image, maximum width of an image, gaps, and the text of labels.
 _CELL_HEIGHT = 330
 _MAX_CELL_WIDTH = 520
 _GAP = 12
 _LABEL = 18
-#: Sheet of the views alone: how many at most, their resolution, width over height of the whole, and Gaussians.
+#: Sheet of views alone: maximum number of views, their longer side, aspect ratio of the sheet, and maximum number of
+#: Gaussians.
 _MOST_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
 
 
 def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
-    """Write a JPEG: the style image, then for each evaluation view the original above the stylized render.
+    """Write a JPEG with the style image and, for each evaluation view, the original above the stylized render.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     views = stylizer.views
     device = views.rasterizer.device
@@ -40,7 +41,8 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
     with torch.no_grad():
         for index in stylizer.evaluation_views:
             dcs = (views.scene.sh_dc.to(device), stylizer.shown())
-            # The rasterizer's own render: one rank writes the sheet, and the others take no part in it.
+            # The rasterizer is called directly: one rank writes the sheet, and the others do not take part in its
+            # renders.
             camera = views.cameras[index]
             renders = [_picture(views.rasterizer.render(views.colors(index, dc), camera)) for dc in dcs]
             pairs.append((camera, renders))
@@ -57,12 +59,19 @@ def write_views(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     near: float = NEAR,
 ) -> None:
-    """Write a JPEG of what some cameras see of a scene, small, at most 48 of them, spread evenly over the list.
+    """Write a JPEG with small renders of at most 48 cameras, spread evenly over the list.
 
-    Of large scenes, some Gaussians stand for all (`sampled`).
+    Large scenes are represented by a sample of their Gaussians (`sampled`).
+
+    Args:
+        path: Path of the JPEG.
+        scene: Scene to render.
+        cameras: Cameras to choose from, at least one.
+        background: Background color.
+        near: Distance of the near plane in world units.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     part = sampled(scene, _VIEW_GAUSSIANS)
     rasterizer = make_rasterizer("cpu", part, background=background, near=near)
@@ -85,10 +94,10 @@ def write_views(
 
 
 def write_rows(path: Path, style: Tensor, rows: Sequence[tuple[str, Sequence[Tensor]]]) -> None:
-    """Write a JPEG: the style image, and rows of pictures [H, W, 3] one below the other, each with its name above it.
+    """Write a JPEG with the style image and rows of images [H, W, 3] below it, each row with its name above.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     named = [
         (name, [_fitted(_picture(image), _MAX_CELL_WIDTH, _CELL_HEIGHT) for image in images])
@@ -115,7 +124,7 @@ def _picture(image: Tensor) -> Image.Image:
 
 
 def _stacked(pictures: Sequence[Image.Image]) -> Image.Image:
-    """Pictures one below the other, as wide as the widest; one picture as it is."""
+    """Stack images vertically, all at the width of the widest; a single image is unchanged."""
     if len(pictures) == 1:
         return pictures[0]
     width = max(picture.width for picture in pictures)
@@ -129,7 +138,7 @@ def _stacked(pictures: Sequence[Image.Image]) -> Image.Image:
 
 
 def _fitted(picture: Image.Image, width: int, height: int) -> Image.Image:
-    """The picture at the largest size that fits a box, enlarged at need."""
+    """Resize an image to the largest size that fits a box, enlarging it if needed."""
     factor = min(width / picture.width, height / picture.height)
     size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
     return picture.resize(size, Image.Resampling.LANCZOS)

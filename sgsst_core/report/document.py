@@ -1,4 +1,4 @@
-"""A report's values, as JSON holds them: what was stylized with what, what was decided, and what came out."""
+"""JSON document of a report: inputs, plan, results and history of a job."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from sgsst_core.stylizing.loop import Stopped
 from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
 
-#: Of report.json: raised whenever a field changes its meaning or goes away.
+#: Version of report.json, raised whenever a field is removed or changes its meaning.
 REPORT_VERSION = 3
-#: Of plan.json.
+#: Version of plan.json.
 PLAN_VERSION = 2
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Where a job's inputs came from, for the report.
+    """Origin of a job's inputs, for the report.
 
     Attributes:
-        scene: the PLY file.
-        dropped: Gaussians of the file that were left out because of non-finite values.
-        styles: the style's pictures.
-        cameras: the camera file or folder; None for an orbit.
-        photos: folder of the content images; None for unstylized renders.
-        backbone: the feature network's weights.
+        scene: Scene file.
+        dropped: Number of Gaussians dropped from the file because of non-finite values.
+        styles: Style images.
+        cameras: Camera file or folder; None for an orbit.
+        photos: Folder of the content images; None for unstylized renders.
+        backbone: Weights of the feature network.
     """
 
     scene: Path
@@ -59,13 +59,15 @@ def build_report(
     after: Evaluation,
     findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
-    """The report as values that JSON can hold; its fields are documented in docs/report-format.md.
+    """Build the report as JSON-serializable values. See docs/report-format.md for its fields.
 
     Args:
-        stylizer: after its last step.
-        stopped: what `run` returned.
-        before, after: loss on the stylizer's `evaluation_views`, of the unstylized and the stylized scene.
-        findings: what is extreme in scene, views and style.
+        stylizer: Job after its last step.
+        sources: Origin of the job's inputs.
+        stopped: Return value of `run`.
+        before: Loss of the unstylized scene on the stylizer's `evaluation_views`.
+        after: Loss of the stylized scene on the same views.
+        findings: Findings about scene, views and style.
     """
     return {
         **_outcome_json(stylizer, stopped, before, after),
@@ -85,7 +87,7 @@ def build_report(
 
 
 def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, after: Evaluation) -> dict[str, Any]:
-    """What was made by which program in what time, and how good it is."""
+    """Return program, time, losses and measurements of a job."""
     coarse = sum(record.stage == "coarse" for record in stylizer.history)
     weights = stylizer.loss.weights
     return {
@@ -114,7 +116,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
 
 
 def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
-    """What was stylized with what."""
+    """Return settings and inputs of a job."""
     backbone, styles = sources.backbone, _styles_json(stylizer, sources)
     return {
         "settings": stylizer.settings.model_dump(mode="json"),
@@ -143,10 +145,10 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
 
 
 def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
-    """The pictures of the style, as they were used, with their shares."""
+    """Return the style images as they were used, with their weights."""
     style, regions, paths = stylizer.style, stylizer.regions, sources.styles
     if regions is not None and not regions.mapped and regions.every[regions.active[0]].style is not None:
-        paths = tuple(map(Path, style.names))  # one region is everything, and has a style of its own
+        paths = tuple(map(Path, style.names))  # a single region with a style of its own covers everything
     return [
         {"path": str(path), "width": picture.shape[1], "height": picture.shape[0], "weight": weight}
         for path, picture, weight in zip(paths, style.pictures, style.weights, strict=True)
@@ -154,7 +156,7 @@ def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
 
 
 def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
-    """The regions of the scene, the rest first; none where it has none."""
+    """Return the regions of the scene, background first; empty if there are none."""
     regions = stylizer.regions
     if regions is None:
         return []
@@ -175,7 +177,7 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
 
 
 def _refined_json(plan: Plan) -> dict[str, Any] | None:
-    """What was cut into smaller Gaussians, and what that did to the unstylized picture; None where nobody wanted it."""
+    """Return how Gaussians were split, with the effect on unstylized renders; None if refinement was not requested."""
     made = plan.refinement
     if made is None:
         return None
@@ -191,22 +193,22 @@ def _refined_json(plan: Plan) -> dict[str, Any] | None:
 
 
 def plan_json(plan: Plan) -> dict[str, Any]:
-    """A plan as values that JSON can hold."""
+    """Return a plan as JSON-serializable values."""
     return {"version": PLAN_VERSION, **plan.as_dict()}
 
 
 def _graphs_json(stylizer: Stylizer) -> dict[str, Any] | None:
-    """What became of the graphs of the loss; None where the plan has none."""
+    """Return the state of the CUDA graphs of the loss; None if the plan has none."""
     graphs = stylizer.graphs
     return None if graphs is None else {"captured": graphs.captured, "problem": graphs.problem}
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:
-    """What happened, beside the plan's prediction.
+    """Return the measured counterparts of the plan's prediction.
 
-    Median seconds of a step of either phase whose view had been visited before, and what a first visit takes beside
-    them; of waiting for other ranks in the second phase; the speed-up over one rank, whose seconds are the predicted
-    ones; peak memory of the process and of its GPU in bytes; seconds of measuring.
+    Times are the median seconds of a step in either phase, for views visited before; the additional seconds of a first
+    visit; the median seconds spent waiting for other ranks in the second phase; and the seconds spent measuring. The
+    speedup over one rank compares with its predicted time. Memory is the peak of the process and of its GPU in bytes.
     """
     seconds, first_visits = zip(*(_step_seconds(stylizer, stage) for stage in ("sos", "coarse")), strict=True)
     waited = [record.parts.get("communication", 0.0) for record in stylizer.history if record.stage == "sos"]
@@ -226,11 +228,11 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
 
 
 def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float | None]:
-    """Of a step of a phase whose view had been visited, median; and what a first visit takes beside them, mean.
+    """Return the median seconds of a phase's steps on views visited before, and the extra seconds of first visits.
 
-    The job's first step is left out where there are other first visits: it prepares the style, too. Where no view came
-    again, or a step takes several, of which its record names one, what is known to be preparation is left out of all
-    steps, and nothing is said of first visits.
+    The extra seconds are a mean over first visits. If the phase has other first visits, the job's first step is
+    skipped, because it prepares the style too. If no view recurs, or a step takes several views (its record names only
+    one), the first value is the median over all steps, not counting their recorded preparation, and the second is None.
     """
     again: list[float] = []
     first: list[float] = []
@@ -252,7 +254,7 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float |
 
 
 def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
-    """What was measured beside the steps, what it took, and how much of the steps' time that is."""
+    """Return what was measured besides the steps, its time, and its fraction of the steps' time."""
     seconds, expected = stylizer.seconds_by_part.get("measuring", 0.0), stylizer.plan.prediction
     share = stylizer.settings.measure
     return {
@@ -270,7 +272,7 @@ def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
 
 
 def sent_json(history: Sequence[StepRecord]) -> dict[str, dict[str, int]] | None:
-    """Bytes that the first rank sends to others in a step of either phase, median by kind; None where it has nobody."""
+    """Return the median bytes per step that the first rank sends, by phase and kind; None for a single rank."""
     found: dict[str, dict[str, int]] = {}
     for stage in ("coarse", "sos"):
         steps = [record.sent for record in history if record.stage == stage and record.sent]
@@ -279,16 +281,16 @@ def sent_json(history: Sequence[StepRecord]) -> dict[str, dict[str, int]] | None
     return found or None
 
 
-#: Losses relative to the start, for which the report says when they were reached.
+#: Relative losses for which the report says when they were reached.
 _REACHED = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 
 
 def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
-    """What error the time bought: the mean loss over the last round of views, relative to the start.
+    """Relate loss to time: the mean loss over the last round of views, relative to the start.
 
     Returns:
-        `relative` at the end; `reached`: seconds and step at which it came below 0.5, 0.2, 0.1 and so on; `last_tenth`:
-        what the last tenth of the time changed. None where no step was made on all scales.
+        `relative`: Loss at the end. `reached`: Seconds and step at which it fell to 0.5, 0.2, 0.1 and so on.
+            `last_tenth`: Change over the last tenth of the time. None if no step was made on all scales.
     """
     records = [record for record in stylizer.history if record.stage == "sos"]
     if not records:
@@ -309,7 +311,7 @@ def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
 
 
 def novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Quality on views that were not trained on, at each moment; None where there are none."""
+    """Return the quality on novel views at each moment; None if there are none."""
     moments = [entry["novel_views"] for entry in measured if entry["novel_views"]]
     if not moments:
         return None
@@ -319,7 +321,7 @@ def novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | Non
 
 
 def approximations_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """The gradient's error at each moment; None where nothing is approximated."""
+    """Return the gradient's error at each moment; None if nothing is approximated."""
     moments = [entry["approximation"] for entry in measured if entry["approximation"]]
     return {"what": measured[0]["approximated"], "moments": moments} if moments else None
 

@@ -1,4 +1,4 @@
-"""A report's curves for its page, as SVG, each against seconds and against steps."""
+"""Charts of the report's page as SVG, each against seconds and against steps."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from sgsst_core.report.history import (
 from sgsst_core.report.palette import INK, color_of
 from sgsst_core.report.svg import inline
 
-#: Inches; at this width the text is legible on a phone, and two figures stand side by side on a desk.
+#: Size in inches. At this width, text is legible on a phone, and two charts fit side by side on a desktop screen.
 _WIDTH, _HEIGHT = 5.6, 3.5
 _REACHES = {"short": color_of(0), "long": color_of(1)}
 _METRICS = {"rmse": "RMSE", "lpips": "LPIPS"}
@@ -48,12 +48,12 @@ _METRICS = {"rmse": "RMSE", "lpips": "LPIPS"}
 
 @dataclass(frozen=True)
 class PageFigure:
-    """One figure of the page.
+    """Chart of the page.
 
     Attributes:
-        name: for identifiers; lower-case letters.
-        title, caption: text, not HTML.
-        svg: an <svg> element for each x axis.
+        name: Prefix of identifiers, in lower-case letters.
+        title, caption: Text, not HTML.
+        svg: <svg> element for each x axis.
     """
 
     name: str
@@ -63,7 +63,7 @@ class PageFigure:
 
 
 def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
-    """The figures for which a report has values; none where no step was made."""
+    """Draw the charts that a report has values for; returns none if no step was made."""
     if not report["history"]:
         return []
     history = history_of(report)
@@ -117,7 +117,7 @@ def _known(values: Sequence[float | None]) -> bool:
 
 
 def _undrawn(report: dict[str, Any]) -> str:
-    """A sentence about losses that a logarithmic axis cannot show."""
+    """Return a sentence about losses that a logarithmic axis cannot show; empty if there are none."""
     losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
     count = int((~drawable(losses)).sum())
     return f" Not drawn: {count:,} of {len(losses):,} values, which are zero or not finite." if count else ""
@@ -127,7 +127,7 @@ def _undrawn(report: dict[str, Any]) -> str:
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[Figure, Against], None], rows: int = 1) -> PageFigure:
-    """Draw a figure once for each x axis, at one size: the page does not move when one takes the other's place."""
+    """Draw a chart for each x axis, at the same size, so that the page does not move when they are switched."""
     svg = {}
     for against in AGAINST:
         with matplotlib.rc_context(STYLE):
@@ -143,7 +143,8 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
     grid = list(figure.subplots(math.ceil(count / 2), min(count, 2), sharey=True, squeeze=False).flat)
     everything = [values for terms in history.terms.values() for values in terms.values()]
     for axes, (scale, terms) in zip(grid, history.terms.items(), strict=False):
-        # Where the coarsest scale went first, the others would be a sliver at the end of its axis.
+        # Each panel has its own x axis: after a first phase on the coarsest scale, the others would be a sliver at the
+        # end of a shared one.
         there = history.x[against][np.any([~np.isnan(values) for values in terms.values()], axis=0)]
         own = replace(history, limits={**history.limits, against: log_limits(there, X_MARGIN)})
         for term, values in terms.items():
@@ -151,7 +152,7 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
         axes.set_title(scale_name(scale))
         set_log_x(axes, own.limits[against], against)
         set_log_y(axes, everything)
-    for axes in grid[: max(count - 2, 0)]:  # another panel stands below
+    for axes in grid[: max(count - 2, 0)]:  # another panel is below
         axes.set_xlabel("")
     for axes in grid[count:]:
         axes.set_visible(False)
@@ -179,7 +180,7 @@ def _draw_consistency(figure: Figure, against: Against, history: History, moment
 def _draw_approximations(figure: Figure, against: Against, history: History, probes: Sequence[dict[str, Any]]) -> None:
     axes = figure.subplots()
     steps = column([probe.get("step") for probe in probes])
-    # The probes' own seconds are those of one gradient: when they were made is known from their steps.
+    # The probes' own seconds are the time of one gradient. When they ran follows from their step.
     x = steps if against == "steps" else np.interp(steps, history.x["steps"], history.x["seconds"])
     errors = column([probe.get("relative_error") for probe in probes])
     shown = drawable(x) & drawable(errors)
@@ -196,7 +197,7 @@ def _draw_memory(figure: Figure, against: Against, history: History, predicted: 
     if on_device:
         shown.append((history.device_memory, predicted.get("device_bytes"), " on the GPU", color_of(1), color_of(1)))
     for memory, peak, where, color, dashed in shown:
-        # Every step stands alone: of memory, the most in a place is what matters, not a mean over a round.
+        # Memory is not averaged over a round: what matters is the maximum in each bin.
         line = thinned(history.x[against], memory / 1e9, 1, history.place_width(against))
         marker = "o" if len(line.x) == 1 else None
         axes.plot(line.x, line.high, color=color, marker=marker, label=f"measured{where}")

@@ -1,4 +1,4 @@
-"""A report's history as columns of numbers, and what charts make of them: running means, places of an axis."""
+"""History of a report as columns of numbers, with the running means and logarithmic axes that charts need."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from sgsst_core.loss.terms import TERMS
 Floats = NDArray[np.float64]
 Against = Literal["seconds", "steps"]
 AGAINST: tuple[Against, ...] = ("seconds", "steps")
-#: An axis has so many places for points, less than a point of print apart; steps that share one are drawn as one.
+#: Number of bins of an x axis, less than a point of print wide. Steps in the same bin are drawn as one point.
 PLACES = 300
-#: What logarithmic axes can show; ticks are sought some decades beyond, and float64 must hold those too.
+#: Range of values on logarithmic axes. Ticks are searched some decades beyond it, which must also fit float64.
 _LEAST, _MOST = 1e-200, 1e200
-#: Of the x axis: factor between its ends and the first and last step.
+#: Factor by which the x axis extends beyond the first and the last step.
 X_MARGIN = 1.05
 
 
 @dataclass(frozen=True)
 class Thinned:
-    """Steps gathered into places of an axis, each array [places] float64.
+    """Steps grouped into bins of an axis, each array [bins] float64.
 
     Attributes:
-        x: geometric mean of the place's steps.
-        mean: geometric mean of their running means.
-        low, high: least and most of their values.
+        x: Geometric mean of the bin's steps.
+        mean: Geometric mean of their running means.
+        low, high: Minimum and maximum of their values.
     """
 
     x: Floats
@@ -42,18 +42,18 @@ class Thinned:
 
 @dataclass(frozen=True)
 class History:
-    """A report's history by column, each array [steps] float64, NaN where there is no value.
+    """History of a report by column, each array [steps] float64, NaN where there is no value.
 
     Attributes:
-        x: seconds and steps so far.
-        limits: first and last place of either axis, those of the novel moments included.
-        phases: runs of equal stages, by name.
-        terms: what the loss of a scale is the sum of.
-        relative: loss of a scale over that of the unstylized scene.
-        mean_relative: the same of the mean of the scales; NaN where a step is on one scale alone.
-        memory: bytes that the process held.
-        device_memory: most bytes that its tensors had held on the GPU.
-        round_length: steps in which every view comes once.
+        x: Seconds and steps so far.
+        limits: Ends of either x axis, including the measurements of novel views.
+        phases: Name and range of each run of equal stages.
+        terms: Loss terms by scale and name.
+        relative: Loss by scale, relative to the unstylized scene.
+        mean_relative: Mean over scales, relative to the unstylized scene; NaN for steps on a single scale.
+        memory: Memory of the process in bytes.
+        device_memory: Peak memory of its tensors on the GPU so far, in bytes.
+        round_length: Number of steps in which every view occurs once.
     """
 
     x: dict[Against, Floats]
@@ -67,13 +67,13 @@ class History:
     round_length: int
 
     def place_width(self, against: Against) -> float:
-        """Of one of an axis's places, as a difference of natural logarithms."""
+        """Return the width of an axis's bins, as a difference of natural logarithms."""
         low, high = self.limits[against]
         return (math.log(high) - math.log(low)) / PLACES
 
 
 def history_of(report: dict[str, Any]) -> History:
-    """The history of a report, which may be empty."""
+    """Return the history of a report, which may be empty."""
     records = report["history"]
     scales = sorted({int(scale) for record in records for scale in record["scales"]})
     before = report["loss"]["before"]["scales"]
@@ -101,27 +101,27 @@ def history_of(report: dict[str, Any]) -> History:
 
 
 def column(values: Sequence[float | None]) -> Floats:
-    """Values as an array [n], NaN where there is none."""
+    """Return values as an array [n], with NaN for None."""
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
 def joined(columns: Sequence[Floats]) -> Floats:
-    """All values of some columns, of which there may be none."""
+    """Concatenate columns; the list may be empty."""
     return np.concatenate([np.empty(0), *columns])
 
 
 def novel_view_moments(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """The report's measurements of novel views; none where there are none."""
+    """Return the report's measurements of novel views; empty if there are none."""
     return (report.get("novel_views") or {}).get("moments") or []
 
 
 def moment_places(moments: Sequence[dict[str, Any]], against: Against) -> Floats:
-    """Where moments lie on an x axis, [n]."""
+    """Return the x positions [n] of measurements."""
     return column([moment.get("seconds" if against == "seconds" else "step") for moment in moments])
 
 
 def _terms_there(records: Sequence[dict[str, Any]]) -> list[str]:
-    """Terms of which a record's loss has any; all where none has."""
+    """Return the terms that are nonzero in any record, or all terms if none is."""
     split = [terms for record in records for terms in record["scales"].values()]
     return [term for term in TERMS if any(terms.get(term) for terms in split)] or list(TERMS)
 
@@ -143,12 +143,12 @@ def _phases(stages: Sequence[str]) -> list[tuple[str, slice]]:
 
 
 def drawable(values: Floats) -> NDArray[np.bool_]:
-    """Where a logarithmic axis has a place for a value."""
+    """Return which values a logarithmic axis can show."""
     return np.isfinite(values) & (values >= _LEAST) & (values <= _MOST)
 
 
 def log_limits(values: Floats, margin: float) -> tuple[float, float]:
-    """Ends of a logarithmic axis that shows the values; any two where there is nothing to show."""
+    """Return the ends of a logarithmic axis for the values; arbitrary ones if there is nothing to show."""
     shown = values[drawable(values)]
     if not len(shown):
         return 0.1, 1.0
@@ -158,13 +158,13 @@ def log_limits(values: Floats, margin: float) -> tuple[float, float]:
 
 
 def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
-    """Gather steps into places that are equally wide on a logarithmic axis; what such an axis cannot show is left out.
+    """Group steps into bins of equal width on a logarithmic axis, skipping values that such an axis cannot show.
 
     Args:
-        x: [n] in ascending order.
-        values: [n].
-        window: steps of the running mean.
-        width: of a place, as a difference of natural logarithms.
+        x: Positions [n] in ascending order.
+        values: Values [n].
+        window: Length of the running mean in steps.
+        width: Width of a bin, as a difference of natural logarithms.
     """
     shown = drawable(x) & drawable(values)
     x, values = x[shown], values[shown]
@@ -182,7 +182,7 @@ def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
 
 
 def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
-    """Geometric mean of the `window` values around each place, of fewer toward the ends."""
+    """Return the geometric mean of the `window` values around each index, or of fewer near the ends."""
     logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
     sums = np.concatenate([[0.0], np.cumsum(logs)])
     places = np.arange(len(logs))

@@ -1,4 +1,4 @@
-"""What a report says of the program and of the machine that it ran on."""
+"""Program version, hardware and memory use, as stated in reports."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from sgsst_core.stylizing.checkpoint import versions
 
 
 def program_version() -> str:
-    """Version of the installed distribution; "unknown" where the source tree is used without installing it."""
+    """Return the version of the installed distribution; "unknown" for a source tree that is not installed."""
     return versions()["program"]
 
 
 def peak_memory() -> int:
-    """Most bytes of physical memory that this process has held so far."""
+    """Return the peak physical memory of this process so far, in bytes."""
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere but on macOS
+    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere except on macOS
 
 
 def machine(device: torch.device) -> dict[str, Any]:
-    """What the job ran on."""
+    """Describe the machine that ran the job."""
     return {
         "system": platform.platform(),
         "processor": _processor(),

@@ -1,4 +1,4 @@
-"""report.html: one file that shows a report to people, with everything in it that it needs."""
+"""HTML page of a report: one self-contained file."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from sgsst_core.report.tables import (
 from sgsst_core.report.wording import NOTHING, byte_count, duration, number, percent
 from sgsst_core.stylizing.state import BEFORE_STEPS
 
-#: Members of a list that the folded part shows; the rest is counted.
+#: Maximum number of list members shown in the collapsed section; the rest is counted.
 _LIST = 40
-#: Fields of a report that have a place of their own on the page.
+#: Fields of a report that have a section of their own on the page.
 _PLACED = ("history", "novel_views", "approximations", "bought", "findings", "plan", "seconds_by_part")
 _STOPPED = {
     "finished": "all planned steps were done",
@@ -58,11 +58,11 @@ _PARTS = {
     "planning": "planning, before the steps",
     "preparing": "preparing the job, before the steps",
 }
-#: Parts of the time that are not the steps'.
+#: Kinds of time that are not part of the steps.
 _BESIDE = ("checkpoint", "measuring", *BEFORE_STEPS)
 _ENVIRONMENT = Environment(
     loader=PackageLoader("sgsst_core.report"),
-    autoescape=True,  # names of scenes, views and files are whatever users wrote
+    autoescape=True,  # names of scenes, views and files are arbitrary user input
     undefined=StrictUndefined,
     trim_blocks=True,
     lstrip_blocks=True,
@@ -70,12 +70,12 @@ _ENVIRONMENT = Environment(
 
 
 def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None = None) -> str:
-    """The page as HTML; nothing in it refers to anything outside, and no script runs.
+    """Render the page as HTML, without external references and without scripts.
 
     Args:
-        report: of version 2, as `build_report` makes it or as it is read from report.json.
-        sheet: the contact sheet, JPEG; None leaves it out.
-        views: all views, JPEG; None leaves them out.
+        report: Report of version 2, from `build_report` or read from report.json.
+        sheet: Contact sheet as JPEG; None omits it.
+        views: Sheet of all views as JPEG; None omits it.
     """
     figures = draw_figures(report)
     return _ENVIRONMENT.get_template("report.html").render(
@@ -91,7 +91,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         against=AGAINST,
         places=PLACES,
         round_length=report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"]),
-        # The figures' text is fixed or escaped by the XML writer: they are markup.
+        # Text in the figures is fixed or escaped by the XML writer, so they are safe as markup.
         figures=[(figure, {against: Markup(figure.svg[against]) for against in AGAINST}) for figure in figures],
         losses=loss_table(report),
         novel_views=novel_views_table(report),
@@ -109,7 +109,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
 
 
 def _style_names(report: dict[str, Any]) -> str:
-    """The style's pictures; reports of before there were several name one alone."""
+    """Return the file names of the style images. Old reports have a single one under "style"."""
     styles = report.get("styles", [report["style"]])
     names = [PurePath(style["path"]).name for style in styles]
     if len(names) == 1:
@@ -118,23 +118,25 @@ def _style_names(report: dict[str, Any]) -> str:
 
 
 def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None, views_path: Path | None = None) -> None:
-    """Write the page; the file appears whole or not at all.
+    """Write the page atomically.
 
     Args:
-        sheet_path: the contact sheet, JPEG; None leaves it out.
-        views_path: all views, JPEG; None leaves them out.
+        path: Path of the page.
+        report: Report of version 2, from `build_report` or read from report.json.
+        sheet_path: Contact sheet, JPEG; None omits it.
+        views_path: Sheet of all views, JPEG; None omits it.
 
     Raises:
-        OutputError: the file cannot be written, or a sheet cannot be read.
+        OutputError: If the file cannot be written, or a sheet cannot be read.
     """
     page = render_page(report, _sheet_bytes(sheet_path), _sheet_bytes(views_path))
     with atomic_path(path) as temporary:
-        # A file name that is no valid Unicode shows question marks; it must not cost the page.
+        # File names that are not valid Unicode are shown with question marks instead of failing the page.
         temporary.write_bytes(page.encode("utf-8", errors="replace"))
 
 
 def _sheet_bytes(path: Path | None) -> bytes | None:
-    """A sheet's file; None where there is none."""
+    """Read a sheet, or return None if there is none."""
     try:
         return path.read_bytes() if path else None
     except OSError as error:
@@ -147,7 +149,7 @@ def _sheet_bytes(path: Path | None) -> bytes | None:
 
 
 def _facts(report: dict[str, Any]) -> list[str]:
-    """What was stylized with what, in a few words each."""
+    """Return short facts about the job's inputs."""
     count = report["cameras"]["count"]
     sizes = report["cameras"]["sizes"]
     size = f", up to {' × '.join(str(side) for side in max(sizes))} pixels" if sizes else ""
@@ -171,7 +173,7 @@ def _result(report: dict[str, Any]) -> dict[str, str]:
 
 
 def _bought(report: dict[str, Any]) -> dict[str, Any] | None:
-    """Which loss was reached when, and what the last tenth of the time was good for."""
+    """Describe which loss was reached when, and what the last tenth of the time gained."""
     bought = report.get("bought")
     if not bought:
         return None
@@ -205,7 +207,7 @@ def _approximations(report: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:
-    """Parts of the time with their share, the longest first."""
+    """Return the kinds of time with their percentage, longest first."""
     found = report.get("seconds_by_part") or {}
     parts = {_PARTS.get(name, name): seconds for name, seconds in found.items()}
     measured = sum(parts.values())
@@ -222,7 +224,7 @@ def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:
 
 
 def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """All fields that have no place of their own, as (field, [(name, value)])."""
+    """Return all fields without a section of their own, as (field, [(name, value)])."""
     fields = {field: value for field, value in report.items() if field not in _PLACED}
     if report.get("novel_views"):
         fields["novel_views"] = {
@@ -232,7 +234,7 @@ def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]
 
 
 def _flat(name: str, value: Any) -> Iterable[tuple[str, str]]:
-    """Nested objects as lines, named as in the JSON file: `after.scales.0.gram`."""
+    """Yield nested objects as (name, value), with names as in the JSON file: `after.scales.0.gram`."""
     if isinstance(value, dict) and value:
         for key, inner in value.items():
             yield from _flat(f"{name}.{key}" if name else str(key), inner)

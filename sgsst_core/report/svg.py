@@ -1,7 +1,7 @@
-"""Figures as SVG that shares a page with others.
+"""Figures as inline SVG, several of which can share a page.
 
-Colors are written as CSS variables with the printed color as fallback (`var(--c-222222, #222222)`), so that a page
-can give others to a dark screen; text takes the page's font.
+Colors are CSS variables with the printed color as fallback (`var(--c-222222, #222222)`), so a page can replace them on
+dark screens. Text uses the page's font.
 """
 
 from __future__ import annotations
@@ -20,14 +20,17 @@ _LONG_DECIMAL = re.compile(r"(\.\d\d)\d+")
 
 
 def inline(figure: Figure, name: str, label: str) -> str:
-    """A figure as an <svg> element that shares a page with others: identifiers are its own, styles do not leak."""
+    """Return a figure as an <svg> element that can share a page with others.
+
+    Its identifiers are prefixed with its name, and it contains no style sheet.
+    """
     file = io.BytesIO()
-    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # of no use here, and it names other servers
+    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # not needed, and it names other servers
     figure.savefig(file, format="svg", transparent=True, metadata=metadata)
     root = ElementTree.fromstring(file.getvalue())
     for parent in root.iter():
         for child in list(parent):
-            if _NAMESPACE.sub("", child.tag) == "style":  # it would hold for the whole page
+            if _NAMESPACE.sub("", child.tag) == "style":  # it would apply to the whole page
                 parent.remove(child)
     used = _references(root)
     for element in root.iter():
@@ -52,7 +55,10 @@ def _references(root: ElementTree.Element) -> set[str]:
 
 
 def _rewritten(key: str, value: str, name: str) -> tuple[str, str]:
-    """An attribute without its namespace; identifiers with the figure's name, coordinates to hundredths of a point."""
+    """Return an attribute without its XML namespace.
+
+    Identifiers are prefixed with the figure's name, and coordinates are cut to hundredths of a point.
+    """
     key = _NAMESPACE.sub("", key)
     if key == "id":
         return key, f"{name}-{value}"

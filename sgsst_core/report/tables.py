@@ -1,4 +1,4 @@
-"""The tables of a report's page: rows of text."""
+"""Tables of the report's page, as rows of text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sgsst_core.report.wording import NOTHING, byte_count, duration, number, per
 
 @dataclass(frozen=True)
 class Column:
-    """Of a table; numbers are set flush right."""
+    """Column of a table; numbers are right-aligned."""
 
     title: str
     number: bool = False
@@ -19,14 +19,14 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text, one cell a column."""
+    """Table of text, with one cell per column in each row."""
 
     columns: Sequence[Column]
     rows: Sequence[Sequence[str]]
 
 
 def loss_table(report: dict[str, Any]) -> Table:
-    """The loss before and after, of the mean of the scales and of each."""
+    """Return the loss before and after, as mean over scales and for each scale."""
     loss = report["loss"]
     rows = [["mean of the scales", loss["before"]["total"], loss["after"]["total"], loss["relative"]]]
     for scale, before in loss["before"]["scales"].items():
@@ -39,7 +39,7 @@ def loss_table(report: dict[str, Any]) -> Table:
 
 
 def novel_views_table(report: dict[str, Any]) -> Table | None:
-    """Every moment in numbers; columns that have none are left out."""
+    """Return all measurements of novel views, without empty columns; None if there are none."""
     moments = (report.get("novel_views") or {}).get("moments") or []
     if not moments:
         return None
@@ -60,7 +60,7 @@ def novel_views_table(report: dict[str, Any]) -> Table | None:
     return Table([Column(title, True) for title in columns], list(zip(*columns.values(), strict=True)))
 
 
-#: What a result is judged by, and how it is written.
+#: Title and text format of each measure in the judgment of a result.
 _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "style": ("distance to the style", number),
     "color_distance": ("distance to its colors, in levels of 8 bits", number),
@@ -72,7 +72,7 @@ _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
 
 
 def judged_table(report: dict[str, Any]) -> Table | None:
-    """What the result is judged to be by a network that was not optimized, beside the unstylized scene."""
+    """Return the judgment of the result beside that of the unstylized scene; None if there is none."""
     judged = (report.get("novel_views") or {}).get("judged")
     if not judged:
         return None
@@ -82,7 +82,7 @@ def judged_table(report: dict[str, Any]) -> Table | None:
 
 
 def decision_table(report: dict[str, Any]) -> Table:
-    """What the plan decided and why, what it saves and what it costs."""
+    """Return the plan's decisions with their reasons, savings and costs."""
     columns = [
         Column("item"),
         Column("decision"),
@@ -107,12 +107,12 @@ def decision_table(report: dict[str, Any]) -> Table:
     )
 
 
-#: Beside steps whose view has been visited before.
+#: Rows for first visits; the other rows are about views visited before.
 _VISITS = {"first_visit": "a view's first visit, beside it", "first_visit_coarse": "the same in phase 1"}
 
 
 def prediction_table(report: dict[str, Any]) -> Table:
-    """What the plan expected beside what happened."""
+    """Return the plan's predictions beside the measured values."""
     predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
     rows = [
         _beside("a step on all scales", predicted.get("seconds"), measured.get("seconds"), duration),
@@ -140,17 +140,17 @@ def prediction_table(report: dict[str, Any]) -> Table:
 
 
 def _share(part: float, whole: float) -> float | None:
-    """A part's share; None of nothing."""
+    """Return a part as a fraction of the whole; None if the whole is 0."""
     return part / whole if whole else None
 
 
 def _beside(name: str, before: float | None, after: float | None, text: Callable[[float | None], str]) -> list[str]:
-    """A row of a prediction, its measurement and their ratio."""
+    """Return a row with a prediction, its measured value and their ratio."""
     return [name, text(before), text(after), number(after / before if before and after is not None else None)]
 
 
 def finding_table(report: dict[str, Any]) -> Table | None:
-    """What is extreme in scene, views and style; None where nothing is."""
+    """Return the findings about scene, views and style; None if there are none."""
     findings = report.get("findings") or []
     rows = [
         [
@@ -167,7 +167,7 @@ def finding_table(report: dict[str, Any]) -> Table | None:
 
 
 def approximation_table(report: dict[str, Any]) -> Table | None:
-    """Every comparison with the exact gradient; None where there was none."""
+    """Return all comparisons with the exact gradient; None if there are none."""
     moments = (report.get("approximations") or {}).get("moments") or []
     names = report["cameras"]["names"]
     rows = []

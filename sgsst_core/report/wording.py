@@ -1,17 +1,17 @@
-"""Numbers as people read them."""
+"""Formatting of numbers for people."""
 
 from __future__ import annotations
 
 import math
 
-#: What is written for a value that is not there.
+#: Text for a missing value.
 NOTHING = "–"
-#: Between a number and its unit, where a line must not break.
+#: Space between a number and its unit, where a line must not break.
 _GAP = "\u00a0"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """With so many significant digits; whole thousands are not rounded further."""
+    """Format a number with `digits` significant digits; below 1e9, all integer digits are kept."""
     if value is None:
         return NOTHING
     if not math.isfinite(value):
@@ -20,12 +20,12 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def percent(share: float | None, digits: int = 2) -> str:
-    """A share in percent, with so many significant digits."""
+    """Format a fraction in percent, with `digits` significant digits."""
     return NOTHING if share is None else f"{number(100 * share, digits)}{_GAP}%"
 
 
 def duration(seconds: float | None) -> str:
-    """Seconds as seconds, minutes or hours."""
+    """Format seconds as seconds, minutes or hours."""
     if seconds is None or not math.isfinite(seconds):
         return NOTHING
     if seconds < 60:
@@ -39,7 +39,7 @@ def duration(seconds: float | None) -> str:
 
 
 def byte_count(count: float | None) -> str:
-    """Bytes with the largest unit of which there is at least one."""
+    """Format bytes with the largest unit that gives at least 1."""
     if count is None or not math.isfinite(count):
         return NOTHING
     for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):

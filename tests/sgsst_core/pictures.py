@@ -1,4 +1,4 @@
-"""Pictures that tests make: smooth structure with some texture, so that features are neither dead nor noise."""
+"""Synthetic images with smooth structure and some texture, so that features are neither zero nor noise."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def picture(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
-    """A picture [height, width, 3] in 0..1 with edges, gradients and texture."""
+    """Return an image [height, width, 3] in 0 to 1 with edges, gradients and texture."""
     generator = torch.Generator().manual_seed(seed)
     result = torch.zeros((1, 3, height, width), dtype=torch.float64)
     for cell, strength in ((64, 0.5), (16, 0.3), (4, 0.2)):
@@ -18,12 +18,15 @@ def picture(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.f
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Norm of the difference over the norm of what is expected."""
+    """Return the norm of the difference over the norm of the expected value."""
     expected = expected.double()
     return float((value.double() - expected).norm() / expected.norm())
 
 
 def nearly_one_color(height: int = 40, width: int = 50) -> Tensor:
-    """[h, w, 3] float32 of 100 and up to seven times more of its rounding, 2^-17, the mean of which float32 rounds."""
+    """Return an image [h, w, 3] float32 of 100 plus up to seven times its rounding error, 2^-17.
+
+    Its mean is not representable in float32.
+    """
     steps = torch.randint(8, (height, width, 3), generator=torch.Generator().manual_seed(3))
     return 100 + 2.0**-17 * steps.float()

@@ -12,13 +12,13 @@ from sgsst_core.scene.gaussians import Scene
 
 
 def camera(width: int = 70, height: int = 45, *, focal: float = 60.0, pose: Tensor | None = None) -> Camera:
-    """At the origin, looking along +z, unless there is a pose; principal point off the middle."""
+    """Return a camera with a principal point off center, at the origin and looking along +z unless a pose is given."""
     pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
     return Camera("test", width, height, focal, focal * 1.1, width / 2 + 1.3, height / 2 - 0.7, pose)
 
 
 def turned_pose(angle: float = 0.3) -> Tensor:
-    """A pose that turns about a slanted axis and moves."""
+    """Return a pose with a translation and a rotation about a slanted axis."""
     axis = torch.tensor([1.0, 2.0, -0.5], dtype=torch.float64)
     x, y, z = (axis / axis.norm()).tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
@@ -29,7 +29,7 @@ def turned_pose(angle: float = 0.3) -> Tensor:
 
 
 def cloud(count: int = 400, *, seed: int = 0, log_scale: float = -2.5, degree: int = 0, depth: float = 4.0) -> Scene:
-    """Gaussians of all shapes and opacities in front of `camera()`; a few behind it, at its sides and very close."""
+    """Return Gaussians of all shapes and opacities in front of `camera()`, some behind, beside or very close to it."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -54,14 +54,14 @@ def single(
     scales: tuple[float, float, float] = (0.1, 0.1, 0.1),
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
 ) -> Scene:
-    """One Gaussian; opacity and scales as they are, not as files store them."""
+    """Return one Gaussian, with opacity and scales as they are, not as files store them."""
     return together([(mean, opacity, scales, quat)])
 
 
 def together(
     gaussians: list[tuple[tuple[float, ...], float, tuple[float, ...], tuple[float, ...]]],
 ) -> Scene:
-    """A scene of (mean, opacity, scales, quat)."""
+    """Return a scene from tuples (mean, opacity, scales, quat)."""
     means, opacities, scales, quats = zip(*gaussians, strict=True)
     count = len(means)
     return Scene(
@@ -75,17 +75,17 @@ def together(
 
 
 def empty_scene() -> Scene:
-    """No Gaussian at all."""
+    """Return a scene without Gaussians."""
     return Scene(
         torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0, 0, 3)
     )
 
 
 def colors_of(scene: Scene, seed: int = 5) -> Tensor:
-    """Random colors in 0..2, float32."""
+    """Return random colors in 0 to 2, float32."""
     return 2 * torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(seed))
 
 
 def pixels_like(view: Camera, seed: int = 6) -> Tensor:
-    """A random image gradient [h, w, 3], float32."""
+    """Return a random image gradient [h, w, 3], float32."""
     return torch.randn(view.height, view.width, 3, generator=torch.Generator().manual_seed(seed))

@@ -1,4 +1,4 @@
-"""Exclusive seconds by name, by the clock and by events of a pretend stream."""
+"""Tests of exclusive times by name, measured by the clock and by events of a simulated stream."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sgsst_core.timing import Timer
 
 
 class Stream:
-    """A device that works behind the program: what it is given takes so many seconds of its own."""
+    """Device that runs asynchronously; each piece of work takes a given number of its own seconds."""
 
     def __init__(self) -> None:
         self.given = 0.0
@@ -32,7 +32,7 @@ class Stream:
 
 
 class PretendEvent:
-    """A mark of `Stream`, with the rules of CUDA's: what the device has not come to has no time."""
+    """Event of `Stream` with CUDA's rules: it has no time before the device reaches it."""
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
@@ -58,7 +58,7 @@ class PretendEvent:
 
 
 def step(timer: Timer, work: Any) -> None:
-    """Blocks within blocks, the same name inside and outside, and work between blocks, which counts for none."""
+    """Run nested blocks, also with the same name inside and outside, and work between blocks, which counts for none."""
     with timer("loss"):
         work(1.0)
         with timer("forward"):
@@ -82,7 +82,7 @@ def test_nested_blocks_count_for_the_inner_name(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     timer = Timer()
     step(timer, lambda seconds: now.__setitem__(0, now[0] + seconds))
-    assert timer.seconds == SECONDS  # with no need to read them
+    assert timer.seconds == SECONDS  # without reading them
     assert timer.read() == SECONDS
 
 
@@ -98,7 +98,7 @@ def test_blocks_within_a_whole_one_count_for_it(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_devices_seconds_are_its_own() -> None:
-    """The program gives the work at once: by its clock hardly any time passes."""
+    """The program submits the work at once, so its own clock hardly advances."""
     stream = Stream()
     timer = Timer(event=stream.event)
     step(timer, stream.launch)

@@ -1,7 +1,7 @@
-"""The hard cases, as one table that the tests and the benchmark share.
+"""Numerically hard cases, as one table that the tests and the benchmark share.
 
-Every case says what is extreme, measures an error against a float64 reference, and states the bound for it. A case
-that is refused on purpose (a limit) is one that checks the refusal.
+Each case describes what is extreme, measures an error against a float64 reference, and states a bound for it. For input
+that must be refused, the case checks the refusal.
 """
 
 from __future__ import annotations
@@ -22,5 +22,5 @@ _GROUPS = (gaussians, views, pictures, optimization, precision, jobs, forms)
 
 
 def all_cases() -> list[Case]:
-    """Every case, group by group."""
+    """Return all cases, group by group."""
     return [case for module in _GROUPS for case in module.cases()]

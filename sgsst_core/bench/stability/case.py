@@ -1,4 +1,4 @@
-"""What a hard case is, and the measurements that cases share."""
+"""Definition of a hard case, and the scenes and comparisons that cases share."""
 
 from __future__ import annotations
 
@@ -31,24 +31,25 @@ Group = Literal[
     "Gaussians", "views", "style and content", "stiff optimization", "precision", "jobs", "files and orbits"
 ]
 
-#: Images and coverage in float32 agree with float64 to this share of the brightest color.
+#: Error bound of float32 images and coverage against float64, relative to the brightest color.
 IMAGE_BOUND = 1e-4
-#: Where a value lies within this of a cut-off, float32 may skip what float64 keeps: a step, not an error.
+#: Distance to a cutoff within which float32 may skip what float64 keeps: a discontinuity, not an error.
 CLOSE_TO_CUT = 2e-5
-#: A contribution just above ALPHA_MIN, or a crossing Gaussian at a transmittance of up to 1e-2, times the color.
+#: Largest such jump, relative to the color: a contribution just above ALPHA_MIN, or a Gaussian that crosses a
+#: transmittance of up to 1e-2.
 LARGEST_STEP = 1e-2
-#: Loss and gradient in float32 agree with float64 under the same ReLU and max-pool decisions to this.
+#: Relative error bound of float32 loss and gradient against float64, with the same ReLU and max-pool decisions.
 LOSS_BOUND = 1e-5
 
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What a case came to.
+    """Result of a case.
 
     Attributes:
-        error: measured against the float64 reference; NaN or infinite where a result is not finite.
-        bound: what it may be.
-        note: what else was seen, for people.
+        error: Measured error against the float64 reference; NaN or infinite if a result is not finite.
+        bound: Maximum allowed error.
+        note: Other observations, for people.
     """
 
     error: float
@@ -66,10 +67,10 @@ class Case:
     """One hard case.
 
     Attributes:
-        name: what is extreme about it.
-        group: what part of the method it strains.
-        measure: what the error is.
-        run: the measurement; True for its full size, False for one that takes at most seconds.
+        name: Description of what is extreme.
+        group: Part of the method under stress.
+        measure: Definition of the error.
+        run: Function that runs the measurement, in full size if its argument is true, or else within a few seconds.
     """
 
     name: str
@@ -80,7 +81,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A case that was run: its result, wall-clock seconds, and bytes by which the process's peak memory grew."""
+    """Result of a case, wall-clock seconds, and growth of the process's peak memory in bytes."""
 
     result: CaseResult
     seconds: float
@@ -88,25 +89,25 @@ class Measurement:
 
 
 def measure(case: Case, *, full: bool = False) -> Measurement:
-    """Run a case; full size, or one that takes at most seconds."""
+    """Run a case, in full size or in a version that takes a few seconds at most."""
     peak, started = _peak_memory(), time.perf_counter()
     result = case.run(full)
     return Measurement(result, time.perf_counter() - started, _peak_memory() - peak)
 
 
 def _peak_memory() -> int:
-    """Bytes; Linux counts in KiB, macOS in bytes."""
+    """Return the peak memory in bytes; `ru_maxrss` is in KiB on Linux and in bytes on macOS."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def camera(width: int = 37, height: int = 29, *, focal: float = 30.0) -> Camera:
-    """At the origin, looking along +z; the principal point is off the middle."""
+    """Return a camera at the origin that looks along +z, with its principal point off center."""
     pose = torch.eye(4, dtype=torch.float64)
     return Camera("hard case", width, height, focal, focal * 1.1, width / 2 + 1.3, height / 2 - 0.7, pose)
 
 
 def ordinary(count: int = 80, *, seed: int = 0, degree: int = 0) -> Scene:
-    """Gaussians as trained scenes have them, in front of `camera()`."""
+    """Return Gaussians like those of trained scenes, in front of `camera()`."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -123,7 +124,7 @@ def ordinary(count: int = 80, *, seed: int = 0, degree: int = 0) -> Scene:
 
 
 def among_ordinary(extreme: Scene, *, count: int = 80) -> Scene:
-    """Extreme Gaussians first, then ordinary ones, whose pixels must not suffer."""
+    """Return the extreme Gaussians followed by ordinary ones, whose pixels must stay correct."""
     rest = ordinary(count, degree=extreme.sh_degree)
     return Scene(*(torch.cat([getattr(extreme, name), getattr(rest, name)]) for name in Scene.__dataclass_fields__))
 
@@ -135,7 +136,7 @@ def repeated(
     scale: float = 0.1,
     logit: float = 2.0,
 ) -> Scene:
-    """The same round Gaussian `count` times, to be made extreme; scale in world units."""
+    """Return `count` copies of one round Gaussian, to be made extreme; `scale` is in world units."""
     return Scene(
         means=torch.tensor(mean).repeat(count, 1),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
@@ -147,7 +148,7 @@ def repeated(
 
 
 def fast_rasterizers() -> tuple[RasterizerName, ...]:
-    """What is held against `reference`: the rasterizers of processors, and that of GPUs where there is one."""
+    """Return the rasterizers to compare with `reference`: those for CPUs, and the GPU's if there is a GPU."""
     return ("cpu", "cached", "triton") if torch.cuda.is_available() else ("cpu", "cached")
 
 
@@ -160,15 +161,19 @@ def compare_rasterizers(
     expected_scene: Scene | None = None,
     keep: Tensor | None = None,
 ) -> CaseResult:
-    """Largest error of `fast_rasterizers` against the float64 reference.
+    """Return the largest error of `fast_rasterizers` against the float64 reference.
 
-    Images and coverage: as a share of the brightest color, outside pixels where a cut-off hangs by a thread (there
-    a step up to LARGEST_STEP is allowed, and counted). Color gradients: as a share of the largest one.
+    Errors of images and coverage are relative to the brightest color. At pixels very close to a cutoff, a jump of up to
+    LARGEST_STEP is allowed and counted. Errors of color gradients are relative to the largest gradient.
 
     Args:
-        colors: [N, 3]; None for random ones in 0..2.
-        expected_scene: what the reference renders, where that is not the scene itself; it holds the scene's rows `keep`
-            ([N] bool), and the others must contribute nothing.
+        scene: Scene to render.
+        view: Camera to render with.
+        near: Distance of the near plane in world units.
+        colors: Colors [N, 3]; None for random ones in 0 to 2.
+        expected_scene: Scene that the reference renders; None for `scene`. It holds the rows `keep` of the scene; the
+            others must contribute nothing.
+        keep: Mask [N] bool of the rows in `expected_scene`; None for all.
     """
     generator = torch.Generator().manual_seed(5)
     if colors is None:
@@ -187,7 +192,7 @@ def compare_rasterizers(
         fast = make_rasterizer(name, scene, near=near)
         shown = torch.cat([fast.render(colors, view) / brightest, fast.coverage(view)[..., None]], dim=-1).cpu()
         off = (shown.double() - torch.cat([image / brightest, coverage[..., None]], dim=-1)).abs().amax(-1)
-        # a step that a cut-off explains is no error, any larger one is
+        # A jump that a cutoff explains is not an error; any larger one is.
         explained = band & (off > IMAGE_BOUND) & (off <= LARGEST_STEP)
         flipped += int(explained.sum())
         error = _worst(error, off[~explained])
@@ -205,23 +210,23 @@ def _worst(error: float, values: Tensor) -> float:
 
 @cache
 def vgg16() -> BackboneWeights:
-    """The smaller network, for cases that need real features.
+    """Load the smaller network, for cases that need real features.
 
     Raises:
-        WeightsError: it is not installed.
+        WeightsError: If it is not installed.
     """
     return load_network_weights("vgg16")
 
 
 class DecisionsOf(FeatureNetwork):
-    """A float64 network that back-propagates through the ReLU masks and pool positions of another one.
+    """Float64 network that back-propagates through the ReLU masks and pool positions of another network.
 
-    Without them, a maximum that is tied in exact arithmetic (in any constant picture) sends the gradient to either
-    pixel: both are subgradients, and no precision is high enough to agree.
+    In exact arithmetic, maxima can be tied, for example in any constant image. The gradient may then go to either
+    pixel: both are subgradients, and no precision makes two networks agree.
 
-    They are those of the passes that the other network made in a block of `listening`, in their order, and not of
-    passes over the same pixels: those of a lower scale are averaged in float64 here and were in float32 there, and a
-    maximum that is nearly tied may have moved.
+    The decisions come from the passes that the other network made in a `listening` block, in their order. Repeating its
+    passes on the same pixels would not do: images of lower scales are averaged in float64 here and in float32 there,
+    which can move a maximum that is nearly tied.
     """
 
     def __init__(self, weights: BackboneWeights, other: FeatureNetwork) -> None:
@@ -232,7 +237,7 @@ class DecisionsOf(FeatureNetwork):
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """A block in which the other network makes the passes that this one is to follow afterwards."""
+        """Record the passes that the other network makes in this block, for this network to follow afterwards."""
         forward = self.other.forward
 
         def heard(rgb: Tensor, *, keep: bool = True) -> Activations:
@@ -245,11 +250,14 @@ class DecisionsOf(FeatureNetwork):
         del self.other.forward
 
     def rounding_of(self, layer: str) -> float:
-        """That of the other one: a channel that is constant but for it has no part in either's gradient."""
+        """Return the rounding error of the other network.
+
+        A channel that is constant except for that rounding then has no gradient in either network.
+        """
         return self.other.rounding_of(layer)
 
     def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
-        """As `FeatureNetwork.forward`, with the decisions of the other network's next pass kept for `backward`."""
+        """Run `FeatureNetwork.forward`, and store the decisions of the other network's next pass for `backward`."""
         own = super().forward(rgb, keep=keep)
         theirs = Activations({}, self._heard.popleft())
         for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
@@ -268,12 +276,16 @@ def compare_losses(
     untiled: bool = True,
     bound: float = LOSS_BOUND,
 ) -> CaseResult:
-    """Error of the float32 loss and pixel gradient, relative, against float64 with the same decisions.
+    """Return the relative error of the float32 loss and pixel gradient against float64 with the same decisions.
 
     Args:
-        image, content: [H, W, 3].
-        style: [H', W', 3], brought down to the view as always.
-        untiled: also compare the loss with the autograd reference, which needs at least 16 x 16 pixels of everything.
+        image: Image [H, W, 3].
+        style: Style image [H', W', 3], downscaled to the view as usual.
+        content: Content image [H, W, 3].
+        content_weight: Weight of the content term.
+        coverage: Position weights [H, W]; None for equal weights.
+        untiled: Whether to compare the loss with the autograd reference too, which needs at least 16 x 16 pixels.
+        bound: Maximum allowed error.
     """
     style = resize_area(style, style_size((style.shape[0], style.shape[1]), (image.shape[0], image.shape[1])))
     single = FeatureNetwork(vgg16())
@@ -286,7 +298,7 @@ def compare_losses(
     loss = expected.loss
     if untiled:
         loss, _ = sos_reference(vgg16(), image, style, content, content_weight=content_weight, coverage=coverage)
-    # one unit of loss is far below what anyone could see; it only keeps a perfect match from dividing by zero
+    # The floor of 1, a loss far below anything visible, only prevents a division by zero for a perfect match.
     error = abs(found.loss - loss) / max(abs(loss), 1.0)
     if not bool(torch.isfinite(found.image_gradient).all()):
         error = math.inf
@@ -311,7 +323,7 @@ def _evaluate(
 
 
 def texture(height: int, width: int, seed: int = 0) -> Tensor:
-    """A picture [height, width, 3] float32 in 0..1 with structure at several sizes."""
+    """Return an image [height, width, 3] float32 in 0 to 1 with structure at several sizes."""
     generator = torch.Generator().manual_seed(seed)
     result = torch.zeros(height, width, 3)
     for cell, strength in ((16, 0.6), (4, 0.4)):
@@ -322,7 +334,7 @@ def texture(height: int, width: int, seed: int = 0) -> Tensor:
 
 
 def without(scene: Scene, rows: Tensor) -> tuple[Scene, Tensor]:
-    """The scene without some rows ([N] bool), and what is kept ([N] bool)."""
+    """Return the scene without some rows ([N] bool), and the mask [N] bool of the remaining ones."""
     kept = ~rows
     columns = {name: getattr(scene, name)[kept] for name in Scene.__dataclass_fields__}
     return replace(scene, **columns), kept

@@ -1,4 +1,4 @@
-"""Hard cases of packed scene files and of orbits: one Gaussian, extreme sizes, objects without extent."""
+"""Hard cases of compressed scene files and of orbits: one Gaussian, extreme sizes, objects without extent."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CAMERAS = "cameras that are not finite, or do not face the object"
 
 
 def cases() -> list[Case]:
-    """All cases of this group."""
+    """Return all cases of this group."""
     forms: tuple[PackedForm, ...] = ("compressed.ply", "spz")
     found = [
         Case(f"{name}, as {form}", _GROUP, _AGAIN, partial(_packed, make, form))
@@ -51,13 +51,13 @@ def _one() -> Scene:
 
 
 def _extreme_scales() -> Scene:
-    """From what an exponential makes of -9.9 to that of 5.9: what a byte in SPZ can name."""
+    """Return Gaussians with log scales from -9.9 to 5.9, the range of a byte in SPZ."""
     scene = ordinary(90, seed=3)
     return replace(scene, scales=torch.linspace(-9.9, 5.9, 270).reshape(90, 3))
 
 
 def _far_and_near() -> Scene:
-    """Positions from 1e-4 to 1e4."""
+    """Return Gaussians with positions from 1e-4 to 1e4."""
     scene = ordinary(60, seed=4)
     return replace(scene, means=scene.means * torch.logspace(-4, 3, 60)[:, None])
 
@@ -78,7 +78,7 @@ _SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def _packed(make: Callable[[], Scene], form: PackedForm, full: bool) -> CaseResult:
-    """Everything finite, as many Gaussians, and what has been rounded once stays where it is."""
+    """Check that a file is finite and complete, and that rounded values do not change when written again."""
     scene = make()
     with tempfile.TemporaryDirectory() as folder:
         first, second = Path(folder) / f"first.{form}", Path(folder) / f"second.{form}"
@@ -99,7 +99,10 @@ def _packed(make: Callable[[], Scene], form: PackedForm, full: bool) -> CaseResu
 
 
 def _sorted(values: torch.Tensor, scene: Scene) -> torch.Tensor:
-    """Rows by position: compressed PLYs may hold them in another order, which neighbors at one place do not show."""
+    """Return rows ordered by position.
+
+    Compressed PLY files may reorder Gaussians; the order among those at one position does not matter.
+    """
     order = np.lexsort(scene.means.double().numpy().round(3).T)
     return values.double()[torch.from_numpy(order)]
 
@@ -117,7 +120,7 @@ def _finite(scene: Scene) -> bool:
 
 
 def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
-    """Bytes made by hand: positions and sizes come back as they are, the rest within the rounding of a byte."""
+    """Check a hand-made file: positions and sizes are read exactly, the rest to the rounding of a byte."""
     scene = make()
     sizes = scene.scales.exp().numpy().astype("<f4")
     colors = (0.5 + 0.28209479177387814 * scene.sh_dc.double()).clamp(0, 1)
@@ -146,7 +149,7 @@ def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
 
 
 def _cloud(x: float, y: float, z: float, count: int = 200) -> Scene:
-    """Small round Gaussians in a box with these sides."""
+    """Return small round Gaussians in a box with these sides."""
     scene = repeated(count, mean=(0.0, 0.0, 0.0), scale=0.02)
     box = torch.rand(count, 3, generator=torch.Generator().manual_seed(9)) - 0.5
     return replace(scene, means=box * torch.tensor([x, y, z]))
@@ -165,7 +168,7 @@ _OBJECTS: dict[str, Callable[[], Scene]] = {
 
 
 def _orbit(make: Callable[[], Scene], full: bool) -> CaseResult:
-    """Cameras with finite poses and sizes, all of which face the object; or an error that says what to do."""
+    """Check that all cameras are finite and face the object, or that a clear error is raised."""
     scene = make()
     try:
         found = make_orbit(scene, OrbitRequest(near=1e-9))

@@ -1,4 +1,4 @@
-"""Hard cases of the Gaussians themselves, among ordinary ones whose pixels must not suffer."""
+"""Hard cases of Gaussians, mixed with ordinary ones whose pixels must stay correct."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _PROPERTIES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
 
 def cases() -> list[Case]:
-    """All cases of this group."""
+    """Return all cases of this group."""
     found = [
         Case(f"{value} in {name}, in the file", "Gaussians", _IMAGE, partial(_invalid_in_file, name, value))
         for name in _PROPERTIES
@@ -74,65 +74,71 @@ def _columns(scene: Scene, **columns: Tensor) -> Scene:
 
 
 def _quaternions() -> Scene:
-    """Zero (no rotation: left out), the shortest and the longest that float32 holds, denormals."""
+    """Return quaternions of length 0 (no rotation, left out), of float32's extreme lengths, and denormal ones."""
     lengths = torch.tensor([0.0, 1e-45, 1e-30, 1e-4, 1.0, 1e4, 1e19, 1.9e38])
     return _columns(repeated(8), quats=torch.tensor([0.5, 0.5, -0.5, 0.7]) * lengths[:, None])
 
 
 def _scales() -> Scene:
-    """Zero (below float64's range), 1e-20, 1e10, 1e30, and what overflows even float64 (left out)."""
+    """Return scales of 0 (below float64's range), 1e-20, 1e10, 1e30, and one that overflows float64 (left out)."""
     logarithms = torch.tensor([-3e38, -1000.0, math.log(1e-20), math.log(1e10), math.log(1e30), 300.0, 1e5, 3e38])
     return _columns(repeated(8), scales=logarithms[:, None].expand(8, 3).clone(), opacities=torch.full((8,), -2.0))
 
 
 def _flat_or_thin() -> Scene:
-    """Discs and needles whose other axes have no extent at all."""
+    """Return discs and needles whose other axes have no extent at all."""
     none, some = -200.0, -1.0
     axes = [[none, some, some], [some, none, some], [some, some, none], [none, none, some], [some, none, none]]
     return _columns(ordinary(5, seed=3), scales=torch.tensor(axes))
 
 
 def _opacities_at_the_cut() -> Scene:
-    """1/255 and its float32 neighbors: there alpha reaches the cut in one pixel center at most."""
+    """Return opacities of 1/255 and its float32 neighbors.
+
+    With these, alpha reaches the cutoff at no more than one pixel center.
+    """
     cut = np.float32(math.log(ALPHA_MIN / (1 - ALPHA_MIN)))
     values = [np.nextafter(cut, np.float32(-9)), cut, np.nextafter(cut, np.float32(9)), cut + np.float32(1e-3)]
-    # centered on a pixel of `camera()`, whose principal point is (19.8, 13.8): x = 4 (20.5 - 19.8) / 30
+    # Centered on a pixel of `camera()`, whose principal point is (19.8, 13.8): x = 4 (20.5 - 19.8) / 30.
     scene = repeated(4, mean=(4 * 0.7 / 30, 4 * 0.7 / 33, 4.0))
     return _columns(scene, opacities=torch.tensor(np.array(values)))
 
 
 def _logits() -> Scene:
-    """Opacities of 0 and 1 as far as logits go."""
+    """Return opacities of 0 and 1 up to the largest logits."""
     return _columns(ordinary(8, seed=4), opacities=torch.tensor([-3e38, -1e4, -100.0, -17.0, 17.0, 100.0, 1e4, 3e38]))
 
 
 def _depths() -> Scene:
-    """Depth 0, around 0, and a center at the camera: all nearer than the near plane."""
+    """Return Gaussians at depth 0, around 0 and at the camera, all closer than the near plane."""
     scene = repeated(7, scale=0.5)
     depths = torch.tensor([0.0, -0.0, 1e-38, -1e-38, 1e-6, -1e-6, -4.0])
     return _columns(scene, means=torch.stack([torch.zeros(7), torch.zeros(7), depths], dim=1))
 
 
 def _off_screen() -> Scene:
-    """Centers far outside the view, footprints on it; one with a center of a million pixels."""
+    """Return Gaussians centered far outside the view, up to a million pixels, whose footprints reach into it."""
     means = torch.tensor([[-20.0, 0, 4], [20, 1, 4], [0, -15, 4], [0, 1e3, 4], [-1.3e5, 0, 4]])
     sizes = torch.tensor([6.0, 6.0, 5.0, 400.0, 5e4]).log()
     return _columns(repeated(5, logit=-1.0), means=means, scales=sizes[:, None].expand(5, 3).clone())
 
 
 def _stacked(count: int, logit: float) -> Scene:
-    """Many Gaussians at one point: the transmittance is a product of as many factors."""
+    """Return many Gaussians at one point, so that the transmittance is a product of as many factors."""
     return repeated(count, scale=0.02, logit=logit)
 
 
 def _sub_pixel() -> Scene:
-    """Thousands of points between the pixel centers."""
+    """Return thousands of points between the pixel centers."""
     scene = ordinary(3000, seed=7)
     return _columns(scene, scales=torch.full((3000, 3), math.log(1e-6)))
 
 
 def _grazing() -> Scene:
-    """Just beyond the near plane and far to the side: the largest slopes and derivatives of the perspective."""
+    """Return Gaussians just beyond the near plane and far to the side.
+
+    There the slopes and derivatives of the perspective are largest.
+    """
     scene = ordinary(60, seed=8)
     depths = torch.full((60,), NEAR * 1.001)
     return _columns(scene, means=torch.stack([scene.means[:, 0] * 5, scene.means[:, 1] * 5, depths], dim=1))
@@ -154,7 +160,10 @@ _SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def _invalid_in_file(name: str, value: str, full: bool) -> CaseResult:
-    """Refused with the property's name; with `drop_invalid` what is left renders as if it had never been there."""
+    """Check that a file with an invalid value is refused.
+
+    With `drop_invalid`, the rest must render as if the Gaussian did not exist.
+    """
     scene = ordinary(60, degree=1)
     getattr(scene, name)[7] = float(value)
     with tempfile.TemporaryDirectory() as folder:
@@ -174,7 +183,7 @@ def _invalid_in_file(name: str, value: str, full: bool) -> CaseResult:
 
 
 def _invalid_in_memory(name: str, value: str, full: bool) -> CaseResult:
-    """Geometry without a projection contributes nothing."""
+    """Check that a Gaussian whose geometry cannot be projected contributes nothing."""
     scene = ordinary(60)
     getattr(scene, name)[7] = float(value)
     rows = torch.zeros(60, dtype=torch.bool)
@@ -186,7 +195,7 @@ def _invalid_in_memory(name: str, value: str, full: bool) -> CaseResult:
 
 
 def _needles(full: bool) -> CaseResult:
-    """In float32, p r - q^2 of such a needle has no correct digit and is often negative."""
+    """Check needles in all orientations. In float32, their p r - q^2 has no correct digit and is often negative."""
     worst, lost = CaseResult(0.0, 0.0), 0
     steps = 180 if full else 36
     for step in range(steps):
@@ -201,11 +210,11 @@ def _needles(full: bool) -> CaseResult:
 
 
 def _float32_determinant_is_lost(needle: Scene) -> bool:
-    """Whether the usual formula's relative error for `needle` at depth 4 in `camera()` exceeds 0.1."""
+    """Return whether the usual formula's relative error exceeds 0.1 for `needle` at depth 4 in `camera()`."""
     found = project(needle, camera()).values
     if not len(found):
         return False
-    # r, det and q from what the projection stores: w_scale^2 = k / r, u_scale^2 = k r / det
+    # r, det and q follow from the stored projection: w_scale^2 = k / r, u_scale^2 = k r / det.
     k = 0.5 * math.log2(math.e)
     r = k / found[0, 4] ** 2
     det, q = k * r / found[0, 3] ** 2, found[0, 2] * r
@@ -215,7 +224,7 @@ def _float32_determinant_is_lost(needle: Scene) -> bool:
 
 
 def _near_plane(full: bool) -> CaseResult:
-    """What lies on the plane is drawn, what lies one ulp nearer is not."""
+    """Check that a Gaussian on the near plane is drawn, and one that is one ulp closer is not."""
     at = np.float32(0.5)
     below, above = np.nextafter(at, np.float32(0)), np.nextafter(at, np.float32(1))
     scene = repeated(3, scale=0.05)
@@ -239,7 +248,10 @@ def _equal_depths(full: bool) -> CaseResult:
 
 
 def _moved_world(full: bool) -> CaseResult:
-    """Positions that float32 can hold at 1e6 (multiples of 1/16) give the same picture there as at the origin."""
+    """Check that a scene renders the same at 1e6 as at the origin.
+
+    Its positions are multiples of 1/16, which float32 can represent at 1e6.
+    """
     scene, view = ordinary(300, seed=9), camera()
     scene = replace(scene, means=(scene.means * 16).round() / 16)
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
@@ -254,7 +266,10 @@ def _moved_world(full: bool) -> CaseResult:
 
 
 def _large_harmonics(full: bool) -> CaseResult:
-    """A frozen part of 1e4 against a DC part of -1e4: float32 keeps what 1e4 leaves, not more."""
+    """Check colors in which frozen SH coefficients of 1e4 and a DC coefficient of -1e4 cancel.
+
+    The error is relative to 1e4, because float32 cannot keep more.
+    """
     scene = ordinary(200, seed=10, degree=3)
     scene = replace(scene, sh_rest=held(scene.sh_rest) * 1e4)
     view = camera()
@@ -270,7 +285,10 @@ def _large_harmonics(full: bool) -> CaseResult:
 
 
 def _no_direction(full: bool) -> CaseResult:
-    """A Gaussian at the camera's center: its harmonics are those of direction 0, finite, and it is never drawn."""
+    """Check a Gaussian at the camera's center.
+
+    Its view direction is 0, its SH colors must be finite, and it is never drawn.
+    """
     scene = replace(repeated(3), sh_rest=torch.ones(3, 15, 3))
     means = torch.tensor([[0.0, 0, 0], [1e-45, 0, 0], [0, 1e38, 1e38]])
     scene = replace(scene, means=means)

@@ -1,4 +1,4 @@
-"""Hard cases of whole jobs: styles, scenes and settings that leave nothing to compare, or far too much."""
+"""Hard cases of whole jobs: styles, scenes and settings with nothing to compare, or with extreme values."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MEASURE = "loss and gradient at the end, relative to float64; finite, bounded, 
 
 
 def cases() -> list[Case]:
-    """All cases of this group."""
+    """Return all cases of this group."""
     found = [Case(name, "jobs", _MEASURE, partial(_strained, situation)) for name, situation in _SITUATIONS.items()]
     found += [
         Case(name, "jobs", "jobs that were not refused", partial(_refused, situation))
@@ -47,7 +47,7 @@ def _strained(situation: Callable[[], Situation], full: bool) -> CaseResult:
 
 
 def _refused(situation: Callable[[], Situation], full: bool) -> CaseResult:
-    """With an error of its own, before the first step or in it, and not with a broken result."""
+    """Check that a job is refused with an error of its own, at the latest in its first step."""
     try:
         make(situation()).run_step()
     except SgsstError as error:
@@ -83,7 +83,7 @@ def _with_harmonics(size: float, degree: int = 2) -> Scene:
 
 
 def _scan(**settings: object) -> Situation:
-    """One color, little of the view, and that color behind it."""
+    """Return a job with a scene of one color that covers little of the view, and a style of the same color."""
     scene = colored(replace(crowd(20), scales=torch.full((20, 3), math.log(0.2))), 0.4, 0.4, 0.4)
     return Situation(scene, _flat(0.4, 0.4, 0.4), settings, falls=False)
 
@@ -95,7 +95,10 @@ def _job(
 
 
 def _unlike(scene: Callable[[], Scene], style: Callable[[], Tensor], **settings: object) -> Situation:
-    """As `_job`, of which the loss need not fall: what is compared is equal from the start, or cannot be met."""
+    """Return a job like `_job` whose loss need not fall.
+
+    What it compares is equal from the start, or can never become equal.
+    """
     return replace(_job(scene, style, **settings), falls=False)
 
 
@@ -105,7 +108,7 @@ def _scaled(factor: float) -> Situation:
 
 
 def _black_views(scale: str) -> Situation:
-    """The real network; with the factors that the paper's scale is about, which need not be found anew for this."""
+    """Return a job on black views with the real network, at fixed factors for "paper" to save computing them."""
     weights = vgg16()
     if scale == "paper":
         weights = with_scales(weights, dict.fromkeys(PUBLISHED, 20.0))
@@ -114,14 +117,17 @@ def _black_views(scale: str) -> Situation:
 
 
 def _pixels(situation: Situation, factor: float | None = None) -> Situation:
-    """The same job, in which pixels are compared, too, by another factor than the usual one if need be."""
+    """Return the same job with pixels compared too, at the given factor or the usual one."""
     weights = even_network()
     scales = weights.scales if factor is None else weights.scales | {PIXELS: factor}
     return replace(situation, weights=replace(weights, scales=scales))
 
 
 def _white_on_white() -> Situation:
-    """What differs from the style is a hundredth of what both are: each rounding counts a hundred times as much."""
+    """Return a job whose difference from the style is a hundredth of the values themselves.
+
+    Every rounding error therefore counts a hundred times as much.
+    """
     style = partial(_flat, 1, 1, 1, 64, 64)
     settings = {"background": (1.0, 1.0, 1.0), "content_weight": 0, "learning_rate": 0.01}
     job = _unlike(lambda: colored(crowd(), 0.95, 0.95, 0.95), style, **settings)
@@ -213,7 +219,10 @@ _REFUSED: dict[str, Callable[[], Situation]] = {
 
 
 def _chroma(full: bool) -> CaseResult:
-    """Colors that are far apart in size keep their chroma to a rounding of the larger of before and after."""
+    """Check that colors of very different magnitudes keep their chroma.
+
+    The allowed error is one rounding of the larger of the values before and after.
+    """
     scene = crowd(60)
     sizes = torch.logspace(-6, 3, 60)[:, None]
     scene = replace(scene, sh_dc=scene.sh_dc * sizes)

@@ -1,4 +1,4 @@
-"""Hard cases of the optimizer: gradients of all sizes, steps that are too large or too many, colors out of range."""
+"""Hard cases of the optimizer: gradients of all magnitudes, too large or too many steps, colors out of range."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from sgsst_core.stylizing.stylizer import Stylizer
 
 _END = "loss and gradient of the last picture, relative to float64"
 _SIDE = 16
-#: A Gaussian with less total blend weight than this moves no pixel of any view by a gray level.
+#: Total blend weight below which a Gaussian changes no pixel of any view by a gray level.
 HARDLY_SEEN = 1.0 / 255.0
 
 
 def cases() -> list[Case]:
-    """All cases of this group."""
+    """Return all cases of this group."""
     found: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
         ("total weights from 1e-6 to 1e2 in one scene", _END, _weights),
         ("Adam on gradients from 1e-12 to 1e3", "values against float64", _adam),
@@ -48,7 +48,7 @@ def cases() -> list[Case]:
 
 
 class _OnShallowLayers(Stylizer):
-    """The optimizer as it is, on two style layers: what is strained is not the network, and steps are quick."""
+    """Stylizer on the first two style layers: steps are quick, and only the optimizer is under stress."""
 
     def _network(self, weights: BackboneWeights) -> FeatureNetwork:
         return FeatureNetwork(weights, STYLE_LAYERS[:2])
@@ -59,7 +59,11 @@ def _camera() -> Camera:
 
 
 def _walls(*walls: tuple[float, int]) -> Scene:
-    """Walls of (opacity's logit, Gaussians along a side), one behind the other; each fills the view."""
+    """Return walls of Gaussians, one behind the other, each of which fills the view.
+
+    Args:
+        walls: Logit of the opacity and number of Gaussians per side, for each wall.
+    """
     means, scales, logits = [], [], []
     for index, (logit, columns) in enumerate(walls):
         depth = 3.0 + index
@@ -103,13 +107,13 @@ def _at_the_end(stylizer: Stylizer, note: str) -> CaseResult:
 
 
 def _outside(stylizer: Stylizer, rows: Tensor) -> float:
-    """How far the colors of some rows ([n] bool) lie outside 0..1 at most."""
+    """Return how far the colors of some rows ([n] bool) lie outside 0 to 1, at most."""
     colors = COLOR_OFFSET + SH_C0 * stylizer.sh_dc.detach()[rows]
     return float(torch.maximum(colors - 1, -colors).amax()) if len(colors) else 0.0
 
 
 def _weights(full: bool) -> CaseResult:
-    """Behind opaque walls, Gaussians down to nearly the smallest blend weight there is."""
+    """Check Gaussians behind opaque walls, with blend weights down to almost the smallest possible one."""
     faint = math.log(1.1 * ALPHA_MIN / (1 - 1.1 * ALPHA_MIN))
     scene = _walls((2.0, 5), (3.0, 1), (faint, 5), (2.0, 5), (1.0, 5), (faint, 8))
     stylizer = _stylizer(scene, 2000 if full else 200, learning_rate=0.05)
@@ -127,7 +131,10 @@ def _weights(full: bool) -> CaseResult:
 
 
 def _adam(full: bool) -> CaseResult:
-    """Adam divides by the gradient's own size, so that all 16 orders of magnitude move alike, in either precision."""
+    """Check Adam on gradients of 16 orders of magnitude.
+
+    Adam divides by the gradient's own size, so all values move alike, in either precision.
+    """
     sizes = torch.logspace(-12, 3, 16, dtype=torch.float64)
     ends = []
     for dtype in (torch.float32, torch.float64):
@@ -170,7 +177,7 @@ def _far_colors(full: bool) -> CaseResult:
 
 
 def _diverged(full: bool) -> CaseResult:
-    """An error instead of NaN in the result; the colors stay what they were."""
+    """Check that divergence raises an error, and leaves the colors unchanged instead of NaN."""
     stylizer = _stylizer(_walls((2.0, 5)), 3, shallow=False)
     with torch.no_grad():
         stylizer.sh_dc.copy_(stylizer.sh_dc.abs() * 1e8)
@@ -184,7 +191,7 @@ def _diverged(full: bool) -> CaseResult:
 
 
 def _many_steps(full: bool) -> CaseResult:
-    """At a constant rate; the loss keeps to its lowest level, within what a constant rate leaves it to wander."""
+    """Check that the loss stays near its lowest level, apart from the noise of a constant learning rate."""
     steps = 100_000 if full else 500
     stylizer = _stylizer(_walls((2.0, 5), (1.0, 5)), steps, learning_rate=2.5e-3, early_stop=False)
     run(stylizer)

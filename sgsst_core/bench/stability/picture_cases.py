@@ -1,4 +1,4 @@
-"""Hard cases of style and content: pictures without texture or with nothing else, and features without variance."""
+"""Hard cases of style and content: images without texture or with extreme values, and constant features."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HEIGHT, _WIDTH = 32, 40
 
 
 def cases() -> list[Case]:
-    """All cases of this group."""
+    """Return all cases of this group."""
     found = [
         Case(f"style: {name}", "style and content", _LOSS, partial(_style, make)) for name, make in _PICTURES.items()
     ]
@@ -52,12 +52,12 @@ def _constant(red: float, green: float, blue: float, height: int = _HEIGHT, widt
 
 
 def _checkerboard() -> Tensor:
-    """Black and white in turn: nothing changes faster."""
+    """Return pixels that alternate between black and white, the highest frequency there is."""
     return ((torch.arange(_HEIGHT)[:, None] + torch.arange(_WIDTH)) % 2).float()[..., None].expand(-1, -1, 3).clone()
 
 
 def _contrast() -> Tensor:
-    """Values of -100 and 100: colors are not clamped before the network."""
+    """Return an image with values of -100 and 100; colors are not clamped before the network."""
     return 200 * (texture(_HEIGHT, _WIDTH, 4) > 0.5).float() - 100
 
 
@@ -88,7 +88,7 @@ def _nothing_to_do(full: bool) -> CaseResult:
 
 
 def _small_style(side: int, full: bool) -> CaseResult:
-    """Layers whose cells are larger than the style image have no target and are left out of the loss."""
+    """Check a style image smaller than a cell of deep layers, which are then left out of the loss."""
     result = compare_losses(
         texture(_HEIGHT, _WIDTH, 1), texture(side, side, 2), texture(_HEIGHT, _WIDTH, 3), untiled=False
     )
@@ -96,7 +96,7 @@ def _small_style(side: int, full: bool) -> CaseResult:
 
 
 def _long_style(full: bool) -> CaseResult:
-    """200 times longer than wide: kept, brought down to the view's shorter side; targets against float64."""
+    """Check the targets of a style image 200 times as long as wide, scaled to the view's shorter side."""
     from sgsst_core.bench.stability.case import vgg16
     from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
     from sgsst_core.loss.sos import SosLoss
@@ -126,7 +126,10 @@ def _features(seed: int, channels: int = 12) -> Tensor:
 
 
 def _dead(where: str, full: bool) -> CaseResult:
-    """Constant channels, zero or not; the published factor (sigma - sigma_v) / sigma is infinite for them."""
+    """Check channels that are constant, zero or not.
+
+    The published factor (sigma - sigma_v) / sigma is infinite for them.
+    """
     view, style = _features(1), _features(2)
     for name, features in (("the view", view), ("the style", style)):
         if where in (name, "both"):
@@ -143,7 +146,10 @@ def _dead(where: str, full: bool) -> CaseResult:
 
 
 def _ratio(power: int, full: bool) -> CaseResult:
-    """Sigma of features with a mean of 10^power sigma; the one-pass formula of the published code beside it."""
+    """Check sigma for features whose mean is 10^power sigma.
+
+    The note gives the error of the published code's one-pass formula.
+    """
     generator = torch.Generator().manual_seed(power)
     features = (10.0**power + torch.randn((60, 50, 16), generator=generator, dtype=torch.float64)).float()
     exact = layer_statistics_reference(features).std()
@@ -168,7 +174,7 @@ def _steep(full: bool) -> CaseResult:
 
 
 def _autograd(features: Tensor, target: LayerTarget) -> Tensor:
-    """Gradient of one layer's style loss by its definition, float64."""
+    """Return the gradient of one layer's style loss, computed from its definition in float64."""
     x = features.double().clone().requires_grad_()
     (gradient,) = torch.autograd.grad(style_loss_reference(x, target), x)
     return gradient

@@ -27,17 +27,17 @@ from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.settings import make_settings
 
-#: Losses of partition tiles, and the style loss of the same features in any number of parts, are right to this.
+#: Error bound of the losses of partition tiles, and of the style loss of the same features in any number of tiles.
 _TILES_BOUND = 1e-6
-#: What follows from more of the arithmetic, to this. Squares of up to 4096 positions are added up in float32, by matrix
-#: products that some processors sum in longer chains than others. Of a ReLU's features, most positions of a channel are
-#: the same 0: the same addend is rounded the same way over and over, which does not average out (with AVX2 4e-7 of a
-#: gradient and 1.5e-7 of a loss, with AVX-512 on a Xeon 1.2e-6 and 1.3e-6 of a view in one piece).
+#: Error bound of results with longer sums. Squares of up to 4096 positions are summed in float32, by matrix products
+#: that some processors accumulate in longer chains than others. After a ReLU, most positions of a channel have the same
+#: value 0, so the same addend is rounded the same way over and over, which does not average out: with AVX2 4e-7 of a
+#: gradient and 1.5e-7 of a loss; with AVX-512 on a Xeon 1.2e-6 and 1.3e-6, for a view in one piece.
 _SUMS_BOUND = 2e-6
 
 
 def cases() -> list[Case]:
-    """All cases of this group."""
+    """Return all cases of this group."""
     found: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
         ("Gram matrix of 17 million pixels", "Gram, mean, sigma, relative to float64", _long_sum),
         ("features that overflow float16", "settings that were not refused", _float16),
@@ -52,7 +52,10 @@ def cases() -> list[Case]:
 
 
 def _long_sum(full: bool) -> CaseResult:
-    """67 partition tiles of 512 x 512 make a view of 5187 x 3361; beside it float32 added one term after the other."""
+    """Check the statistics of 67 partition tiles of 512 x 512, which make a view of 5187 x 3361.
+
+    The note gives the error of adding one term after another in float32.
+    """
     generator = torch.Generator().manual_seed(0)
     channels = torch.linspace(1, 300, 64)
     found, exact = LayerStatistics.zero(64), LayerStatistics.zero(64)
@@ -72,7 +75,7 @@ def _long_sum(full: bool) -> CaseResult:
 
 
 def _float16(full: bool) -> CaseResult:
-    """Features reach 1e4 and Gram entries 1e8, where float16 ends at 65504: it is not offered."""
+    """Check that float16 is refused: features reach 1e4 and Gram entries 1e8, while float16 ends at 65504."""
     activations = FeatureNetwork(vgg16(), STYLE_LAYERS).forward(texture(32, 40).round(), keep=False)
     largest = max(float(features.max()) for features in activations.features.values())
     gram = max(float(layer_statistics(features).gram().max()) for features in activations.features.values())
@@ -85,7 +88,10 @@ def _float16(full: bool) -> CaseResult:
 
 
 def _bfloat16(brightest: float, full: bool) -> CaseResult:
-    """As wide as float32, with 8 bits: nothing overflows, the gradient's direction is kept roughly."""
+    """Check gradients in bfloat16, which has the range of float32 but 8 bits of precision.
+
+    Nothing overflows, and the gradient's direction is roughly right.
+    """
     image, style, content = (brightest * texture(48, 64, seed) for seed in (1, 2, 3))
     gradients = []
     for dtype in (torch.float32, torch.bfloat16):
@@ -100,7 +106,10 @@ def _bfloat16(brightest: float, full: bool) -> CaseResult:
 
 
 def _half_weights(full: bool) -> CaseResult:
-    """Weights down to 4e-7 lie below float16's normal range; they are kept scaled by 2^14, so that none is lost."""
+    """Check blend weights in half precision.
+
+    Weights down to 4e-7 are below float16's normal range; they are stored multiplied by 2^14, so none is lost.
+    """
     scene, view = ordinary(1500, seed=2), camera(100, 60)
     scene = replace(scene, opacities=torch.linspace(-5.5, 6.0, 1500)[torch.randperm(1500)])
     colors = 2 * torch.rand(1500, 3, generator=torch.Generator().manual_seed(1))
@@ -114,7 +123,7 @@ def _half_weights(full: bool) -> CaseResult:
 
 
 def _split(height: int, width: int, tiles: int) -> list[tuple[slice, slice]]:
-    """1, 2 or 7 strips, or 8 x 8 rectangles."""
+    """Split a view into 1, 2 or 7 strips, or into 8 x 8 rectangles."""
     down, across = (8, 8) if tiles == 64 else (1, tiles)
     rows, columns = (np.linspace(0, side, parts + 1).astype(int) for side, parts in ((height, down), (width, across)))
     return [
@@ -123,21 +132,21 @@ def _split(height: int, width: int, tiles: int) -> list[tuple[slice, slice]]:
 
 
 def _agreement(features: torch.Tensor, parts: dict[str, list[LayerStatistics]], target: LayerTarget) -> CaseResult:
-    """Largest difference of loss and feature gradient between ways of adding up the same features."""
+    """Return the largest difference of loss and feature gradient between ways to sum the same features."""
     results = {name: style_loss(merge_all(statistics), target) for name, statistics in parts.items()}
     losses = [float(terms.sum()) for terms, _ in results.values()]
     gradients = [gradient.apply(features) for _, gradient in results.values()]
     error = max(abs(loss / losses[0] - 1) for loss in losses)
     off = max(float((gradient - gradients[0]).norm() / gradients[0].norm()) for gradient in gradients)
-    # Of the loss, which has a narrower bound, in units of it.
+    # The loss has the narrower bound, so its error is scaled to the common one.
     error *= _SUMS_BOUND / _TILES_BOUND
     return CaseResult(max(error, off), _SUMS_BOUND, ", ".join(parts))
 
 
 def _features() -> tuple[torch.Tensor, LayerTarget]:
-    """Real features [160, 224, 64] float32, and the target of a picture that is clearly another one.
+    """Return real features [160, 224, 64] float32, and the target of a clearly different image.
 
-    (Where both nearly agree, the loss is a difference that magnifies every rounding by as much.)
+    For similar images, the loss is a small difference, which magnifies every rounding error.
     """
     network = FeatureNetwork(vgg16(), ("relu1_1",))
     style = network.forward(texture(100, 100, 5) ** 3, keep=False).features["relu1_1"]
@@ -165,7 +174,11 @@ def _order_of_tiles(full: bool) -> CaseResult:
 
 
 def _tiles(full: bool) -> CaseResult:
-    """Forward passes differ too: the network sees each tile by itself. A flipped max-pool decision is no error."""
+    """Check the whole loss with the view in 1, 2, 7 and 64 tiles.
+
+    The forward pass differs too, because the network sees each tile separately. Flipped max-pool decisions are not
+    errors.
+    """
     size = (16, 1024) if full else (16, 448)
     counts = {1: None, 2: 512, 7: 160, 64: 16} if full else {1: None, 2: 224, 7: 64}
     exact = _loss_of(size, None, torch.float64)[0].loss
@@ -177,7 +190,7 @@ def _tiles(full: bool) -> CaseResult:
         assert result.image_gradient is not None
         losses.append(result.loss)
         gradients.append(result.image_gradient)
-    # Of a view in one piece, where the sums are longest, within their bound; of tiles within theirs, in units of it.
+    # The undivided view, where sums are longest, is held to _SUMS_BOUND; tiles are held to _TILES_BOUND, scaled to it.
     whole, *tiled = (abs(loss / exact - 1) for loss in losses)
     error = max(whole, max(tiled) * _SUMS_BOUND / _TILES_BOUND)
     off = max(float((gradient - gradients[0]).norm() / gradients[0].norm()) for gradient in gradients)
@@ -186,7 +199,7 @@ def _tiles(full: bool) -> CaseResult:
 
 
 def _loss_of(size: tuple[int, int], tile_size: int | None, dtype: torch.dtype) -> tuple[SosResult, int]:
-    """The whole loss of a picture, and into how many partition tiles it was cut."""
+    """Return the whole loss of an image, and its number of partition tiles."""
     image, style, content = (texture(*size, seed).to(dtype) for seed in (1, 2, 3))
     loss = SosLoss(FeatureNetwork(vgg16(), dtype=dtype), tile_size=tile_size)
     return loss.evaluate(image, loss.style_targets(style, size), loss.view_target(content)), len(loss.tiles(*size))

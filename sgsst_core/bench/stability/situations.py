@@ -1,8 +1,7 @@
-"""Whole jobs so small that hundreds of them can be run: what a scene, a style and settings come to together.
+"""Whole jobs so small that hundreds of them can be run, to test combinations of scene, style and settings.
 
-Cases and the random search (`benchmarks.stability_search`) hold them against the same bounds: finite colors, steps no
-longer than Adam's, the same bits again, a loss that does not rise, and loss and gradient of the last picture as in
-float64.
+The cases and the random search (`benchmarks.stability_search`) apply the same bounds: finite colors, steps no longer
+than Adam's, bit-identical repetition, a loss that does not rise, and loss and gradient of the last image as in float64.
 """
 
 from __future__ import annotations
@@ -31,40 +30,42 @@ from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.optimizer import constrained
 from sgsst_core.stylizing.stylizer import Stylizer
 
-#: Loss and pixel gradient of the last picture against float64, relative.
+#: Relative error bound of loss and pixel gradient of the last image against float64.
 TWIN_BOUND = 1e-4
-#: Adam's longest step in learning rates: that of a gradient which was 0 in all steps before.
+#: Adam's longest step in learning rates: after a gradient that was 0 in all steps before.
 LONGEST_STEP = 0.1 / math.sqrt(0.001) + 0.1
-#: By how much more than at the start a loss may be at the end.
+#: Fraction by which the final loss may exceed the initial one.
 RISE = 1e-3
-#: Losses as small as this are rounding of what was equal at the start.
+#: Losses up to this size are rounding errors of what was equal at the start.
 NO_LOSS = 1e-3
-#: Of a gradient, whatever the rounding of content is.
+#: Upper limit for the allowed error of a gradient, however uncertain the content is.
 _MOST_UNCERTAIN = 0.5
-#: Of the cosine of two float32 vectors of length 1.
+#: Rounding error of the cosine of two float32 vectors of length 1.
 _ROUNDING_OF_COSINES = 2**-22
 STEPS, LEARNING_RATE = 4, 0.02
 _CHANNELS = 8
-#: Of float32 features, relative to their size.
+#: Rounding error of float32 features, relative to their size.
 _FEATURE_ROUNDING = 2**-20
-#: Added to a number and taken away again, so many times itself leaves 20 of float64's 53 bits of it.
+#: Multiple of a number that, when added and subtracted again, leaves 20 of its 53 bits in float64.
 _CUT = 2.0**33
-#: What that changes of a gradient is at least an eighth of what float32 does to it, which rounds sums, too, and those
-#: of equal numbers the same way each time.
+#: The change that this rounding makes to a gradient is at least an eighth of that of float32, which also rounds sums,
+#: and rounds those of equal numbers the same way each time.
 _SAFETY = 8.0
 
 
 @dataclass(frozen=True)
 class Situation:
-    """A job.
+    """Inputs and settings of a job.
 
     Attributes:
-        style: [H, W, 3].
-        settings: on top of `small_settings`.
-        cameras: none for `views`.
-        falls: the loss may not end above the start, where steps have the surround that it is judged with. False where a
-            step of any length overshoots: what is compared is equal, or nearly so, before the first one.
-        weights: of the network; None for `small_network`.
+        scene: Scene to stylize.
+        style: Style image [H, W, 3].
+        settings: Settings that override those of `make`.
+        cameras: Cameras; `views()` if empty.
+        falls: Whether the loss must not end above the start; only checked if steps use the background that losses are
+            measured with. False if a step of any length overshoots, because what is compared is (nearly) equal from the
+            start.
+        weights: Weights of the network; None for `small_network`.
     """
 
     scene: Scene
@@ -76,7 +77,7 @@ class Situation:
 
 
 def views(width: int = 24, height: int = 20) -> tuple[Camera, ...]:
-    """Two cameras side by side."""
+    """Return two cameras side by side."""
     first = camera(width, height, focal=0.75 * max(width, height))
     pose = first.world_to_camera.clone()
     pose[0, 3] = -0.3
@@ -84,20 +85,20 @@ def views(width: int = 24, height: int = 20) -> tuple[Camera, ...]:
 
 
 def crowd(count: int = 60, *, seed: int = 0, degree: int = 0) -> Scene:
-    """Gaussians that cover most of each view, as trained ones do."""
+    """Return Gaussians that cover most of each view, as trained ones do."""
     scene = ordinary(count, seed=seed, degree=degree)
     return replace(scene, scales=scene.scales + 2.2, sh_dc=0.6 * scene.sh_dc)
 
 
 def colored(scene: Scene, red: float, green: float, blue: float) -> Scene:
-    """The same scene in one color (0..1)."""
+    """Return the same scene in one color (0 to 1)."""
     color = (torch.tensor([red, green, blue], dtype=torch.float32) - COLOR_OFFSET) / SH_C0
     return replace(scene, sh_dc=color.expand(len(scene), 3).clone())
 
 
 @functools.cache
 def small_network() -> BackboneWeights:
-    """VGG16's layers with 8 channels each and random weights (He et al. 2015), the same ones in every process."""
+    """Return VGG16's layers with 8 channels each and fixed random weights (He et al. 2015)."""
     generator = torch.Generator().manual_seed(8)
     layers, channels = {}, 3
     for block, count in enumerate(BLOCKS["vgg16"], start=1):
@@ -111,12 +112,12 @@ def small_network() -> BackboneWeights:
 
 @functools.cache
 def even_network() -> BackboneWeights:
-    """The same one with the factors of `feature_scale` "even", as networks have them that are not the original one."""
+    """Return `small_network` at the feature scale "even"."""
     return with_scales(small_network(), even_scales(small_network()))
 
 
 def make(situation: Situation) -> Stylizer:
-    """A stylizer of a situation, before its first step."""
+    """Make a stylizer of a situation, before its first step."""
     values: dict[str, Any] = {
         "steps_coarse": 1,
         "steps_sos": STEPS,
@@ -132,10 +133,10 @@ def make(situation: Situation) -> Stylizer:
 
 
 def strain(situation: Situation) -> CaseResult:
-    """Run a situation twice: the error against float64 at the end, infinite where any other bound is broken.
+    """Run a situation twice. Returns the final error against float64, or infinity if another bound is violated.
 
     Raises:
-        SgsstError: what the situation is refused with.
+        SgsstError: If the situation is refused.
     """
     jobs = [make(situation) for _ in range(2)]
     begun = jobs[0].sh_dc.detach().clone()
@@ -145,7 +146,7 @@ def strain(situation: Situation) -> CaseResult:
     job = jobs[0]
     after = mean_loss(job.evaluate(job.evaluation_views), job.loss.weights)
     colors, moved = job.stylized(), _moved(job, begun)
-    judged = job.plan.training_background == "background"  # else steps have another loss than what is judged
+    judged = job.plan.training_background == "background"  # other backgrounds change the loss of the steps
     most = job.total * job.settings.learning_rate * LONGEST_STEP
     broken = [
         what
@@ -165,7 +166,7 @@ def strain(situation: Situation) -> CaseResult:
 
 
 def _moved(job: Stylizer, begun: Tensor) -> float:
-    """How far a coefficient has moved at most, beside what brings colors that began beyond the bounds into them."""
+    """Return the largest change of a coefficient, not counting the change that brings initial colors into bounds."""
     found = job.sh_dc.detach()
     chroma_of = begun if job.settings.preserve_colors == "luminance" else None
     within = constrained(begun, chroma_of, bounded=job.settings.bounded)
@@ -173,12 +174,15 @@ def _moved(job: Stylizer, begun: Tensor) -> float:
 
 
 def twin_error(job: Stylizer) -> tuple[float, float, int]:
-    """Relative error of loss and pixel gradient of a view's present picture against float64, and flipped decisions.
+    """Compare loss and pixel gradient of a view's present image with float64.
 
-    The second number is what the error may be: more where the rounding of features, of which nothing can be freed,
-    makes more of it; and where content has changed by little more than that. Where it has changed by less, its term may
-    be what that rounding makes of it, and all else is compared without it. Of features that are matched, the loss
-    alone: another nearest vector, as near, is no error; and cosines that are 1 but for their rounding are.
+    The allowed error grows with the effect of feature rounding, which no implementation avoids, and if content has
+    changed by little more than that rounding. If content has changed by less, its term may consist of rounding alone,
+    and everything else is compared without it. For nearest-neighbor losses only the loss is compared, less the rounding
+    of cosines near 1: another vector that is equally near is no error.
+
+    Returns:
+        Relative error, allowed error, and number of flipped ReLU and pool decisions.
     """
     index = job.views.covered[0]
     picture = job.views.render(index, job.views.colors(index, job.sh_dc.detach()))
@@ -207,10 +211,10 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
 def _rounding_of_features(
     job: Stylizer, exact: SosResult, given: tuple[Tensor, Tensor, Tensor | None], content_weight: float
 ) -> float:
-    """By how much the gradient changes, relative, when all features are rounded a little more than float32 does.
+    """Return the relative change of the gradient if all features are rounded slightly more than in float32.
 
-    It is much where the style loss is a difference of nearly equal statistics, and where a deviation is not much more
-    than the rounding of what deviates.
+    It is large if the style loss is a difference of nearly equal statistics, or if a standard deviation is hardly
+    larger than the rounding of the features.
     """
     rounded = _Rounded(job.weights, job.network)
     _, found = _evaluate_both(job, rounded, *given, content_weight)
@@ -221,9 +225,9 @@ def _rounding_of_features(
 
 
 class _Rounded(DecisionsOf):
-    """The float64 network with every layer's features rounded, equal ones equally, as they are in float32.
+    """Float64 network with the features of every layer rounded, equal ones equally, as in float32.
 
-    Pictures, too: those of lower scales are means.
+    Images are rounded too, because those of lower scales are means.
     """
 
     def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
@@ -236,15 +240,15 @@ class _Rounded(DecisionsOf):
 
 
 def _feature_rounding(job: Stylizer, content: Tensor) -> float:
-    """Rounding of a difference of float32 content features."""
+    """Return the rounding error of a difference of float32 content features."""
     features = job.network.forward(content, keep=False).features[CONTENT_LAYER]
     return _FEATURE_ROUNDING * float(features.square().mean().sqrt()) if features.numel() else 0.0
 
 
 def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> float:
-    """What float32 features leave uncertain of the content term and its gradient, relative.
+    """Return the relative uncertainty of the content term and its gradient with float32 features.
 
-    E_c = lambda mean(d^2) tells how large differences d are; with d off by delta, E_c is off by 2 delta / d.
+    E_c = lambda mean(d^2) gives the size of the differences d. If d is off by delta, E_c is off by 2 delta / d.
     """
     weight = job.settings.content_weight
     rounding = _feature_rounding(job, content) if weight else 0.0
@@ -253,7 +257,10 @@ def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> fl
 
 
 def _content_is_rounding(job: Stylizer, found: SosResult, exact: SosResult, content: Tensor) -> bool:
-    """Whether the content term is no more than differences d that are off by delta make of it: (d + delta)^2."""
+    """Return whether rounding errors of the features explain the content term.
+
+    With differences d that are off by delta, the term is the mean of (d + delta)^2.
+    """
     most = 2 * job.settings.content_weight * _feature_rounding(job, content) ** 2
     return all(terms["content"] <= 2 * exact.terms[scale]["content"] + most for scale, terms in found.terms.items())
 
@@ -266,7 +273,7 @@ def _evaluate_both(
     coverage: Tensor | None,
     content_weight: float,
 ) -> tuple[SosResult, SosResult]:
-    """The loss of a picture by the job's network, and in float64 with its decisions."""
+    """Return the loss of an image by the job's network, and in float64 with the same decisions."""
     with double.listening():
         found = _evaluate(job, job.network, picture, content, coverage, content_weight)
     return found, _evaluate(job, double, picture, content, coverage, content_weight)
@@ -280,7 +287,7 @@ def _evaluate(
     coverage: Tensor | None,
     content_weight: float,
 ) -> SosResult:
-    """The job's loss of a picture by a network."""
+    """Return the job's loss of an image by a given network."""
     settings = job.settings
     loss = SosLoss(
         network,

@@ -1,4 +1,4 @@
-"""Hard cases of the views: sizes, fields of view, and scenes of which nothing is seen."""
+"""Hard cases of views: sizes, fields of view, and views that see nothing."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from sgsst_core.scene.gaussians import Scene
 
 _IMAGE = "image, coverage, gradient against float64"
 _LOSS = "loss and pixel gradient, relative to float64"
-#: Python and caches grow by themselves; what is asked for here would be tens of gigabytes.
+#: Bound on memory growth. Python and caches grow by themselves; the refused allocation would be tens of gigabytes.
 _SMALL_MEMORY = 300 << 20
 
 
 def cases() -> list[Case]:
-    """All cases of this group."""
+    """Return all cases of this group."""
     sizes = [(1, 1), (15, 17), (16, 16), (17, 16), (31, 33), (1, 333), (333, 1), (4096, 16)]
     found = [Case(f"{w} x {h} pixels, rendered", "views", _IMAGE, partial(_size, w, h)) for w, h in sizes]
     sizes = [(1, 1), (15, 17), (16, 16), (3, 200), (33, 47), (4096, 16)]
@@ -56,14 +56,17 @@ def _size(width: int, height: int, full: bool) -> CaseResult:
 
 
 def _stylized_size(width: int, height: int, full: bool) -> CaseResult:
-    """Layers without a cell are left out of the loss. A long view is cut short where the test is to be quick."""
+    """Check the loss of a view of this size; layers without a cell do not count. Quick runs shorten long views."""
     width = width if full else min(width, 512)
     image, style, content = texture(height, width, 1), texture(40, 32, 2), texture(height, width, 3)
     return compare_losses(image, style, content, untiled=min(width, height) >= 16)
 
 
 def _field_of_view(degrees: float) -> tuple[Scene, Camera]:
-    """A focal length of a thousandth of the width at 179.9 degrees: almost everything lies at the border."""
+    """Return a scene and a camera with the given field of view.
+
+    At 179.9 degrees the focal length is a thousandth of the width, so almost everything lies at the border.
+    """
     view = camera()
     return ordinary(300, seed=1), camera(focal=view.width / 2 / math.tan(math.radians(degrees) / 2))
 
@@ -102,7 +105,7 @@ _VIEWS: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 
 
 def _blind(full: bool) -> CaseResult:
-    """A view of nothing is left out; if all are, that is an error that says so."""
+    """Check that views that see nothing are left out, and that a clear error is raised if all are."""
     scene = repeated(5)
     behind = replace(camera(), name="blind", world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1]).double()))
     rasterizer = make_rasterizer("cpu", scene)
@@ -116,12 +119,15 @@ def _blind(full: bool) -> CaseResult:
 
 
 def _too_many_intersections(full: bool) -> CaseResult:
-    """2100 Gaussians over all of 1024 x 1024 raster tiles."""
+    """Check that 2100 Gaussians, each over all 1024 x 1024 raster tiles, are refused."""
     return _refused(repeated(2100, scale=50.0), camera(16384, 16384, focal=8000.0))
 
 
 def _too_much_memory(full: bool) -> CaseResult:
-    """Few enough to be addressed, too many for what is free; nothing where more than 40 GB are free."""
+    """Check that intersections that can be addressed but exceed the free memory are refused.
+
+    On machines with more than 40 GB of free memory, nothing is checked.
+    """
     view = camera(16384, 16384, focal=8000.0)
     fitting = 2**31 // 1024**2 - 8
     if psutil.virtual_memory().available > 20 * fitting * 1024**2:

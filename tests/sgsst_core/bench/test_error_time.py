@@ -1,4 +1,4 @@
-"""Variants with the same time budget, judged by one loss."""
+"""Tests of the comparison of variants with the same time budget by one loss."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_variants_run_and_are_judged_at_the_same_moments(tiny_weights: BackboneW
         assert set(curve.points[-1].by_scale) == {0, 1}
         assert curve.sh_dc is not None
         assert curve.sh_dc.shape == scene.sh_dc.shape
-    assert curves[0].points[-1].relative < 0.9  # it optimizes what it is judged by
+    assert curves[0].points[-1].relative < 0.9  # it optimizes the loss it is evaluated with
     write_plot(tmp_path / "p.png", curves, "a wall")
     assert Image.open(tmp_path / "p.png").width > 800
     values = json.loads(json.dumps(as_dict(curves)))
@@ -51,7 +51,7 @@ def test_variants_run_and_are_judged_at_the_same_moments(tiny_weights: BackboneW
 def test_other_style_losses_are_judged_by_the_same_one(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The paper's, even where all variants optimize another one."""
+    """Variants are evaluated with the paper's loss, even if all of them optimize another one."""
     found: list[Evaluation] = []
     evaluate = ExactTwin.evaluate
 

@@ -1,4 +1,4 @@
-"""Variants judged by a network that none of them optimizes."""
+"""Tests of the comparison of variants by a network that none of them optimizes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def quality(tiny_weights: BackboneWeights, vgg16_weights: object) -> Quality:
-    """AlexNet comes with VGG16's weights."""
+    """Compare three variants; AlexNet comes with VGG16's weights."""
     variants = choose_variants(["standard", "one-scale", "tf32"])
     views = cameras(3, 96, 72)
     return compare_quality(wall(), views, style(), variants, 1.0, weights=tiny_weights, coarsest_side=36)
@@ -31,7 +31,7 @@ def test_variants_stand_beside_the_scene_and_the_transfer(quality: Quality) -> N
     before, transfer, *variants = quality.outcomes
     assert (before.name, transfer.name) == (UNSTYLIZED, TRANSFER)
     assert [outcome.name for outcome in variants] == ["standard", "one-scale"]
-    assert [curve.variant.name for curve in quality.curves if curve.left_out] == ["tf32"]  # there is no GPU for it
+    assert [curve.variant.name for curve in quality.curves if curve.left_out] == ["tf32"]  # needs a GPU
     assert before.judgment.content == 0
     assert transfer.judgment.color_distance < before.judgment.color_distance
     for outcome in variants:
@@ -53,7 +53,7 @@ def test_the_front_holds_what_nothing_beats_in_style_and_content(quality: Qualit
         return replace(quality.outcomes[0], name=name, judgment=judgment)
 
     outcomes = [
-        outcome(UNSTYLIZED, 2.0, 0.0),  # is no result
+        outcome(UNSTYLIZED, 2.0, 0.0),  # does not count as a result
         outcome("a", 1.0, 0.5),
         outcome("b", 0.8, 0.6),
         outcome("beaten", 1.1, 0.55),
@@ -67,7 +67,7 @@ def test_pictures_are_written(quality: Quality, tmp_path: Path) -> None:
     write_sheet(tmp_path / "q.jpg", quality)
     assert Image.open(tmp_path / "q.png").width > 600
     sheet = Image.open(tmp_path / "q.jpg")
-    assert sheet.height > 4 * 300  # the style, and four rows
+    assert sheet.height > 4 * 300  # style and four rows
     on_white = quality.judge.pictures(torch.zeros_like(wall().sh_dc), quality.judge.cameras[0])[1]
     assert on_white.shape == (72, 96, 3)
 

@@ -33,7 +33,7 @@ TORCHVISION_VGG16 = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
 
 
 def random_vgg(name: str, seed: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
-    """Random convolutions (He initialization) of a network on ImageNet-normalized RGB."""
+    """Return random convolutions (He initialization) of a network for ImageNet-normalized RGB."""
     generator = torch.Generator().manual_seed(seed)
     layers = {}
     for layer, (width, channels) in sources.convolution_shapes(name).items():
@@ -50,10 +50,10 @@ def torchvision_state(layers: dict[str, tuple[Tensor, Tensor]], positions: list[
 
 
 def caffe_state(layers: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-    """The same network as `vgg_conv.pth` would hold it: input B, G, R of 0-255 minus Caffe's mean.
+    """Return the same network as stored in `vgg_conv.pth`, for input B, G, R of 0 to 255 minus Caffe's mean.
 
-    (x - mean)/std * kappa = (255 x - caffe) * a + b with a = kappa / (255 std): a goes into conv1_1's weights, b
-    into its bias. The latter holds only where no zero padding mixes in, hence `features` without padding.
+    (x - mean)/std * kappa = (255 x - caffe) * a + b with a = kappa / (255 std): a goes into conv1_1's weights, b into
+    its bias. The bias is only exact away from zero padding, hence `features` without padding.
     """
     std, mean = torch.tensor(sources.IMAGENET_STD).double(), torch.tensor(sources.IMAGENET_MEAN).double()
     caffe = torch.tensor(sources.CAFFE_MEAN).double()
@@ -70,7 +70,7 @@ def caffe_state(layers: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
 
 
 def features(weights: BackboneWeights, rgb: Tensor, padding: int = 1) -> list[Tensor]:
-    """Outputs of every ReLU in float64."""
+    """Return the outputs of every ReLU in float64."""
     x = (rgb.double() * weights.input_scale + weights.input_shift).permute(2, 0, 1)[None]
     outputs, block = [], "1"
     for layer, (weight, bias) in weights.convolutions.items():
@@ -83,7 +83,7 @@ def features(weights: BackboneWeights, rgb: Tensor, padding: int = 1) -> list[Te
 
 @pytest.fixture(scope="module")
 def vgg19_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache folder with random VGG19 weights, installed from a torchvision state dict. Not to be changed."""
+    """Return a cache folder with random VGG19 weights, installed from a torchvision state dict. Read-only."""
     folder = tmp_path_factory.mktemp("cache")
     file = folder / "torchvision.pth"
     torch.save(torchvision_state(random_vgg("vgg19"), TORCHVISION_VGG19), file)
@@ -93,7 +93,7 @@ def vgg19_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def vgg16_folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
-    """A copy of the real VGG16 that a test may damage."""
+    """Return a copy of the real VGG16 that a test may damage."""
     shutil.copy(cache_folder() / "vgg16.safetensors", tmp_path)
     return tmp_path
 
@@ -158,7 +158,7 @@ def test_a_network_of_other_channels_keeps_them(tiny_weights: BackboneWeights, t
         assert torch.equal(found.convolutions[layer][1], bias)
     network = FeatureNetwork(found, ("relu1_1", "relu5_1"))
     assert [network.channels(layer) for layer in network.layers] == [16, 16]
-    for pixels in (16, 8):  # the second is too small for relu5_1
+    for pixels in (16, 8):  # the smaller one is too small for relu5_1
         features = network.forward(torch.zeros(pixels, pixels, 3)).features
         assert features["relu5_1"].shape == (pixels // 16, pixels // 16, 16)
 
@@ -170,10 +170,10 @@ def test_auto_prefers_vgg19(vgg19_folder: Path, vgg16_folder: Path) -> None:
 
 
 def test_real_vgg16_sees_its_input_as_trained(vgg16_weights: BackboneWeights) -> None:
-    """Facts that hold for torchvision's VGG16 only, and features that are alive down to the deepest layer."""
+    """Known values of torchvision's VGG16 are found, and its features are nonzero in all layers."""
     assert list(vgg16_weights.convolutions) == list(sources.convolution_shapes("vgg16"))
     weight, bias = vgg16_weights.convolutions["conv1_1"]
-    # The first values of torchvision's vgg16-397923af features.0.weight[0, 0] and features.0.bias.
+    # First values of features.0.weight[0, 0] and features.0.bias in torchvision's vgg16-397923af.
     expected = torch.tensor([[-0.5537, 0.1427, 0.5290], [-0.5831, 0.3566, 0.7657], [-0.6902, -0.0480, 0.4841]])
     torch.testing.assert_close(weight[0, 0], expected, rtol=0, atol=6e-5)
     torch.testing.assert_close(bias[:3] / sources.KAPPA, torch.tensor([0.4034, 0.3778, 0.4644]), rtol=0, atol=6e-5)
@@ -189,7 +189,7 @@ def test_perceptual_weights_are_complete(vgg16_weights: BackboneWeights) -> None
     assert alex["conv5.bias"].shape == (256,)
     assert [heads[f"linear{i}.weight"].numel() for i in range(1, 6)] == [64, 128, 256, 512, 512]
     for tensors in (alex, heads):
-        # LPIPS clamps its heads at 0 in training: distances cannot be negative.
+        # LPIPS clamps its heads at 0 in training, so distances cannot be negative.
         assert all(bool((tensors[f"linear{i}.weight"] >= 0).all()) for i in range(1, 6))
     # LPIPS takes -1..1, shifts by (-.030, -.088, -.188) and divides by (.458, .448, .450).
     rgb = torch.tensor([0.1, 0.5, 0.9])
@@ -279,7 +279,7 @@ def test_wrong_state_dicts_are_refused(tmp_path: Path) -> None:
 
 
 class _RunsCode:
-    """Unpickled without restriction, it would create a file."""
+    """Object that creates a file when it is unpickled without restrictions."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -329,7 +329,7 @@ def test_fetch_keeps_what_is_installed_and_sound(vgg16_weights: BackboneWeights)
 
 
 def test_unreachable_download_says_how_to_do_without(tmp_path: Path) -> None:
-    """In a process of its own, whose proxy refuses connections."""
+    """The command runs in a process whose proxy refuses connections."""
     code = (
         "import pathlib, sys\n"
         "from sgsst_core.errors import WeightsError\n"

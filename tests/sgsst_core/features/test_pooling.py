@@ -1,4 +1,4 @@
-"""The compiled pool and its backward pass against PyTorch's operations, to the bit."""
+"""Tests that the compiled pool and its backward pass are bit-identical to PyTorch's operations."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from torch import Tensor
 from sgsst_core.features.pooling import max_pool, max_pool_backward, max_pool_backward_reference, relu_backward
 
 DTYPES = [torch.float32, torch.float64, torch.bfloat16]
-#: Even and odd, a single window, and fewer pixels than one.
+#: Even and odd sides, a single window, and less than one window.
 SIZES = [(12, 10), (13, 11), (2, 2), (3, 2), (1, 5)]
 
 
 def relu_output(height: int, width: int, dtype: torch.dtype, *, levels: int = 0) -> Tensor:
-    """[1, 24, h, w], channels last; of few levels, most windows have equal maxima, and some nothing above 0."""
+    """Return a ReLU output [1, 24, h, w], channels last.
+
+    With few levels, most windows have ties, and some are all 0.
+    """
     values = torch.randn((1, height, width, 24), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     if levels:
         values = (values * levels).round()
@@ -51,7 +54,7 @@ def test_negative_zeros_and_infinities_are_compared_as_numbers(dtype: torch.dtyp
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_not_a_number_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
-    """So that a network that was given one does not hide it; processors make it with either sign."""
+    """NaN of either sign, as processors make them, must not be hidden by the pool."""
     source = relu_output(2, 2, dtype)
     source[0, 5, 1, 0] = torch.copysign(torch.tensor(torch.nan, dtype=dtype), torch.tensor(sign, dtype=dtype))
     assert bool(torch.signbit(source[0, 5, 1, 0])) == (sign < 0)

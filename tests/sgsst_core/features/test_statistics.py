@@ -17,7 +17,7 @@ from sgsst_core.features.statistics import (
 
 
 def features(height=40, width=50, channels=24, *, ratio=1.0, dtype=torch.float64, seed=0):
-    """Features [h, w, c] whose mean is `ratio` times their standard deviation."""
+    """Return features [h, w, c] whose mean is `ratio` times their standard deviation."""
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn((height, width, channels), generator=generator, dtype=torch.float64)
     return (noise + ratio).to(dtype)
@@ -84,7 +84,7 @@ def test_half_precision_features_are_summed_in_float32():
 
 
 def test_a_shift_that_lies_far_from_the_mean_is_replaced():
-    """Every place that the sample looks at is an outlier: about it, three digits of the variance would cancel."""
+    """If all sampled positions are outliers, a shift from them would cost three digits of the variance."""
     x = features(1024, 1000, 2, dtype=torch.float32)
     x[:, 0] = 1e3
     shift = _shift(x, None)
@@ -95,7 +95,7 @@ def test_a_shift_that_lies_far_from_the_mean_is_replaced():
 
 @pytest.mark.parametrize("height", [40, 700])
 def test_shift_of_a_small_covered_part(height):
-    """Uncovered features far away from covered ones, which a sample of all positions would hardly hold."""
+    """The shift must come from covered features, which a sample of all positions would hardly contain."""
     x = features(height, 50, 8, dtype=torch.float32)
     covered = torch.zeros(x.shape[:2])
     covered[7:9, 11:14] = 0.5

@@ -1,4 +1,4 @@
-"""The feature network's passes: layout, what is kept, and what holds around them on a GPU."""
+"""Tests of the feature network's passes: memory layout, kept activations, and flags on a GPU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sgsst_core.features import pooling, vgg
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
 
-CUDA = torch.device("cuda")  # a name: nothing here needs one
+CUDA = torch.device("cuda")  # only a name: no test needs a GPU
 CUDNN: Any = torch.backends.cudnn
 SIZE = (50, 37)
 
@@ -28,7 +28,7 @@ def picture() -> Tensor:
 
 
 def add(layer: str, features: Tensor, gradient: Tensor) -> None:
-    """Of the mean square of all reported features."""
+    """Add the gradient of the mean square of all reported features, up to a factor."""
     gradient += features / features.numel()
 
 
@@ -37,7 +37,7 @@ def pixel_gradient(network: FeatureNetwork) -> Tensor:
 
 
 class Watched(FeatureNetwork):
-    """Notes the flags and layouts that its convolutions see."""
+    """Network that records the flags and layouts its convolutions see."""
 
     def note(self, *tensors: Tensor) -> None:
         self.flags.add((CUDNN.conv.fp32_precision, CUDNN.benchmark))
@@ -61,7 +61,7 @@ class Watched(FeatureNetwork):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_every_convolution_has_channels_last(tiny_weights: BackboneWeights, dtype: torch.dtype) -> None:
-    """So that none of them copies what it is given: not behind a ReLU's or a pool's backward pass either."""
+    """No convolution needs to copy its input, not even after a ReLU's or a pool's backward pass."""
     network = Watched(tiny_weights, dtype=dtype)
     pixel_gradient(network)
     count = sum(isinstance(step, vgg._Convolution) for step in network._steps)
@@ -89,7 +89,7 @@ def on_a_gpu(device: torch.device, **flags: bool) -> contextlib.AbstractContextM
 def test_flags_hold_in_the_network_alone(
     tiny_weights: BackboneWeights, tf32: bool, search: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The network computes on the CPU here, and takes itself to be on a GPU for the flags."""
+    """The network runs on the CPU, but sets the flags as on a GPU."""
     use_whole_float32()
     network = Watched(tiny_weights, tf32=tf32)
     network.search = search
@@ -103,7 +103,7 @@ def test_flags_hold_in_the_network_alone(
 
 
 def test_statistics_are_summed_in_whole_float32(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loss is asked for in the middle of the backward pass."""
+    """The callback runs in the middle of the backward pass."""
     use_whole_float32()
     monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
     network = FeatureNetwork(tiny_weights, tf32=True)
@@ -177,7 +177,7 @@ def in_planes(*arguments: Any) -> Tensor:
 
 @contextmanager
 def operator_on_cpu(does: Callable[..., Tensor]) -> Iterator[list[int]]:
-    """cuDNN's operator on the CPU, made of its parts; the list has a member for each call."""
+    """Emulate cuDNN's operator on the CPU. Yields a list with one entry per call."""
     calls: list[int] = []
 
     def counted(*arguments: Any) -> Tensor:
@@ -193,7 +193,7 @@ def operator_on_cpu(does: Callable[..., Tensor]) -> Iterator[list[int]]:
 
 
 def fuse(network: FeatureNetwork) -> set[bool]:
-    """Fuse what a try shows to work, as at the construction of a network on a GPU."""
+    """Fuse the convolutions that pass a trial, as a network on a GPU does when it is constructed."""
     steps = [step for step in network._steps if isinstance(step, vgg._Convolution)]
     for step in steps:
         step.fused = vgg._can_fuse(step)
@@ -233,7 +233,7 @@ def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, mon
 
 
 class Launches(TorchDispatchMode):
-    """Counts what computes: neither views nor empty memory."""
+    """Counter of operations that compute something, unlike views and uninitialized memory."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -246,7 +246,7 @@ class Launches(TorchDispatchMode):
 
 
 def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One for a convolution with its ReLU, one for a pool; backward two for each."""
+    """The forward pass has one launch per convolution with its ReLU and per pool, the backward pass two."""
     network = FeatureNetwork(tiny_weights, tf32=True)
     monkeypatch.setattr(pooling, "_is_compiled_for", lambda values: False)
     pools = sum(isinstance(step, vgg._Pool) for step in network._steps)
@@ -260,7 +260,7 @@ def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights, monkeypa
     assert forward.names == {
         "cudnn_convolution_relu": convolved,
         "max_pool2d_with_indices": pools,
-        "mul": 1,  # the input's normalization
+        "mul": 1,  # normalization of the input
         "add": 1,
     }
     assert backward.names == {
@@ -268,6 +268,6 @@ def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights, monkeypa
         "convolution": convolved,
         "max_pool2d_with_indices": pools,
         "max_pool2d_with_indices_backward": pools,
-        "zeros_like": 1,  # the deepest layer's gradient, to which the loss adds
+        "zeros_like": 1,  # gradient of the deepest layer, which the loss adds to
         "mul": 1,
     }

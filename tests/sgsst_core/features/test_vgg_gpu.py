@@ -1,4 +1,7 @@
-"""The feature network on a GPU against float64 on the CPU. Twins without one: test_vgg, test_precision, test_timing."""
+"""Tests of the feature network on a GPU against float64 on the CPU.
+
+Their counterparts without a GPU are in test_vgg, test_precision and test_timing.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ def add(layer: str, features: Tensor, gradient: Tensor) -> None:
 
 
 def difference(weights: BackboneWeights, dtype: torch.dtype = torch.float32, *, tf32: bool = False) -> Difference:
-    """Of the pixel gradient, to float64 on the CPU."""
+    """Compare the pixel gradient with that of float64 on the CPU."""
     use_whole_float32()
     image = picture(*SIZE)
     exact = FeatureNetwork(weights, dtype=torch.float64)

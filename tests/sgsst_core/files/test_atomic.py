@@ -1,4 +1,4 @@
-"""Output files appear whole or not at all."""
+"""Tests that output files are written completely or not at all."""
 
 from __future__ import annotations
 

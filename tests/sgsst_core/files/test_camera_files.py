@@ -1,4 +1,4 @@
-"""Every form of camera file gives the same cameras; what is wrong in one is named."""
+"""Tests that all formats of camera files give the same cameras, and that errors name what is wrong."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WIDTH, HEIGHT = 640, 480
 
 
 def views(count: int = 3) -> list[Camera]:
-    """Cameras in general position, focal 500, principal point in the middle."""
+    """Return cameras in general position, with focal length 500 and a centered principal point."""
     generator = torch.Generator().manual_seed(3)
     positions = torch.randn(count, 3, generator=generator, dtype=torch.float64) * 4
     up = torch.tensor([0.1, -1.0, 0.2], dtype=torch.float64)
@@ -68,7 +68,7 @@ def nerfstudio(cameras: list[Camera]) -> dict[str, Any]:
 
 
 def colmap(folder: Path, cameras: list[Camera], *, text: bool, model: str = "PINHOLE") -> Path:
-    """Write a sparse model without pycolmap's help, after COLMAP's "Output Format" page."""
+    """Write a sparse model without pycolmap, following COLMAP's "Output Format" page."""
     folder.mkdir(parents=True)
     number, values = {
         "SIMPLE_PINHOLE": (0, [500.0, WIDTH / 2, HEIGHT / 2]),
@@ -79,7 +79,7 @@ def colmap(folder: Path, cameras: list[Camera], *, text: bool, model: str = "PIN
     for view in cameras:
         x, y, z, w = pycolmap.Rotation3d(view.world_to_camera[:3, :3].numpy()).quat
         poses.append([w, x, y, z, *view.world_to_camera[:3, 3].tolist()])
-    order = list(reversed(range(len(cameras))))  # ids that are not in the order of the names
+    order = list(reversed(range(len(cameras))))  # ids are not in the order of the names
     if text:
         (folder / "cameras.txt").write_text(f"# cameras\n1 {model} {WIDTH} {HEIGHT} {' '.join(map(repr, values))}\n")
         lines = [f"{i + 1} {' '.join(repr(float(p)) for p in poses[i])} 1 {cameras[i].name}\n\n" for i in order]
@@ -164,7 +164,7 @@ def test_blender_with_a_broken_image(tmp_path: Path) -> None:
 
 
 def test_nerfstudio_training_frame(tmp_path: Path) -> None:
-    """A scene trained by nerfstudio is seen the same from cameras that were moved as nerfstudio moves them."""
+    """Cameras moved as by nerfstudio show a scene trained by nerfstudio in the same way."""
     cameras = views()
     content = nerfstudio(cameras)
     applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
@@ -327,7 +327,7 @@ def test_names_with_spaces_and_windows_line_ends(tmp_path: Path) -> None:
 
 
 def change(content: Any, key: str, value: Any) -> Any:
-    """The content of an INRIA or nerfstudio file with one value of its second camera replaced, or removed."""
+    """Replace or remove one value of the second camera in the content of an INRIA or nerfstudio file."""
     entry = (content if isinstance(content, list) else content["frames"])[1]
     if value is None:
         del entry[key]

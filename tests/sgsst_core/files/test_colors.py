@@ -1,4 +1,4 @@
-"""Colors alone as float16: what they lose is bounded."""
+"""Tests of the error bound of colors stored alone as float16."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images of every kind that users have become float32 RGB, and the broken ones one clear error."""
+"""Tests that images of every common kind become float32 RGB, and that broken ones give one clear error."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sgsst_core.scene.camera import Camera, resized
 
 
 def gradient(height: int = 6, width: int = 9) -> np.ndarray:
-    """[height, width, 3] uint8, every pixel different."""
+    """Return an image [height, width, 3] uint8 with all pixels different."""
     values = np.arange(height * width)
     return np.stack([values * 3 % 256, values * 5 % 256, 255 - values], axis=1).reshape(height, width, 3).astype("u1")
 
@@ -58,7 +58,7 @@ def test_exif_orientation_is_applied(tmp_path: Path, orientation: int) -> None:
     exif[0x0112] = orientation
     stored = gradient()
     path = save(tmp_path / "a.png", Image.fromarray(stored), exif=exif)
-    # TIFF 6.0, tag Orientation: which visual edges the stored first row and column are
+    # Visual edges of the stored first row and column, from TIFF 6.0, tag Orientation.
     shown = {
         1: stored,
         2: stored[:, ::-1],
@@ -138,7 +138,7 @@ def test_of_an_animation_the_first_frame_is_read(tmp_path: Path) -> None:
 
 
 def png_header(width: int, height: int) -> bytes:
-    """A PNG that declares any size and holds nothing."""
+    """Return a PNG that declares any size and contains no data."""
     size = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = [(b"IHDR", size), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -270,7 +270,7 @@ def test_photos_of_another_aspect_are_refused_early_and_late(tmp_path: Path) -> 
     for check in (lambda: check_photos(tmp_path, [camera("a")]), lambda: load_photo(path, camera("a"))):
         with pytest.raises(ImageError, match="is 93 x 60, but its camera 'a' 90 x 60, another aspect"):
             check()
-    # rounding of a small camera's sides is no other aspect
+    # The rounded sides of a small camera do not count as another aspect ratio.
     save(tmp_path / "b.png", Image.new("RGB", (990, 742)))
     check_photos(tmp_path, [resized(camera("b", 990, 742), 22)])
 

@@ -1,5 +1,6 @@
-"""Compressed PLY, SPZ and .splat: against gsply, which reads and writes the first two, against values by hand, and
-against files that lie.
+"""Tests of compressed PLY, SPZ and .splat: against gsply for the first two, and against hand-made values.
+
+Files with false headers and damaged content must be refused.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.splat_scenes import camera, cloud
 from tests.small_scenes import cameras, wall
 
-#: Half a turn about x, from a PLY's axes to SPZ's.
+#: Half a turn about x, from the axes of a PLY to those of SPZ.
 TURN = torch.tensor([1.0, -1.0, -1.0])
 FORMS: tuple[PackedForm, ...] = ("compressed.ply", "spz")
 
@@ -61,7 +62,7 @@ def gsply_of(scene: Scene) -> gsply.GSData:
 
 
 def turned(scene: Scene) -> Scene:
-    """The same Gaussians in SPZ's axes. Coefficients are found by looking: those that give the same colors."""
+    """Return the same Gaussians in SPZ's axes. SH coefficients are fitted to give the same colors."""
     turn = torch.diag(TURN.double())
     directions = torch.nn.functional.normalize(
         torch.randn(200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1
@@ -78,7 +79,7 @@ def turned(scene: Scene) -> Scene:
 
 
 def assert_close(found: Scene, expected: Scene, *, opacities: float = 1.1e-3, others: float = 3e-6) -> None:
-    """Equal but for rounding; rotations may have either sign, and no opacity is infinite."""
+    """Assert equality up to rounding, up to the sign of rotations, and with finite opacities."""
     for field in fields(Scene):
         first, second = getattr(found, field.name).double(), getattr(expected, field.name).double()
         tolerance = others
@@ -102,7 +103,7 @@ def test_compressed_ply_of_another_program_is_read_as_it_reads_it(tmp_path: Path
     assert read_scene_header(path).form == "compressed.ply"
     found, reference = read_scene(path), read_compressed(path)
     assert found.scene.sh_degree == degree
-    # its middle of the first and the last step of spherical harmonics is not the end
+    # gsply places the first and last level of SH coefficients in the middle of their steps instead of at the ends.
     expected = scene_of(reference)
     assert_close(replace(found.scene, sh_rest=expected.sh_rest), expected)
     rest = held(expected.sh_rest)
@@ -147,7 +148,7 @@ def test_spz_by_hand(tmp_path: Path, version: int) -> None:
     position = struct.pack("<3e", 1.5, -2, 0.25)
     if version > 1:
         position = b"".join(round(value * 4096).to_bytes(3, "little", signed=True) for value in (1.5, -2, 0.25))
-    # half a turn about an axis between x and y: w = 0.6, x = 0, y = 0.8, z = 0, and the sign of y turned
+    # Half a turn about an axis between x and y: w = 0.6, x = 0, y = 0.8, z = 0, and the sign of y inverted.
     rotation = bytes([128, 26, 128])
     if version == 3:
         packed = 1 << 30  # y is the largest; x, z and w follow
@@ -191,7 +192,7 @@ def test_full_and_no_opacity_are_finite_and_come_back(tmp_path: Path) -> None:
 
 
 def test_bounds_without_colors(tmp_path: Path) -> None:
-    """Older compressed PLYs have colors between 0 and 1."""
+    """Compressed PLYs of older versions have colors between 0 and 1."""
     path = tmp_path / "scene.ply"
     scene = replace(wall(), sh_dc=torch.zeros(616, 3))
     write_packed(path, scene, "compressed.ply")
@@ -226,7 +227,7 @@ def test_pictures_of_what_is_written_are_nearly_the_same(tmp_path: Path, form: P
 
 @pytest.mark.parametrize(("form", "bound"), [("compressed.ply", 48), ("spz", 53)])
 def test_a_real_scene_loses_little(shared_data: Path, tmp_path: Path, form: PackedForm, bound: float) -> None:
-    """The plush toy: 47,974 Gaussians of degree 3, trained from photos."""
+    """The plush toy has 47,974 Gaussians of degree 3, trained from photos."""
     folder = shared_data / "scenes" / "snowmiku_plush"
     scene = read_scene(next(folder.glob("*.ply"))).scene
     path = tmp_path / "plush"
@@ -238,7 +239,7 @@ def test_a_real_scene_loses_little(shared_data: Path, tmp_path: Path, form: Pack
 
 
 def test_the_loss_is_that_of_pictures(tmp_path: Path) -> None:
-    """By hand, of one view."""
+    """The PSNR of one view is computed by hand."""
     scene, view = wall(sh_degree=1), cameras(1)[0]
     path = tmp_path / "scene.spz"
     write_packed(path, replace(scene, sh_dc=scene.sh_dc + 0.3), "spz")
@@ -254,7 +255,7 @@ def test_the_loss_is_that_of_pictures(tmp_path: Path) -> None:
 
 
 def test_neighbors_share_bounds(tmp_path: Path) -> None:
-    """Whatever the order of the scene: an error of 1 in 1024 of the whole extent would be forty times larger."""
+    """Errors are small in any order of the scene; 1/1024 of the whole extent would be forty times larger."""
     scene = cloud(20_000)
     scene = scene.subset(torch.randperm(len(scene), generator=torch.Generator().manual_seed(1)))
     path = tmp_path / "scene.ply"
@@ -284,7 +285,7 @@ def test_a_position_that_spz_cannot_hold_is_an_error_and_leaves_nothing(tmp_path
 
 
 def test_a_float_ply_is_what_it_was(tmp_path: Path) -> None:
-    """The same bytes as plyfile writes."""
+    """The file is bit-identical to plyfile's."""
     scene, path, other = cloud(300, degree=2), tmp_path / "a.ply", tmp_path / "b.ply"
     write_scene(path, scene)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(24))]
@@ -429,7 +430,7 @@ def test_extensions_behind_the_data_are_passed_over(tmp_path: Path) -> None:
 
 
 def test_spz_4_streams_that_lie(tmp_path: Path) -> None:
-    """Streams that end early, go on, or are damaged, behind a table that is right."""
+    """Streams are truncated, too long or damaged, behind a correct table."""
     sections = [bytes(size) for size in (9, 1, 3, 3, 4)]
     for index, wrong, message in ((0, bytes(8), "ends before"), (2, bytes(1 << 27), "goes on"), (4, None, "damaged")):
         bodies = [zstandard.compress(section) for section in sections]
@@ -477,7 +478,7 @@ def test_forms_that_are_not_read_name_the_converter(tmp_path: Path, data: bytes,
 
 
 def test_random_changes_never_break_a_reader(tmp_path: Path) -> None:
-    """Whatever is wrong, it is a `SceneError` or a scene of finite values."""
+    """A damaged file gives a `SceneError` or a scene of finite values."""
     generator = np.random.default_rng(3)
     path = tmp_path / "scene"
     row = struct.pack("<6f8B", 1, 2, 3, 1, 1, 1, 0, 255, 51, 128, 255, 128, 128, 128)

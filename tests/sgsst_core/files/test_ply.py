@@ -1,4 +1,4 @@
-"""3DGS PLY files: read by plyfile and by a second reader written here, written back with nothing but f_dc changed."""
+"""Tests of 3DGS PLY files: read by plyfile and by a second reader in this file, and written with only f_dc changed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Rows = list[dict[str, Any]]
 
 @dataclass
 class File:
-    """A PLY file to be: elements as (name, properties as (type, name), rows); list types read "list uchar int"."""
+    """PLY file to write: elements as (name, properties as (type, name), rows); list types read "list uchar int"."""
 
     form: str
     elements: list[tuple[str, list[tuple[str, str]], Rows]]
@@ -63,7 +63,7 @@ class File:
 
 
 def second_reader(data: bytes) -> tuple[list[bytes], dict[str, Rows]]:
-    """Header lines and elements of any PLY without plyfile or numpy; as simple as it can be."""
+    """Read header lines and elements of any PLY without plyfile or numpy, as simply as possible."""
     newline = b"\r\n" if data.startswith(b"ply\r\n") else b"\n"
     head, _, body = data.partition(newline + b"end_header" + newline)
     lines = head.split(newline)
@@ -104,7 +104,7 @@ def f32(value: float) -> float:
 
 
 def simple(count: int = 3, degree: int = 0, form: str = "binary_little_endian", **changes: Any) -> File:
-    """A plain file with `count` Gaussians; `changes` replace rows' values by name."""
+    """Return a plain file with `count` Gaussians; `changes` replace values by name."""
     names = BASE + [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
     rows = [{name: f32(row + 0.01 * i) for i, name in enumerate(names)} | changes for row in range(count)]
     return File(form, [("vertex", [("float", name) for name in names], rows)])
@@ -118,7 +118,7 @@ def save(folder: Path, file: File | bytes) -> Path:
 
 @st.composite
 def files(draw: st.DrawFn) -> File:
-    """Any 3DGS PLY: degree, format, order, types, extra properties, elements around, comments of any bytes."""
+    """Draw any 3DGS PLY: degree, format, order, types, extra properties and elements, comments of any bytes."""
     form = draw(st.sampled_from(["ascii", "binary_little_endian", "binary_big_endian"]))
     degree = draw(st.integers(0, 3))
     names = BASE + [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
@@ -179,9 +179,9 @@ def test_any_3dgs_ply_comes_back_with_new_colors_and_nothing_else_changed(
             new, before = row[f"f_dc_{channel}"], old[f"f_dc_{channel}"]
             assert f32(new) == colors[index, channel]
             if (("double", f"f_dc_{channel}") in kinds) and f32(before) != colors[index, channel]:
-                assert new == float(colors[index, channel])  # doubles hold the color exactly, in text too
+                assert new == float(colors[index, channel])  # doubles hold the color exactly, in ASCII too
             if f32(before) == colors[index, channel]:
-                assert new == before  # a value that does not change keeps its double precision
+                assert new == before  # unchanged values keep their double precision
             old[f"f_dc_{channel}"] = new
     assert lines == expected_lines
     assert elements == expected_elements
@@ -463,7 +463,7 @@ def test_every_truncation_is_noticed(tmp_path: Path, form: str) -> None:
     file = simple(2, form=form)
     file.elements += [("face", [("list uchar int", "i"), ("float", "q")], [{"i": [1, 2], "q": 0.5}])]
     data = file.to_bytes()
-    # the last bytes of text are its closing blank and line end, and a shorter last number is a number too
+    # ASCII may lose its final space and newline, and a truncated last number is still a number.
     for stop in range(len(data) - (5 if form == "ascii" else 1)):
         with pytest.raises(SceneError):
             read_scene(save(tmp_path, data[:stop]))
@@ -507,7 +507,7 @@ def test_real_scenes_differ_in_their_colors_only(shared_data: Path, tmp_path: Pa
     start = before.index(b"end_header\n") + len(b"end_header\n")
     assert after[:start] == before[:start]
     assert len(after) == len(before)
-    # the second reader: colors by their place in the row, without plyfile or our own header parser
+    # Colors by their position in the row, read without plyfile and without the project's header parser.
     names = [line.split()[-1] for line in before[:start].split(b"\n") if line.startswith(b"property")]
     row = 4 * len(names)
     for index in (0, 1, len(old) // 2, len(old) - 1):

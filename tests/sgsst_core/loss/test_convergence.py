@@ -1,4 +1,4 @@
-"""When a run may end before its schedule."""
+"""Tests of early stopping."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_views_that_differ_do_not_look_like_convergence_or_its_absence() -> None
     falling = [views[step % 3] * math.exp(-0.01 * step) for step in range(120)]
     assert not has_converged(falling, 3)
     assert has_converged([views[step % 3] for step in range(60)], 3)
-    assert not has_converged([views[step % 3] for step in range(47)], 3)  # two windows of 24 are not yet there
+    assert not has_converged([views[step % 3] for step in range(47)], 3)  # less than two windows of 24
 
 
 def test_a_rising_loss_has_stopped_falling() -> None:

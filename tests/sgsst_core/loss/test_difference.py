@@ -1,4 +1,4 @@
-"""How far one gradient is from another."""
+"""Tests of the difference between two gradients."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from sgsst_core.loss.difference import Difference
         ([0.0, 0.0], [3.0, 4.0], 1.0, 0.0),
         ([1e-30, 0.0], [0.0, 0.0], 1.0, 0.0),
         ([0.0, 0.0], [0.0, 0.0], 0.0, 1.0),
-        ([1e-30, 0.0], [2e-30, 0.0], 0.5, 1.0),  # squares vanish in float32
-        ([1e30, 0.0], [2e30, 0.0], 0.5, 1.0),  # and overflow
+        ([1e-30, 0.0], [2e-30, 0.0], 0.5, 1.0),  # squares underflow in float32
+        ([1e30, 0.0], [2e30, 0.0], 0.5, 1.0),  # squares overflow
         ([math.nan, 0.0], [1.0, 0.0], math.inf, 0.0),
         ([math.inf, 0.0], [1.0, 0.0], math.inf, 0.0),
     ],

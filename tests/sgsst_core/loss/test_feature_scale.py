@@ -26,7 +26,7 @@ LAYERS = (*STYLE_LAYERS, CONTENT_LAYER)
 
 @pytest.fixture
 def trained_anew(tiny_weights: BackboneWeights) -> BackboneWeights:
-    """A network that takes its input otherwise than the original one."""
+    """Return a network whose input normalization differs from the original network's."""
     return replace(tiny_weights, input_scale=torch.tensor([250.0, 255.0, 260.0]))
 
 
@@ -46,7 +46,7 @@ def test_features_of_each_layer_are_its_factor_times_as_large(tiny_weights: Back
 
 
 def test_scales_of_the_paper_give_the_published_statistics(trained_anew: BackboneWeights) -> None:
-    """Recomputed in float64 by the feature network itself; two digits of a factor are up to 22 % of a statistic."""
+    """Statistics agree to 22 %, because the factors have two digits."""
     with Image.open(STARRY_NIGHT) as painting:
         small = painting.resize((512, 405), Image.Resampling.LANCZOS)
     picture = torch.from_numpy(np.array(small)).double() / 255
@@ -73,7 +73,7 @@ def test_even_scales_are_one_factor_but_for_the_layer_that_knows_colors(trained_
     assert {factor for layer, factor in scaled.scales.items() if layer not in ("relu1_1", PIXELS)} == {EVEN_SCALE}
     picture = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))
     before, after = features(trained_anew, picture), features(scaled, picture)
-    for layer in LAYERS:  # powers of two: exactly
+    for layer in LAYERS:  # exact, because factors are powers of two
         torch.testing.assert_close(after[layer], before[layer] * scaled.scales[layer], rtol=0, atol=0)
 
 

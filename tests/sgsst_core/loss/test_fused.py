@@ -1,4 +1,4 @@
-"""Statistics, style loss and its gradient by Triton kernels, against float64: on a GPU, else in the interpreter."""
+"""Tests of Triton kernels for statistics and style loss against float64, on a GPU or in the interpreter."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WEIGHTS = (terms.GRAM_WEIGHT, terms.MEAN_WEIGHT, terms.STD_WEIGHT)
 
 
 def features(height: int, width: int, channels: int, seed: int, mean: float = 0.0) -> Tensor:
-    """The inner part of a larger map, as a tile owns it, float32, with channels that depend on each other."""
+    """Return the inner part of a larger feature map, as a tile owns it, float32, with dependent channels."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn((height + 3, width + 2, channels), generator=generator)
     mixed = (x @ torch.randn((channels, channels), generator=generator) / channels**0.5).relu() + mean
@@ -28,7 +28,7 @@ def features(height: int, width: int, channels: int, seed: int, mean: float = 0.
 
 
 def position_weights(height: int, width: int) -> Tensor:
-    """Rows of 0, as beside a silhouette, and weights in 0..1."""
+    """Return weights in 0 to 1 with rows of 0, as beside a silhouette."""
     weights = torch.rand((height + 2, width), generator=torch.Generator().manual_seed(7))
     weights[:5] = 0
     return weights.to(DEVICE)[2:]
@@ -44,7 +44,7 @@ def on_cpu(statistics: LayerStatistics) -> LayerStatistics:
 
 
 def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tuple[Tensor, Tensor]:
-    """Terms [4] and gradient [h, w, c] of features x; it is added, and nothing around it is touched."""
+    """Return terms [4] and gradient [h, w, c]; the gradient is added, and its surroundings stay unchanged."""
     found, *maps = fused_style_loss(
         fused_statistics(x, weights), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23
     )
@@ -64,7 +64,7 @@ def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tu
     ("channels", "height", "width"), [(3, 70, 50), (16, 50, 40), (64, 150, 200), (128, 40, 33), (512, 9, 31)]
 )
 def test_agrees_with_float64(channels: int, height: int, width: int, weighted: bool) -> None:
-    """64 channels at this size are summed in more than one span."""
+    """With 64 channels, this size is summed in more than one span."""
     x = features(height, width, channels, seed=1)
     a = position_weights(height, width) if weighted else None
     found, exact = on_cpu(fused_statistics(x, a)), layer_statistics_reference(x.cpu(), None if a is None else a.cpu())
@@ -102,7 +102,10 @@ def test_survives_a_large_mean_to_sigma_ratio() -> None:
 
 
 def test_channels_that_differ_by_less_than_their_mean_is_rounded() -> None:
-    """Pixels of nearly one color, which have no Gram term: their map is about the mean as float32 has it."""
+    """Gradients are correct for pixels of nearly one color, which have no Gram term.
+
+    Their differences are below the rounding error of the mean, so features must be centered about the float32 mean.
+    """
     x = nearly_one_color()
     weights = terms.TermWeights(0.0, terms.MEAN_WEIGHT, terms.STD_WEIGHT)
     target = target_of(3)
@@ -150,7 +153,7 @@ def test_bfloat16_features_are_summed_in_float32() -> None:
     x = features(40, 60, 32, seed=3).bfloat16()
     exact = layer_statistics_reference(x.cpu())
     found = on_cpu(fused_statistics(x))
-    # In the interpreter products are whole; TF32, which a GPU takes for them, keeps three digits.
+    # In the interpreter, products are exact; on a GPU they use TF32, which keeps three digits.
     assert relative_error(found.centered, exact.centered) < (2e-3 if DEVICE == "cuda" else 3e-6)
     target = target_of(32)
     _, gradient = fused_gradient(x, None, target)
@@ -166,7 +169,7 @@ def test_repeats_to_the_bit() -> None:
 
 
 def test_a_map_made_by_kernels_is_applied_by_the_tensor_functions_too() -> None:
-    """Where features lie otherwise in memory than the kernels read them."""
+    """They are needed for features in another memory layout."""
     x, target = features(12, 14, 16, seed=5), target_of(16)
     _, *maps = fused_style_loss(fused_statistics(x), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)
     found = StyleGradient(maps[0].cpu(), maps[1].cpu(), maps[2].cpu()).apply(x.cpu())

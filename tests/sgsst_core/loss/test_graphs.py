@@ -1,4 +1,4 @@
-"""The loss from captured graphs against the loss kernel by kernel, on a pretend device: the same bits."""
+"""Tests that the loss from captured graphs is bit-identical to the loss kernel by kernel, on a simulated GPU."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def counts() -> Iterator[Counts]:
 
 @pytest.fixture
 def without_triton(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kernels of PyTorch alone, which need no interpreter."""
+    """Use PyTorch's kernels only, which need no interpreter."""
     leave_out_kernels(monkeypatch)
 
 
@@ -75,7 +75,7 @@ def assert_same(found: SosResult, expected: SosResult) -> None:
 def test_a_graph_gives_the_same_bits_for_every_view(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, weighted: bool
 ) -> None:
-    if not weighted:  # once is enough for the kernels in Triton, which take their time in the interpreter
+    if not weighted:  # once is enough for the Triton kernels, which are slow in the interpreter
         leave_out_kernels(monkeypatch)
     loss = make_loss(tiny_weights)
     style, views = style_of(loss), [view_of(loss, seed, weighted=weighted) for seed in (2, 3)]
@@ -89,10 +89,10 @@ def test_a_graph_gives_the_same_bits_for_every_view(
         if step >= FIRST_VISITS:
             assert not counts.waits
             assert not counts.copies
-            assert counts.launches.total() < 15  # one graph; image, content and coverage go in, values come out
+            assert counts.launches.total() < 15  # one graph; copies of image, content and coverage; the results
         assert_same(found, expected)
         results.append((found.values, expected.values))
-    for values, expected_values in results:  # later evaluations have not changed them
+    for values, expected_values in results:  # later evaluations must not change them
         assert values.cpu().equal(expected_values.cpu())
     assert graphs.problem is None
     assert loss.timer.read()["network"] > 0
@@ -122,7 +122,7 @@ def test_graphs_hold_the_search_for_nearest_vectors(
 
 @pytest.mark.usefixtures("without_triton")
 def test_every_kind_of_evaluation_has_a_graph_of_its_own(tiny_weights: BackboneWeights) -> None:
-    """Scales, scale of the image, and style targets; graphs whose turns come in between do not disturb each other."""
+    """Graphs differ by scales, image scale and style targets, and interleaved ones do not interfere."""
     loss = make_loss(tiny_weights)
     whole, other = style_of(loss), loss.style_targets(picture(60, 60, seed=7, dtype=torch.float32), (HEIGHT, WIDTH))
     content = image(8)
@@ -167,7 +167,7 @@ def test_what_cannot_be_captured_is_evaluated_as_ever(
     convolve = FeatureNetwork._convolve
 
     def waits(network: FeatureNetwork, x: Tensor, step: Any) -> Tensor:
-        assert float(x.amax()) < 1e9  # a look at the device, which no graph can hold
+        assert float(x.amax()) < 1e9  # reads from the device, which a graph cannot contain
         return convolve(network, x, step)
 
     monkeypatch.setattr(FeatureNetwork, "_convolve", waits)
@@ -202,7 +202,7 @@ def test_only_scales_of_one_tile_that_fit_twice_are_captured(
 
 @pytest.mark.usefixtures("without_triton")
 def test_a_view_without_its_content_is_not_captured(tiny_weights: BackboneWeights) -> None:
-    """Its features would be computed in every replay, of the view that was captured."""
+    """A graph would recompute the content features of the captured view in every replay."""
     loss = make_loss(tiny_weights)
     style, view = style_of(loss), loss.view_target(image(2), keep_content=False)
     graphs = LossGraphs(loss)

@@ -1,4 +1,4 @@
-"""Several style pictures as one style."""
+"""Tests of several style images as one style."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ def assert_same(found, wanted, **tolerances):
 
 
 def test_a_mixture_has_the_moments_of_all_positions_together():
-    """Pictures with as many positions as their weights say, as if they were one picture."""
+    """Images with positions in proportion to their weights have the moments of their union."""
     parts = [features(1, 40), features(2, 10, offset=0.3)]
     statistics = [layer_statistics_reference(part) for part in parts]
     mixed = mixed_target([LayerTarget.of(part) for part in statistics], normalized([4, 1]))
@@ -33,7 +33,7 @@ def test_a_mixture_has_the_moments_of_all_positions_together():
 
 
 def test_digits_do_not_cancel_at_large_means():
-    """Deviations of 1e-6 about means of 1e6: the second moment less the squared mean would have no digit left."""
+    """Deviations of 1e-6 about means of 1e6 would vanish in E[x^2] - mean^2."""
     targets = [
         LayerTarget(torch.eye(2).double(), torch.full((2,), 1e6).double(), torch.tensor(s, dtype=torch.float64))
         for s in ([1e-6, 0.0], [2e-6, 0.0])

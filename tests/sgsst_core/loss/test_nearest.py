@@ -1,4 +1,4 @@
-"""Nearest-neighbor feature matching against its definition, and where angles do not exist."""
+"""Tests of nearest-neighbor feature matching against its definition, and where angles do not exist."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def loss_of(
 
 
 def setting(height: int, width: int, *, covered: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Image, style, content and coverage."""
+    """Return image, style, content and coverage."""
     coverage = None
     if covered:
         coverage = (picture(height, width, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
@@ -55,7 +55,7 @@ def gradient_of(result: SosResult) -> Tensor:
 
 
 def features(positions: tuple[int, int], channels: tuple[int, ...], seed: int) -> dict[str, Tensor]:
-    """As a ReLU leaves them, float64; none of them is 0."""
+    """Return nonnegative float64 features, like a ReLU's output, without zero vectors."""
     generator = torch.Generator().manual_seed(seed)
     return {
         f"relu3_{place}": torch.randn((*positions, count), generator=generator, dtype=torch.float64).relu() + 0.01
@@ -149,7 +149,7 @@ def test_blocks_of_any_size_find_the_same(
     found = Matches.of(own, vectors, EPS, a)
     assert float(found.distance(a) / count) == pytest.approx(expected.item(), rel=1e-12)
     for layer, part in own.items():
-        gradient = torch.ones_like(part)  # it is added
+        gradient = torch.ones_like(part)  # the gradient is added
         found.add_gradient(gradient, part, layer, vectors, 1 / count, a)
         assert relative_error(gradient - 1, wanted[layer]) < 1e-12
 
@@ -164,7 +164,7 @@ def test_the_first_of_equally_near_vectors_counts(monkeypatch: pytest.MonkeyPatc
 
 
 def test_features_of_no_length_have_no_angle() -> None:
-    """They count as far from everything, and nothing pulls at them; those that are mere rounding likewise."""
+    """Zero vectors, and vectors of rounding size, count as far from everything and get no gradient."""
     own, style = features((3, 4), (6, 4), 1), features((2, 2), (6, 4), 2)
     for part in own.values():
         part[0] = 0
@@ -192,7 +192,7 @@ def test_a_style_of_no_length_pulls_at_nothing() -> None:
 
 
 def test_what_is_no_number_does_not_look_like_one() -> None:
-    """A run that diverges is stopped by its gradient."""
+    """NaN reaches the gradient, which stops a run that diverges."""
     own, style = features((3, 4), (6,), 1), features((2, 2), (6,), 2)
     own["relu3_1"][1, 2, 3] = torch.nan
     vectors = vectors_of(style)
@@ -212,7 +212,7 @@ def test_uncovered_positions_do_not_count(tiny_weights: BackboneWeights, style_l
     assert gradient_of(nothing).abs().max() == 0
     coverage[:32] = 1
     other = image.clone()
-    other[80:] = 0  # beyond what features of covered cells see
+    other[80:] = 0  # outside the receptive field of covered cells
     lean = loss_of(tiny_weights, "nnfm")
     results = [evaluate(lean, (each, style, content, coverage)) for each in (image, other)]
     assert results[0].terms[0]["nearest"] == results[1].terms[0]["nearest"] > 0
@@ -247,9 +247,9 @@ def test_large_styles_are_thinned_evenly() -> None:
     assert len(places) == 5000
     assert (places.diff() >= 0).all()
     assert 0 <= int(places[0]) <= int(places[-1]) < 700_000
-    for count, most in ((places // 700, 1000), (places % 700, 700)):  # rows and columns alike
+    for count, most in ((places // 700, 1000), (places % 700, 700)):  # rows and columns are both uniform
         assert torch.histc(count.double(), 10, 0, most).sub(500).abs().max() < 25
-    # Fewer than two for each: all of them in range, few twice.
+    # With fewer than two positions per sample, all are in range and few repeat.
     assert len(chosen_places(6001, 6000).unique()) > 4000
 
 

@@ -1,4 +1,4 @@
-"""The loss of several regions, each with its own style."""
+"""Tests of the loss of several regions, each with its own style."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ SIZE = (112, 150)
 
 
 def shares(size, count):
-    """Maps of some regions and of what belongs to none: they add up to 1. The first ones have borders."""
+    """Return maps of some regions, which add up to 1 with another background; the first ones have hard borders."""
     raw = torch.stack([picture(*size, seed=10 + number)[:, :, 0] ** 4 for number in range(count + 1)])
     raw[0, :, size[1] // 2 :] = 0
     raw[1, : size[0] // 2] = 0
@@ -80,7 +80,7 @@ def test_the_order_of_regions_does_not_matter(tiny_weights, case):
 
 
 def test_one_region_of_everything_is_a_view_without_regions(tiny_weights, case):
-    """To the bit: the same statistics with the same position weights."""
+    """Results are bit-identical: same statistics, same position weights."""
     image, content, styles, maps, _ = case
     network = FeatureNetwork(tiny_weights)
     loss = SosLoss(network, coarsest=60)
@@ -113,7 +113,7 @@ def test_weights_scale_the_style_terms_alone(tiny_weights, case):
 
 
 def test_statistics_of_two_regions_together_are_merged_statistics():
-    """What holds exactly of a union: its map is the sum of both, and its moments are theirs, merged."""
+    """The union's map is the sum of both, and its moments are theirs, merged."""
     features = torch.rand(9, 13, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     first, second = shares((9, 13), 2)
     whole = layer_statistics(features, first + second)

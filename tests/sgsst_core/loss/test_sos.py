@@ -1,4 +1,4 @@
-"""The SOS gradient of any partition against the untiled autograd reference."""
+"""Tests of the SOS gradient for any partition against the untiled autograd reference."""
 
 from dataclasses import replace
 
@@ -14,13 +14,13 @@ from sgsst_core.scene.pyramid import scale_count, style_size
 from tests.networks import comparing_pixels
 from tests.sgsst_core.pictures import picture, relative_error
 
-#: Gradients below agree to these: float64 against the reference; float32 tiled against float32 whole.
+#: Tolerances of gradients: float64 against the reference; float32 tiled against float32 untiled.
 FLOAT64_TOLERANCE = 1e-9
 FLOAT32_TOLERANCE = 1e-5
 
 
 def setting(size, *, covered=False):
-    """(image, style, content, coverage) for views of a size, float64."""
+    """Return (image, style, content, coverage) for views of a size, float64."""
     image, content = picture(*size, seed=1), picture(*size, seed=2)
     style = resize_area(picture(600, 500, seed=3) ** 2, style_size((600, 500), size))
     coverage = None
@@ -57,7 +57,7 @@ def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, gray
 
 
 def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny_weights):
-    """Alone, the loss is that of means and deviations of 0-256 values, times the square of their factor."""
+    """The pixel loss is that of means and deviations of 0-256 values, times the squared factor."""
     weights = comparing_pixels(tiny_weights, 3.0)
     network = FeatureNetwork(weights, (PIXELS, "relu1_1"))
     loss = SosLoss(network, content_weight=0)
@@ -117,7 +117,7 @@ def test_float32_does_not_depend_on_the_partition(tiny_weights, size, tile_sizes
 
 
 class DecisionsOf(FeatureNetwork):
-    """A float64 network that back-propagates through the ReLU masks and pool positions that float32 arrived at."""
+    """Float64 network that back-propagates through the ReLU masks and pool positions of a float32 network."""
 
     def __init__(self, weights, other: FeatureNetwork):
         super().__init__(weights, dtype=torch.float64)
@@ -154,7 +154,7 @@ def test_float32_differs_from_float64_by_flips_and_little_else(vgg16_weights):
 
 @pytest.mark.parametrize("held", [0, 1.5])
 def test_memory_budget_changes_no_result(tiny_weights, held):
-    """Nothing kept, or some tiles (memory for 1.5 times the pixels): second forwards give the same gradient."""
+    """Recomputed forward passes give the same gradient, for no kept tile and for some."""
     network = FeatureNetwork(tiny_weights)
     case = setting((200, 330))
     whole = evaluate(network, case, None, memory=1 << 34)
@@ -175,7 +175,7 @@ def test_content_features_kept_or_computed_again(tiny_weights):
 
 
 def test_left_out_content_and_layers(tiny_weights):
-    """Without content weight the content layer is not needed; deeper layers than the deepest used are not computed."""
+    """Without content weight, the content layer and layers beyond the deepest used one are not computed."""
     image, style, content, _ = (None if t is None else t.float() for t in setting((200, 300)))
     full = SosLoss(FeatureNetwork(tiny_weights, (*STYLE_LAYERS, CONTENT_LAYER)), content_weight=0)
     lean = SosLoss(FeatureNetwork(tiny_weights, STYLE_LAYERS), content_weight=0)
@@ -206,7 +206,7 @@ def test_tiny_views_use_the_layers_that_they_reach(tiny_weights, size):
 
 
 def test_uncovered_pixels_get_no_gradient_of_their_own(tiny_weights):
-    """Beyond the receptive field of every covered cell, nothing pulls at a pixel."""
+    """Pixels beyond the receptive field of every covered cell have zero gradient."""
     size = (400, 300)
     coverage = torch.zeros(size)
     coverage[:64] = 1

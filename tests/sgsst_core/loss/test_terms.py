@@ -26,7 +26,7 @@ def make_features(height, width, channels, seed, dtype=torch.float64):
 
 
 def autograd_style(x, target, weights):
-    """Style loss by its definition, gradient by autograd."""
+    """Return the style loss from its definition, and its gradient by autograd."""
     x = x.double().clone().requires_grad_()
     loss = style_loss_reference(x, target, weights)
     return loss.item(), torch.autograd.grad(loss, x)[0]
@@ -67,7 +67,7 @@ def test_dead_channels_give_finite_gradients(dead_in):
 
 
 def test_a_map_about_the_rounded_mean_is_the_same_map():
-    """Where features differ by less than float32 rounds their mean, as pixels of nearly one color do."""
+    """It matters if features differ by less than the rounding error of their mean, as in pixels of nearly one color."""
     x, target = nearly_one_color(), LayerTarget.of(layer_statistics(make_features(30, 20, 3, 2)))
     _, gradient = style_loss(layer_statistics(x), target, weights=TermWeights(gram=0.0))
     exact = gradient.apply(x.double())
@@ -111,7 +111,7 @@ def test_without_any_position_loss_and_gradient_are_nothing():
 
 
 def test_terms_are_added_up_in_their_order_to_the_bit():
-    """An exact sum (of `math.fsum`, or of `sum` in later versions of Python) has another last digit."""
+    """An exact sum (`math.fsum`, or `sum` in later versions of Python) has another last digit."""
     terms = LossTerms(content=3.0, std=1e16, mean=1.0, gram=1.0)
     assert list(terms) == list(TERMS)
     assert terms.total == ((1.0 + 1.0) + 1e16) + 3.0 == 1e16 + 4
@@ -144,7 +144,7 @@ def test_a_term_that_is_not_declared_is_refused():
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("columns", [slice(None), slice(3, 120)])
 def test_style_gradient_is_added_block_by_block(dtype, weighted, columns):
-    """To whole rows, or to those of a partition tile's middle, beside which nothing is touched."""
+    """Blocks are whole rows, or those of a partition tile's inner rectangle; the surroundings stay unchanged."""
     x = make_features(90, 130, 40, 1).to(dtype)
     a = torch.rand((90, 130), generator=torch.Generator().manual_seed(3)) if weighted else None
     random = torch.randn((42, 40), generator=torch.Generator().manual_seed(4), dtype=torch.float64)

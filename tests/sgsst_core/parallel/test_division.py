@@ -1,4 +1,4 @@
-"""Work shared out among ranks: nothing twice, nothing forgotten, and as even as 16-pixel edges allow."""
+"""Tests of the division of work among ranks: complete, without overlap, and as even as 16-pixel edges allow."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_faster_ranks_get_more() -> None:
 
 def test_ranks_without_work_have_no_pieces() -> None:
     shares = divide(view(15, 17, 1), HALO, (1.0,) * 4)
-    assert sorted(map(len, shares)) == [0, 0, 0, 1]  # cut in two, both parts would be all halo
+    assert sorted(map(len, shares)) == [0, 0, 0, 1]  # split in two, each half would be all halo
     nothing = (Piece(0, (480, 640), Rectangle(0, 0, 0, 0)),)
     assert sum(loads(divide(nothing, HALO, (1.0, 1.0)), HALO)) == 0
 

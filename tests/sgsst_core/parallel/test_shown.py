@@ -1,4 +1,4 @@
-"""Sets of Gaussians, one bit each."""
+"""Tests of sets of Gaussians, stored as one bit each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every decision on made-up probes: nothing is rendered, timed or looked up here."""
+"""Tests of every decision on synthetic probes, without rendering or timing anything."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ GIGABYTE = 10**9
 
 
 def probe(**changes: Any) -> Probe:
-    """Four views of a scene of six Gaussians that fills them, on a CPU with 10 GB; changes: to fields of any part."""
+    """Return a probe of four views filled by six Gaussians, on a CPU with 10 GB; `changes` replace any fields."""
     weights = torch.tensor([0.0, 0.5, 1.0, 2.0, 4.0, 8.0], dtype=torch.float64)
     parts: dict[str, Any] = {
         "scene": SceneFacts(6, 3, 3, 3),
@@ -137,7 +137,7 @@ def test_position_weights_are_for_views_with_an_empty_surround(share: float, wan
     ("share", "values", "training_background", "warm"),
     [
         (0.0, {}, "background", True),
-        (0.05, {}, "background", True),  # a room with holes
+        (0.05, {}, "background", True),  # room with holes
         (0.05, {"preserve_colors": "luminance"}, "background", False),
         (0.5, {"preserve_colors": "luminance"}, "palette", True),
         (0.5, {}, "palette", True),
@@ -163,7 +163,7 @@ def test_what_is_behind_a_scan_and_what_its_colors_begin_with(
 
 
 def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end() -> None:
-    """Content features are computed with it at every visit, of images that are kept where they fit."""
+    """Content features are recomputed for the new background at every visit, from cached images if they fit."""
     drawn, fixed = (
         plan_of(probe(uncovered_share=0.5), training_background=kind, early_stop=True)
         for kind in ("random", "background")
@@ -179,7 +179,7 @@ def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end()
     assert "every iteration" not in said(without, "training_background")
     uncached = plan_of(probe(uncovered_share=0.5), training_background="random", keep=("content",))
     assert uncached.prediction is not None
-    assert uncached.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # a render of the content, too
+    assert uncached.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # also a render of the content
     assert drawn.prediction.first_visit - uncached.prediction.first_visit == pytest.approx(0.15)
 
 
@@ -216,7 +216,7 @@ def test_memory_is_shared_by_the_ranks_of_a_machine() -> None:
 
 
 def test_matching_features_is_in_seconds_and_memory() -> None:
-    """Beside what the passes of a network take; nothing is said or counted where nothing is matched."""
+    """Matching adds to the network's passes; without it, the plan does not mention or count it."""
     search, rate, channels = 1e-9, probe().network.rate, 48
     positions = [(600 >> scale) // 4 * ((800 >> scale) // 4) for scale in (0, 1)]
     pairs = sum(count * min(count, MOST_VECTORS) for count in positions)
@@ -276,7 +276,7 @@ def test_another_precision_where_it_is_asked_for_and_faster(
     [
         ("cuda", "off", LEAST_PASSES, True),
         ("cuda", "off", LEAST_PASSES - 1, False),
-        ("cuda", "on", LEAST_PASSES, False),  # every view is cut to a size of its own
+        ("cuda", "on", LEAST_PASSES, False),  # every view is cropped to a size of its own
         ("cuda", "on", VIEWS * LEAST_PASSES, True),
         ("cpu", "off", LEAST_PASSES, False),
     ],
@@ -291,7 +291,7 @@ def test_algorithms_are_tried_where_sizes_come_back(device: str, weights: str, s
         assert ("not tried" in decision.decision) is not search
 
 
-#: A graph saves 4 ms of 10, and takes 40 to capture: it pays from the twelfth visit on.
+#: A graph saves 4 of 10 ms and takes 40 ms to capture, so it pays off from the twelfth visit on.
 CAPTURED = LaunchCost(seconds=0.010, replayed=0.006, capture=0.040)
 
 
@@ -300,13 +300,13 @@ CAPTURED = LaunchCost(seconds=0.010, replayed=0.006, capture=0.040)
     [
         ({}, {"steps_sos": 12}, None),
         ({}, {"steps_sos": 11}, "come about 11 times, and a graph of each phase pays from 12.0 visits on: 6 ms a view"),
-        ({}, {"steps_sos": 12, "steps_coarse": 12}, None),  # each phase has a graph of its own
+        ({}, {"steps_sos": 12, "steps_coarse": 12}, None),  # each phase has its own graph
         ({}, {"steps_sos": 12, "steps_coarse": 11}, "come about 23 times, and a graph of each phase pays from 12.0"),
-        ({}, {"steps_sos": 12, "position_weights": "on"}, "come about 3 times"),  # views are cut to sizes of their own
+        ({}, {"steps_sos": 12, "position_weights": "on"}, "come about 3 times"),  # views are cropped to different sizes
         ({}, {"steps_sos": 12 * VIEWS, "position_weights": "on"}, None),
         ({}, {"steps_sos": 400, "keep": ("launches",)}, "asked for"),
         ({"ranks": 2}, {"steps_sos": 400}, "a graph cannot hold what workers tell each other"),
-        ({"ranks": 2}, {"steps_sos": 6, "views_per_step": 2}, None),  # every worker has a view to itself
+        ({"ranks": 2}, {"steps_sos": 6, "views_per_step": 2}, None),  # every worker has a view of its own
         ({"launches": None}, {"steps_sos": 400}, "views of one size come about 400 times"),
         ({"launches": LaunchCost(problem="no")}, {"steps_sos": 400}, "there are no graphs: no"),
         ({"launches": LaunchCost(1.0, 0.98, 0.0)}, {"steps_sos": 400}, "a graph saves hardly anything: 980 ms a view"),
@@ -337,16 +337,14 @@ def test_on_a_cpu_nothing_is_captured_and_nothing_is_said_of_it() -> None:
 
 
 def test_a_graph_has_memory_of_its_own() -> None:
-    """Its activations beside those of the same work without it."""
+    """Its activations add to those of the same work without a graph."""
     found = probe(device="cuda", raster=RasterCost(0.01), launches=CAPTURED)
     plans = [plan_of(found, steps_coarse=0, steps_sos=400, keep=keep) for keep in ((), ("launches",))]
     assert [plan.graphs for plan in plans] == [True, False]
     peaks = [plan.prediction.device_bytes for plan in plans if plan.prediction]
     assert peaks[0] is not None
     assert peaks[1] is not None
-    assert peaks[0] - peaks[1] == int(
-        HEIGHT * WIDTH * 3500.0
-    )  # one scale whose pixels hold 3000 bytes, and work on 500
+    assert peaks[0] - peaks[1] == int(HEIGHT * WIDTH * 3500.0)  # pixels of one scale: 3000 bytes kept, 500 for work
 
 
 def test_the_measured_error_of_a_precision_is_said() -> None:
@@ -413,7 +411,7 @@ def on_a_gpu(raster: RasterCost, **changes: Any) -> Probe:
     return probe(device="cuda", rasterizer="triton", raster=raster, **changes)
 
 
-#: Kept weights save 6 ms of 10, and take 12 ms to make: two visits pay for them.
+#: Cached weights save 6 of 10 ms and take 12 ms to compute, so they pay off after two visits.
 FASTER = RasterCost(0.01, 0.004, GIGABYTE, GIGABYTE // 2, 0.012)
 
 
@@ -574,7 +572,7 @@ def test_measuring_takes_memory_but_changes_no_decision() -> None:
 
 
 def test_a_gpu_holds_what_is_computed_with() -> None:
-    """What both hold together is what a process without one holds, and what the GPU alone has."""
+    """The totals of process and GPU equal those of a process without a GPU, plus what only the GPU needs."""
     own = 2 * GIGABYTE
     for ranks in (1, 2):
         values: dict[str, Any] = {"ranks": ranks, "raster": RasterCost(0.01), "link": Link(1e12, 1e-6)}
@@ -587,7 +585,7 @@ def test_a_gpu_holds_what_is_computed_with() -> None:
         assert on_cpu.device_bytes is None
         assert on_gpu.peak_bytes == GIGABYTE
         beside = 5 * (12 + 12 * VIEWS + gaussian_bytes(3)) - 6 * SHAPE_BYTES
-        if ranks == 1:  # activations, but for three quarters of what 500 bytes a pixel are for
+        if ranks == 1:  # activations, less three quarters of what needs 500 bytes per pixel
             beside -= HEIGHT * WIDTH * 375
         assert on_gpu.device_bytes == own + on_cpu.peak_bytes - GIGABYTE - beside
 
@@ -611,7 +609,7 @@ def test_nothing_changes_a_plan() -> None:
             setattr(plan, field.name, None)
     assert isinstance(plan.decisions, tuple)
     assert isinstance(plan.covered, tuple)
-    hash((plan.decisions, plan.covered, plan.prediction))  # nothing in them can change either
+    hash((plan.decisions, plan.covered, plan.prediction))  # hashable, so nothing in them can change
 
 
 def test_decisions_come_in_the_order_in_which_people_read_them() -> None:

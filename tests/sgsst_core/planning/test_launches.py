@@ -1,4 +1,4 @@
-"""What is measured of launches, on a pretend device."""
+"""Tests of the measurement of kernel launches, on a simulated GPU."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SIZE = 32, 48
 
 @pytest.fixture
 def counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counts]:
-    """Kernels of PyTorch alone, which need no interpreter."""
+    """Use PyTorch's kernels only, which need no interpreter."""
     with pretend_cuda() as found:
         leave_out_kernels(monkeypatch)
         yield found
@@ -46,7 +46,7 @@ def test_both_ways_are_timed(counts: Counts, tiny_weights: BackboneWeights) -> N
     assert found.replayed > 0
     assert found.capture >= 0
     replays = [count for line, count in counts.launches.items() if "loss/graphs.py" in line]
-    assert launches.RUNS + 1 in replays  # with the one that follows the capture
+    assert launches.RUNS + 1 in replays  # including the run after the capture
 
 
 def test_what_cannot_be_timed_has_a_reason(

@@ -1,4 +1,4 @@
-"""Which Gaussians masks of some views show."""
+"""Tests of the selection of Gaussians by masks of some views."""
 
 import torch
 
@@ -8,7 +8,7 @@ from tests.small_scenes import cameras, wall
 
 
 def test_votes_are_the_blend_weights_where_masks_are_white():
-    """Against pixels: what they show of one Gaussian, with 1 as its color."""
+    """The reference is the image of one Gaussian with color 1."""
     scene, views = wall(8, 6), cameras(2)
     rasterizer = make_rasterizer("cpu", scene)
     masks = [torch.rand(view.height, view.width, generator=torch.Generator().manual_seed(7)) for view in views]
@@ -29,7 +29,7 @@ def test_a_half_of_a_wall():
     inside, total = count_votes(make_rasterizer("cpu", scene), views, [lambda: mask], len(scene))
     found = decide_by_votes(scene.means, inside, total)
     x = scene.means[:, 0]
-    assert bool(found[x > 0.2].all())  # those beyond the view's edge, too, by their neighbors
+    assert bool(found[x > 0.2].all())  # those outside the view follow their neighbors
     assert not bool(found[x < -0.2].any())
 
 
@@ -41,7 +41,7 @@ def test_those_between_and_those_unseen_follow_their_neighbors():
     total[11] = inside[11] = 0
     found = decide_by_votes(places, inside, total)
     assert found[1:].tolist() == [False, False, *[True] * 9]
-    inside[5] = 0.39  # out by a margin, whatever is around
+    inside[5] = 0.39  # outvoted by a margin, whatever its neighbors are
     assert not bool(decide_by_votes(places, inside, total)[5])
 
 

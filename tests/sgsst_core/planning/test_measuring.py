@@ -1,4 +1,4 @@
-"""What is measured beside the steps: by how much it is thinned out, and what the plan says of it."""
+"""Tests of the measurements in a plan: how they are thinned out and what the plan says about them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import probe, said
 
-#: 4 M Gaussians: every first look at a view takes long.
+#: Cost for 4 million Gaussians: every first visit of a view takes long.
 SLOW = RasterCost(2.0, 1.0, 10**9, 10**9 // 2, first_seconds=5.0)
 VERY_SLOW = RasterCost(50.0, first_seconds=100.0)
 
@@ -52,14 +52,14 @@ def test_every_level_but_the_last_measures_the_end_and_no_more_than_the_one_befo
 
 
 def test_the_first_level_that_is_allowed_is_taken() -> None:
-    """300 steps: views are prepared at 1 each; one takes 0.5 at each moment, which takes 0.25, and to be judged."""
+    """Over 300 steps, a view costs 1 s to prepare and 0.5 s per moment and for the judgment, and a moment 0.25 s."""
     prices = Prices(1.0, 0.5, 0.25)
     costs = [21.75, 15.0, 8.0, 5.5, 3.0, 2.25, 0.0]
     assert [prices.of(level, len(level.moments(300))) for level in LEVELS] == costs
     for place, cost in enumerate(costs):
         assert choose_level(prices, cost, 300) == place
         assert choose_level(prices, cost - 0.01, 300) == min(place + 1, NOTHING)
-    assert choose_level(prices, 1e9, 300, first=3) == 3  # what the plan has thinned out stays so
+    assert choose_level(prices, 1e9, 300, first=3) == 3  # the plan's level is the minimum
 
 
 def test_small_jobs_are_measured_for_half_a_minute_and_others_for_their_share() -> None:
@@ -74,7 +74,7 @@ def test_the_loss_has_half_of_what_is_allowed_and_one_view_at_least() -> None:
     for steps, price, found in ((0.0, 3.0, 4), (0.0, 3.01, 2), (0.0, 6.0, 2), (0.0, 6.01, 1), (0.0, 1e9, 1)):
         assert choose_loss_views(0.1, steps, price, 97) == found
     assert choose_loss_views(0.1, 3000.0, 6.01, 97) == 4
-    assert choose_loss_views(0.1, 0.0, 4.0, 3) == 3  # there are no more
+    assert choose_loss_views(0.1, 0.0, 4.0, 3) == 3  # there are only three views
     assert choose_loss_views(0.0, 3000.0, 3.0, 97) == 4
 
 
@@ -84,7 +84,7 @@ def test_a_target_is_a_share_of_the_loss_on_the_same_views_whatever_they_take() 
 
 
 def test_views_that_no_step_has_visited_make_the_loss_dearer() -> None:
-    """Of four views, two steps visit two."""
+    """Two steps visit two of four views."""
     all_, half = (expected(plan_of(RasterCost(0.1, first_seconds=0.4), steps_sos=steps)) for steps in (4, 2))
     assert all_.losses == 2 * all_.evaluation
     assert half.losses == pytest.approx(2 * half.evaluation + 4 * half.first_visit / 2)
@@ -111,7 +111,10 @@ def test_nothing_is_measured_without_a_share() -> None:
 
 
 def test_a_job_is_its_steps_its_first_visits_and_measuring() -> None:
-    """Four views, all of them visited in either phase; kept weights come with the first one, the survey's lists too."""
+    """All four views are visited in either phase.
+
+    The first visits compute cached weights and use the survey's intersections.
+    """
     found = expected(plan_of(SLOW))
     steps = 8 * found.seconds_coarse + 16 * found.seconds + found.style
     assert found.job == pytest.approx(steps + 4 * (found.first_visit_coarse + found.first_visit) + found.measuring)

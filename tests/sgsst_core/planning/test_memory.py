@@ -1,4 +1,4 @@
-"""The most memory that a job will hold, term by term."""
+"""Tests of the predicted peak memory of a job, term by term."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from tests.sgsst_core.planning.test_decide import GIGABYTE, HEIGHT, VIEWS, WIDTH
 from tests.sgsst_core.planning.test_visits import HUGE, LARGE, expected
 from tests.sgsst_core.planning.test_visits import plan_of as plan_of_raster
 
-#: Bytes that there are for lists and weights.
+#: Budget in bytes for tile intersections and weights.
 ROOM = 10 * GIGABYTE // 4
 
 
 def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
-    """Five of six Gaussians are rendered, as a copy of the scene of degree 3; its lists take those of the survey's."""
+    """Five of six Gaussians are rendered, from a copy of the scene of degree 3.
+
+    Its intersections replace those of the survey.
+    """
     plain = expected(LARGE).peak_bytes
     whole = expected(LARGE, keep=("unseen",)).peak_bytes
     own = OPTIMIZER_BYTES + 12 + 12 * VIEWS
@@ -42,7 +45,7 @@ def test_lists_of_held_out_views_take_what_the_jobs_leave() -> None:
 
 
 def test_views_that_no_step_comes_to_take_nothing() -> None:
-    """Of four, one step sees one: a quarter of the content, and of the colors."""
+    """A single step visits one of four views, which needs a quarter of the content and of the colors."""
     every, one = expected(LARGE, keep=("unseen",)), expected(LARGE, steps_sos=1, keep=("unseen",))
     without = [expected(LARGE, steps_sos=steps, keep=("unseen", "content")) for steps in (40, 1)]
     colors = 6 * 12 * VIEWS * 3 // 4
@@ -52,7 +55,10 @@ def test_views_that_no_step_comes_to_take_nothing() -> None:
 
 
 def test_weights_take_the_room_of_the_surveys_lists() -> None:
-    """Both have one budget, and what did not fit it has a sixteenth of the memory beside it."""
+    """Weights and intersections share one budget.
+
+    Intersections of views whose weights do not fit may take another sixteenth of the memory.
+    """
     kept = [RasterCost(0.3, 0.1, size, size, lists_bytes=10**8) for size in (10**9, ROOM, 4 * ROOM)]
     peaks = [plan_of(probe(raster=raster), cached_weights="float32").prediction for raster in kept]
     base = plan_of(probe(raster=replace(kept[0], bytes=0, lists_bytes=0)), cached_weights="float32").prediction
@@ -63,7 +69,7 @@ def test_weights_take_the_room_of_the_surveys_lists() -> None:
 
 
 def test_the_largest_of_what_comes_and_goes_counts() -> None:
-    """Of many Gaussians it is a view's lists being built, or the search for unseen ones' neighbors at the end."""
+    """With many Gaussians, the peak is the computation of a view's intersections, or the final neighbor search."""
     few = expected(LARGE)
     many = plan_of(probe(gaussians=10**8, used_degree=0, held_degree=0)).prediction
     assert many is not None
@@ -71,7 +77,7 @@ def test_the_largest_of_what_comes_and_goes_counts() -> None:
 
 
 def test_the_exact_twin_computes_in_float32() -> None:
-    """Where the job does not, its activations take as much again, and so does the content of its views."""
+    """If the job is not in float32, its activations and view contents are needed a second time."""
     found = probe(precision_ratio=2.0)
     rises = []
     for precision in ("float32", "bfloat16"):

@@ -1,4 +1,4 @@
-"""Orbits by need: rings where they show more of the surface, what was asked for obeyed, and all of it told."""
+"""Tests of automatic orbits: rings show more of the surface, requests are obeyed, and the plan mentions everything."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.sgsst_core.scene.objects import ball, box, figure, ground, joined, sc
 
 
 def elevations(scene: Scene, made: Orbit) -> list[float]:
-    """Of each camera above the horizon, degrees."""
+    """Return the elevation of each camera above the horizon, in degrees."""
     up = made.up.direction
     middle = middle_of(find_subject(scene), up)
     offsets = [camera.center - middle for camera in made.cameras]
@@ -32,14 +32,14 @@ def elevations(scene: Scene, made: Orbit) -> list[float]:
 
 
 def told(scene: Scene, made: Orbit) -> dict[str, Decision]:
-    """Lines of the plan by their item."""
+    """Return the decisions of the plan by item."""
     cameras = [resized(camera, 64) for camera in made.cameras]
     looked = survey(scene, cameras, make_rasterizer("cpu", scene))
     return {decision.item: decision for decision in orbit_decisions(made, cameras, looked)}
 
 
 def table() -> Scene:
-    """A wide flat thing on a ground, most of which is seen from above."""
+    """Return a wide flat object on a ground, best seen from above."""
     return joined(ground(4.0), scene_of(box((-0.5, -0.5, -0.5), (0.5, 0.0, 0.5))))
 
 

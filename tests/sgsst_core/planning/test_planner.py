@@ -1,4 +1,4 @@
-"""What is left out changes nothing, and the plan says what and why."""
+"""Tests that what a plan leaves out changes no result, and that the plan gives the reason."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.small_scenes import ball, cameras, wall
 
 
 def behind(scene: Scene, count: int = 10) -> Scene:
-    """The scene with its last Gaussians put behind the cameras, where no view sees them."""
+    """Return the scene with its last Gaussians moved behind the cameras, where no view sees them."""
     moved = scene.means.clone()
     moved[-count:, 2] *= -1
     return replace(scene, means=moved)
@@ -51,18 +51,18 @@ def test_what_is_left_out_changes_nothing(tiny_weights: BackboneWeights, name: s
     scene, views = SCENES[name], [resized(camera, 120) for camera in cameras(2)]
     lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
     first = [stylizer.run_step() for stylizer in (lean, full)]
-    # The first step's loss comes from equal colors: nothing but rounding may differ.
+    # The first step's loss comes from equal colors, so it may differ only by rounding.
     assert first[0].loss == pytest.approx(first[1].loss, rel=1e-5)
     for stylizer in (lean, full):
         run(stylizer)
-    # Later steps differ by what Adam makes of rounding: gradients that are 0 but for it move by the learning rate too.
+    # Later steps differ by more: Adam moves a color by the learning rate even if its gradient is only rounding error.
     assert lean.history[-1].loss == pytest.approx(full.history[-1].loss, rel=1e-3)
     assert relative_error(lean.stylized() - scene.sh_dc, full.stylized() - scene.sh_dc) < 0.02
 
 
 @pytest.mark.parametrize("item", EVERYTHING)
 def test_each_item_alone_changes_nothing(tiny_weights: BackboneWeights, item: Item) -> None:
-    """Enough steps for blend weights to be kept, on a scene in which every item has something to leave out."""
+    """There are enough steps to cache blend weights, and every item has something to leave out."""
     scene, views = higher_bands_of_zeros(behind(ball())), cameras(1)
     lean, other = (make(scene, views, tiny_weights, steps_sos=5, keep=keep) for keep in ((), (item,)))
     losses = [stylizer.run_step().loss for stylizer in (lean, other)]
@@ -77,7 +77,7 @@ def test_each_item_alone_changes_nothing(tiny_weights: BackboneWeights, item: It
 
 def test_blend_weights_are_kept_as_memory_and_visits_allow(tiny_weights: BackboneWeights) -> None:
     scene, views = wall(), cameras(3)
-    assert make(scene, views, tiny_weights, steps_sos=14).plan.cached_weights == "none"  # fewer than 5 visits a view
+    assert make(scene, views, tiny_weights, steps_sos=14).plan.cached_weights == "none"  # fewer than 5 visits per view
     lean = make(scene, views, tiny_weights, steps_sos=30)
     assert lean.plan.cached_weights == "float32"
     little = make(scene, views, tiny_weights, steps_sos=30, memory_limit=400_000)
@@ -121,7 +121,7 @@ def test_similar_views_are_left_out_only_when_asked(tiny_weights: BackboneWeight
 
 
 def test_distinct_views_by_their_shift() -> None:
-    """Views 0.3 apart of a wall at distance 3, focal length of one width: shifted by 0.1 of the width."""
+    """Views 0.3 apart of a wall at distance 3, with a focal length of one width, are shifted by 0.1 of the width."""
     scene, views = wall(), cameras(3)
     turned = [replace(camera, world_to_camera=camera.world_to_camera.clone()) for camera in views]
     for camera, x in zip(turned, (-0.3, 0.0, 0.3), strict=True):
@@ -195,7 +195,7 @@ def test_unseen_gaussians_follow_the_same_neighbors_in_parts(monkeypatch: pytest
     seen = weights > 0
     found = neighbors_change(means, change, weights)
     distances, nearest = torch.cdist(means[~seen].double(), means[seen].double()).sort(dim=1)
-    assert bool((distances[:, :9].diff(dim=1) > 0).all())  # no ties: the neighbors are those
+    assert bool((distances[:, :9].diff(dim=1) > 0).all())  # without ties, the neighbors are unique
     own = weights[seen][nearest[:, :8]]
     expected = (change[seen].double()[nearest[:, :8]] * own[..., None]).sum(1) / own.sum(1, keepdim=True)
     torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)

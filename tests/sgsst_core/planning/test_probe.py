@@ -1,4 +1,4 @@
-"""What is measured, on what, and what of it is handed on."""
+"""Tests of the probe: what it measures, on what, and what it passes on."""
 
 from __future__ import annotations
 
@@ -79,7 +79,10 @@ def test_matching_features_is_measured_apart(tiny_weights: BackboneWeights) -> N
 
 
 def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: BackboneWeights) -> None:
-    """On a GPU large, as far as their activations fit; the views' own size bounds both (`measure_rate` is given it)."""
+    """Images are large on a GPU, as far as their activations fit the memory.
+
+    `measure_rate` also limits them to the size of the views.
+    """
     planning_context = equipped(tiny_weights, wall(), memory_limit=10**9)
     on_gpu = replace(planning_context, machine=replace(planning_context.machine, device="cuda"))
     network = planning_context.network
@@ -90,7 +93,7 @@ def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: B
 
 
 def test_the_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for the first one, which prepares; two with gradient, two without."""
+    """The first run only prepares; two runs with gradient and two without follow."""
     taken = iter([1.0, 5.0, 3.0, 4.0, 2.0])
 
     class Clock(Timer):
@@ -155,7 +158,7 @@ def test_an_earlier_survey_takes_the_place_of_a_look(tiny_weights: BackboneWeigh
 
 @pytest.mark.parametrize("kept", ["none", "float32"])
 def test_what_was_built_for_the_whole_scene_is_handed_on(tiny_weights: BackboneWeights, kept: str) -> None:
-    """Network and lists of views; but not where Gaussians are left out, whose places in the lists would be others."""
+    """These are the network and the views' intersections, unless left-out Gaussians change the indices in them."""
     for scene, handed_on in ((ball(), True), (wall(), False)):
         settings = make_settings(cached_weights=kept)
         plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)

@@ -1,4 +1,4 @@
-"""The planner's model of several ranks."""
+"""Tests of the planner's model of several ranks."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_bytes_that_are_sent_are_those_that_ranks_wait_for_but_for_statistics_of
 
 
 def test_groups_add_up_whole_gradients() -> None:
-    """What the views of a step show together is not known."""
+    """The model cannot know which Gaussians the views of a step show together."""
     phases = [(0, [work()]), (10, [replace(work(), shown=1)])]
     found = choose_ranks(phases, 2, 2, SLOW)
     assert found.seconds[2] - found.seconds[1] / 2 == pytest.approx(10 * SLOW.all_reduce(12 * 50_000, 2))
@@ -76,13 +76,13 @@ def test_a_free_link_makes_every_rank_worth_it_and_a_slow_one_none() -> None:
 
 
 def test_further_ranks_must_be_worth_it() -> None:
-    """A view that is all halo: no number of ranks is faster by more than its raster part."""
+    """For a view that is all halo, more ranks only speed up the rasterizer."""
     small = replace(work(40, 40, 1), raster=1e-6)
     assert choose_ranks([(0, [small]), (10, [small])], 1, 8, FREE).ranks == 1
 
 
 def test_groups_take_views_side_by_side() -> None:
-    """Two views a step on two ranks: no halos, twice as fast but for the sum of colors."""
+    """Two views per step on two ranks need no halos, so they are twice as fast apart from the sum of colors."""
     phases = [(0, [work()]), (10, [work()])]
     found = choose_ranks(phases, 2, 2, FREE)
     assert found.speed_up == pytest.approx(2.0)
@@ -95,7 +95,7 @@ def test_many_ranks_are_looked_at_in_steps() -> None:
 
 
 def test_what_does_not_fit_the_memory_goes_forward_twice() -> None:
-    """Two ranks of one machine have half of its memory each, and hold all scales at once."""
+    """Two ranks of one machine have half of its memory each, and keep all scales at once."""
     pixels = 1.25 * 720 * 1280
     roomy = replace(work(), forward=1e-6, held=2 * pixels, working=0.1, sharing=2)
     tight = replace(roomy, held=pixels)

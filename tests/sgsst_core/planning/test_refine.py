@@ -1,4 +1,4 @@
-"""What is cut: sizes as the rasterizer projects them, disagreement by definition, and never more than the budget."""
+"""Tests of splitting in a plan: projected sizes, disagreement by definition, and the budget."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def test_axes_in_a_view_add_up_to_the_projected_covariance() -> None:
     found = project(scene, view)
     rows = torch.from_numpy(found.gaussians).long()
     x, y = (torch.from_numpy(found.values[:, column]) for column in (Column.X, Column.Y))
-    inside = (x > 0) & (x < view.width) & (y > 0) & (y < view.height)  # elsewhere directions are limited
+    inside = (x > 0) & (x < view.width) & (y > 0) & (y < view.height)  # outside the view, directions are clamped
     lengths, reach = axes_in_view(scene, rows[inside], view)
     reference = ReferenceRasterizer(scene)
     assert reference.dtype == torch.float64
-    # extents are t sqrt(p), t sqrt(r), with one t for both; the sum of the squares of the axes is p + r without blur
+    # Extents are t sqrt(p) and t sqrt(r) with the same t; without blur, the squared axes sum to p + r.
     support = torch.from_numpy(found.values[:, Column.LOG2_OPACITY]).double()[inside] + torch.log2(torch.tensor(255.0))
     t = (2 * torch.log(torch.tensor(2.0, dtype=torch.float64)) * support).sqrt()
     extents = [torch.from_numpy(found.values[:, column])[inside] / t for column in (Column.EXTENT_X, Column.EXTENT_Y)]
@@ -52,7 +52,7 @@ def test_disagreement_is_what_cancels_pixel_by_pixel() -> None:
     gradient = torch.randn(14, 20, 3, generator=generator, dtype=torch.float64)
     reference = ReferenceRasterizer(scene)
     cancels, there_is = disagreement(reference, view, gradient)
-    operator = []  # blend weights [pixels, N], one pixel after the other
+    operator = []  # blend weights [pixels, N], pixel by pixel
     for pixel in range(14 * 20):
         one = torch.zeros(14 * 20, 3, dtype=torch.float64)
         one[pixel] = 1

@@ -1,4 +1,4 @@
-"""What views cost beside the passes: once where what is made for them is kept, at every visit where it is not."""
+"""Tests of the cost of visiting views: once for cached data, at every visit for the rest."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from sgsst_core.planning.visits import Made
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import GIGABYTE, probe
 
-#: Lists take 5 s and fit, colors 0.5 s.
+#: Intersections take 5 s and fit the cache; colors take 0.5 s.
 LARGE = RasterCost(2.0, first_seconds=5.0, lists_bytes=10**8, colors_seconds=0.5)
-#: Of four views, the lists of one fit a quarter of 10 GB.
+#: Of four views, the intersections of one fit a quarter of 10 GB.
 HUGE = replace(LARGE, lists_bytes=10 * GIGABYTE // 4)
 
 
@@ -49,7 +49,7 @@ def test_views_that_are_kept_whole_leave_a_part_of_the_room() -> None:
 
 
 def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
-    """Lists are kept in a smaller room beside them, and every view is rendered from these."""
+    """Intersections are then cached in the remaining memory, and every view is rendered from them."""
     found = {size: plan_of(replace(LARGE, bytes=8 * size, half_bytes=4 * size)) for size in (GIGABYTE, 3 * GIGABYTE)}
     predictions = [plan.prediction for plan in found.values()]
     assert all(plan.cached_weights == "half" for plan in found.values())
@@ -63,7 +63,7 @@ def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
 
 
 def test_lists_and_colors_come_with_the_first_visit_where_they_fit() -> None:
-    """The survey's lists are cut down to the Gaussians that are rendered, for a quarter of what they cost."""
+    """Reducing the survey's intersections to the rendered Gaussians takes a quarter of their cost."""
     small, large = expected(replace(LARGE, first_seconds=0.0, colors_seconds=0.0)), expected(LARGE)
     assert large.first_visit - small.first_visit == pytest.approx(0.25 * 5 + 0.5)
     assert large.seconds == small.seconds
@@ -77,7 +77,7 @@ def test_lists_that_do_not_fit_are_made_at_every_visit() -> None:
 
 
 def test_lists_of_the_survey_are_the_jobs_where_every_gaussian_is_rendered() -> None:
-    """Those of some Gaussians are cut down first."""
+    """If only some Gaussians are rendered, the intersections must be reduced first."""
     cut, handed = expected(LARGE), expected(LARGE, keep=("unseen",))
     assert cut.first_visit - handed.first_visit == pytest.approx(0.25 * 5.0)
 
@@ -95,7 +95,7 @@ def test_content_that_is_not_kept_is_computed_at_every_visit() -> None:
 
 
 def test_weights_that_do_not_fit_save_nothing() -> None:
-    """Of 10 GB, kept weights have a quarter."""
+    """Cached weights get a quarter of 10 GB."""
     fit, quarter = (
         expected(RasterCost(0.3, 0.1, 40 * GIGABYTE, size), cached_weights="half")
         for size in (10 * GIGABYTE // 4, 10 * GIGABYTE)
@@ -104,7 +104,10 @@ def test_weights_that_do_not_fit_save_nothing() -> None:
 
 
 def test_maps_of_regions_come_with_the_first_visit() -> None:
-    """Four regions take two renders, and one of what is behind them; each is half of a render with its gradient."""
+    """Four regions take two renders, plus one for the background.
+
+    Each takes half as long as a render with its gradient.
+    """
     settings = make_settings(steps_coarse=0, steps_sos=40, position_weights="off")
     plain = probe(raster=LARGE)
     found = [decide(each, settings).prediction for each in (plain, replace(plain, maps=4))]

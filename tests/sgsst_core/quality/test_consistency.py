@@ -1,4 +1,4 @@
-"""Multi-view consistency on planes, where the right warp and the right occlusion are known, and on a real scene."""
+"""Tests of multi-view consistency on planes, whose warp and occlusion are known, and on a real scene."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sgsst_core.scene.camera import Camera, look_at, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
-#: A power of two, so that planes stay where they are when their world is moved by whole numbers.
+#: A power of two, so that positions of planes stay exact when their world is moved by whole numbers.
 SPACING = 1 / 16
 DEPTH = 4.0
 
@@ -41,10 +41,10 @@ def lpips(vgg16_weights: object) -> Lpips:
 
 
 def plane(half_width: float, half_height: float, depth: float, color: Tensor | None = None) -> Scene:
-    """Opaque flat Gaussians on a rectangle around the z axis, in a smooth pattern or one color [3].
+    """Return opaque flat Gaussians on a rectangle around the z axis, in a smooth pattern or one color [3].
 
-    Gaussians overlap, and the nearer hides the farther: a pixel shows the pattern as it is up to two deviations beside
-    it, to the side of the plane that is nearer to the camera.
+    Gaussians overlap, and the nearer hides the farther one. A pixel therefore shows the pattern from up to two
+    deviations beside it, toward the side of the plane that is nearer to the camera.
     """
     x = torch.arange(-half_width, half_width + SPACING / 2, SPACING)
     y = torch.arange(-half_height, half_height + SPACING / 2, SPACING)
@@ -67,12 +67,12 @@ def camera(position: tuple[float, float, float], target: tuple[float, float, flo
 
 
 def ring(count: int) -> list[Camera]:
-    """Cameras on an arc in front of a plane, to whom the same side of it is the nearer."""
+    """Return cameras on an arc in front of a plane, all nearer to the same side of it."""
     return [camera((0.12 * i + 0.3, 0.04 * i + 0.1, 0.02 * i)) for i in range(count)]
 
 
 def renders(scene: Scene, cameras: list[Camera], rasterizer: Rasterizer):
-    """The scene's own pictures."""
+    """Return a function that renders the scene in its own colors."""
 
     def image(index: int) -> Tensor:
         rest = rest_colors(scene.sh_rest, scene.means, cameras[index])
@@ -87,7 +87,10 @@ def measure(scene: Scene, cameras: list[Camera], gap: int = 1, lpips: Lpips | No
 
 
 def homography(camera: Camera, other: Camera) -> Tensor:
-    """Pixels of a view to those of another one by the plane z = DEPTH, [3, 3] (Hartley and Zisserman, result 13.1)."""
+    """Return the mapping [3, 3] from the pixels of one view to another's by the plane z = DEPTH.
+
+    Hartley and Zisserman, result 13.1.
+    """
 
     def intrinsics(c: Camera) -> Tensor:
         return torch.tensor([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]], dtype=torch.float64)
@@ -100,7 +103,7 @@ def homography(camera: Camera, other: Camera) -> Tensor:
 
 
 def pixel_centers(camera: Camera) -> Tensor:
-    """[H, W, 3] homogeneous."""
+    """Return homogeneous pixel centers [H, W, 3]."""
     y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     return torch.stack([x + 0.5, y + 0.5, torch.ones(x.shape)], dim=-1).double()
 
@@ -108,8 +111,8 @@ def pixel_centers(camera: Camera) -> Tensor:
 @pytest.mark.parametrize(
     ("first", "tolerance"),
     [
-        (camera((0.1, -0.2, 0), (0.1, -0.2, DEPTH)), 1e-4),  # parallel to the plane: all its Gaussians have one depth
-        (camera((1.5, -0.5, 0)), 0.7),  # slanted: mean depths lean to the nearer Gaussians, by up to two deviations
+        (camera((0.1, -0.2, 0), (0.1, -0.2, DEPTH)), 1e-4),  # parallel to the plane: all Gaussians have the same depth
+        (camera((1.5, -0.5, 0)), 0.7),  # slanted: mean depths are biased to nearer Gaussians, by up to two deviations
     ],
     ids=["parallel", "slanted"],
 )
@@ -123,7 +126,7 @@ def test_pixels_of_a_plane_move_by_its_homography(first: Camera, tolerance: floa
     expected = pixel_centers(first) @ homography(first, other).T
     error = torch.stack([x, y], dim=-1) - expected[..., :2] / expected[..., 2:]
     assert float(error.abs().max()) < tolerance
-    # The plane's own depth along the ray of each position in the other view.
+    # Depth of the plane along the ray of each position in the other view.
     rays = torch.stack([(x - other.cx) / other.fx, (y - other.cy) / other.fy, torch.ones_like(x)], dim=-1)
     slope = (rays @ other.world_to_camera[:3, :3])[..., 2]
     torch.testing.assert_close(z, (DEPTH - other.center[2]) / slope, rtol=tolerance / 20, atol=0)
@@ -166,7 +169,7 @@ def test_what_the_other_view_cannot_see_is_masked():
     picture = renders(scene, cameras, rasterizer)
     depths = [expected_depth(scene, c, rasterizer) for c in cameras]
     warped, valid = warp(picture(1), depths[1], cameras[1], depths[0], cameras[0])
-    # A point (X, Y, 4) of the plane is hidden from the camera at (c, 0, 0) where the ray meets the patch at z = 2.
+    # A point (X, Y, 4) of the plane is hidden from the camera at (c, 0, 0) if its ray meets the patch at z = 2.
     wall = (pixel_centers(cameras[0])[..., :2] - torch.tensor([32.0, 24.0])) / 70 * DEPTH
 
     def meets_patch(center: float, half: float) -> Tensor:
@@ -180,13 +183,13 @@ def test_what_the_other_view_cannot_see_is_masked():
     assert not valid[hidden].any()
     assert valid[visible].all()
     careless, _ = warp(picture(1), depths[1], cameras[1], depths[0], cameras[0], tolerance=1e9)
-    assert (careless - picture(0))[hidden].abs().amax(-1).min() > 0.7  # the patch, painted onto the wall behind it
+    assert (careless - picture(0))[hidden].abs().amax(-1).min() > 0.7  # the patch is painted onto the wall behind it
     assert measure(scene, cameras).rmse < 0.02
     assert float((warped - picture(0))[valid].abs().max()) < 0.1
 
 
 def test_identical_cameras_give_zero(lpips):
-    # an edge of the scene in the picture: pixels of the silhouette must not be lost to rounding
+    # The scene's edge is in view; rounding must not exclude the pixels of its silhouette.
     result = measure(plane(1, 1, DEPTH), [camera((0.3, 0.2, 0))] * 3, lpips=lpips)
     assert len(result.pairs) == 2
     assert result.rmse < 1e-6
@@ -224,7 +227,7 @@ def test_rmse_is_that_of_the_compared_pixels_and_pictures_are_clamped():
 
 def test_pairs_that_see_nothing_in_common_have_no_value(lpips):
     scene = plane(2, 2, DEPTH)
-    behind = camera((0, 0, 0), (0, 0, -DEPTH))  # looks away from the plane: empty
+    behind = camera((0, 0, 0), (0, 0, -DEPTH))  # looks away from the plane and sees nothing
     other_side = camera((0, 0, 3 * DEPTH))  # sees the plane from behind, which is the same surface
     cameras = [camera((0, 0, 0)), behind, behind, other_side, camera((0.1, 0, 3 * DEPTH))]
     result = measure(scene, cameras, lpips=lpips)

@@ -1,4 +1,4 @@
-"""What `sgsst check` finds in scenes, views and styles that are extreme in one respect each."""
+"""Tests of `sgsst check` on scenes, views and styles that are each extreme in one respect."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def seen_by(folder: Path, scene: Scene, views: list[Camera]) -> dict[str, Findin
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_survey_takes_the_place_of_another_look(tmp_path: Path, turned: bool) -> None:
-    """The same findings in the same words; a camera that is turned away sees nothing."""
+    """The findings have the same words; a camera that is turned away sees nothing."""
     file, views = stored(tmp_path, wall()), cameras()
     if turned:
         away = views[0].world_to_camera.clone()
@@ -68,7 +68,7 @@ def the(found: dict[str, Finding], text: str) -> Finding:
 def test_nothing_extreme_is_found_in_an_ordinary_scene(tmp_path: Path) -> None:
     scene = replace(wall(), opacities=torch.full((len(wall()),), -1.0))
     assert found_in(tmp_path, scene) == {}
-    # the wall is larger than what its cameras see of it
+    # The wall extends beyond what its cameras see of it.
     found = seen_by(tmp_path, wall(), cameras())
     assert {what.split(":")[0] for what in found} == {"in no view", "hardly seen"}
     assert style_findings(style(), cameras()) == []
@@ -100,7 +100,7 @@ def test_extreme_gaussians_are_counted_and_the_worst_is_named(
 
 
 def test_a_scene_is_looked_at_in_parts_of_any_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same findings, and of equal ones the first is named."""
+    """Findings do not depend on the slices, and the first of equal values is named."""
     scene = wall(sh_degree=1)
     for column, values in (("quats", (1e-20, 1e20)), ("scales", (200.0, 5.0, -1e6)), ("sh_dc", (-1e4, 1e4))):
         for place, value in enumerate(values):
@@ -118,7 +118,7 @@ def test_gaussians_close_to_cameras_are_those_of_all_distances(distance: float, 
     generator = torch.Generator().manual_seed(0)
     means = (torch.randn((500, 3), generator=generator) + far).float()
     centers = torch.cat([means[:40].double(), torch.randn((20, 3), generator=generator, dtype=torch.float64) + far])
-    centers[1] += torch.tensor([distance, 0.0, 0.0])  # just not closer, or just closer
+    centers[1] += torch.tensor([distance, 0.0, 0.0])  # just outside or just inside the distance
     expected = [int(((means.double() - center).norm(dim=1) < distance).sum()) for center in centers]
     assert findings.closer(means, centers, distance) == expected
     assert max(expected) > 0
@@ -162,7 +162,7 @@ def test_extent_ignores_a_few_floaters() -> None:
 def test_unseen_and_hardly_seen_gaussians_are_those_of_the_blend_weights(tmp_path: Path) -> None:
     scene = wall()
     scene.means[:10, 2] = -3.0  # behind every camera
-    scene.means[10:12] = torch.tensor([0.0, 0.0, 5.0])  # behind two opaque layers, faint
+    scene.means[10:12] = torch.tensor([0.0, 0.0, 5.0])  # faint, behind two opaque layers
     front = replace(wall(), means=wall().means * torch.tensor([0.9, 0.9, 0.9]))
     scene = Scene(*(torch.cat([getattr(scene, n), getattr(front, n)]) for n in Scene.__dataclass_fields__))
     found = seen_by(tmp_path, scene, cameras())

@@ -1,4 +1,4 @@
-"""The judge of a result: against plain float64 formulas, and what its figures mean."""
+"""Tests of the judge of a result: against plain float64 formulas, and on scenes with a known outcome."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def alex(vgg16_weights: object) -> Lpips:
-    """AlexNet in float32; its weights come with VGG16's."""
+    """Load AlexNet in float32; its weights come with VGG16's."""
     return Lpips()
 
 
@@ -46,7 +46,7 @@ def judged(judge: Judge, sh_dc: Tensor) -> Judgment:
 
 
 def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple[list[float], float, float, float]:
-    """Style on black and on white, palette, content and features of one view, by loops over layers and positions."""
+    """Compute style on black and on white, color distance, content and features of a view, in plain loops."""
     lpips = Lpips(dtype=torch.float64)
     rasterizer = ReferenceRasterizer(scene)
     rest = reference_rest_colors(held(scene.sh_rest), scene.means, camera, scene.sh_degree).double()
@@ -58,7 +58,7 @@ def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple
             image = rasterizer.render((0.5 + SH_C0 * dc.double() + rest).clamp_min(0), camera)
             shown.append((image + (1 - coverage)[..., None] * behind).clamp(0, 1))
         own, theirs = map(lpips.features, shown)
-        wanted = lpips.features(resize_area(picture, (58, 48)).double())  # 48 is the view's shorter side
+        wanted = lpips.features(resize_area(picture, (58, 48)).double())  # the view's shorter side is 48
         distances, angles = [], []
         for x, y, z in zip(own, theirs, wanted, strict=True):
             height, width = x.shape[:2]
@@ -98,11 +98,11 @@ def test_the_unstylized_scene_has_its_whole_content(alex: Lpips) -> None:
     found = judged(judge_of(alex, scene, cameras(2)), scene.sh_dc)
     assert found.content == 0
     assert found.features == 0
-    assert found.background_sensitivity > 0  # an object has a surround
+    assert found.background_sensitivity > 0  # an object has a background
 
 
 def test_a_scene_of_the_style_is_near_the_style(alex: Lpips) -> None:
-    """Figures fall from a scene of noise to one that shows the style image itself."""
+    """Distances fall from a scene of noise to one that shows the style image itself."""
     scene, view = wall(56, 44), cameras(1)[0]
     scene = replace(scene, scales=scene.scales - 0.69)
     places = (scene.means[:, :2] / torch.tensor([2.4, 1.9])).clamp(-1, 1)
@@ -129,7 +129,7 @@ def test_large_views_are_judged_at_one_size(alex: Lpips) -> None:
 
 @pytest.mark.parametrize("picture", [torch.full((1, 1, 3), 0.5), torch.zeros(40, 40, 3), torch.ones(5, 900, 3)])
 def test_extreme_styles_give_finite_figures(alex: Lpips, picture: Tensor) -> None:
-    """A style of one pixel, a black one without any variance, and one that is a line."""
+    """Styles are a single pixel, black without variance, and a line."""
     scene = ball()
     found = judged(judge_of(alex, scene, cameras(1), picture), torch.full_like(scene.sh_dc, -50.0))
     assert all(np.isfinite(value) for value in vars(found).values())
@@ -167,7 +167,7 @@ def test_regions_are_judged_by_their_own_styles(alex: Lpips) -> None:
         judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colors)
         for styles in (regions_of(scene, dark, bright), regions_of(scene, bright, dark))
     ]
-    assert found[0].color_distance < 60  # colors run into each other at the border
+    assert found[0].color_distance < 60  # colors mix at the border
     assert found[1].color_distance > 150
     assert found[0].content == found[1].content
 

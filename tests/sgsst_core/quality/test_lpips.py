@@ -1,4 +1,4 @@
-"""LPIPS against a second formulation, the published code's numbers, and what its paper says of it."""
+"""Tests of LPIPS against a second implementation, the published code's values, and properties from its paper."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Array = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def alex(vgg16_weights: object) -> Lpips:
-    """AlexNet's LPIPS in float64; its weights come with VGG16's."""
+    """Load AlexNet's LPIPS in float64; its weights come with VGG16's."""
     return Lpips("alex", dtype=torch.float64)
 
 
 def photo(name: str) -> Tensor:
-    """A photo [H, W, 3] float64 in 0..1."""
+    """Return a photo [H, W, 3] float64 in 0 to 1."""
     return torch.from_numpy(getattr(data, name)()).double() / 255
 
 
@@ -81,7 +81,7 @@ def test_increases_with_noise_and_blur(alex: Lpips, changed: Callable[[Tensor, f
     assert distances[-1] > 3 * distances[0]
 
 
-#: Photo of which 150 x 120 pixels are taken, what it is compared with, and the value of the published PyTorch package
+#: Photo that 150 x 120 pixels are taken from, image it is compared with, and value of the published PyTorch package
 #: (`lpips` 0.1.4 with these weights, in float64).
 PUBLISHED = [
     ("astronaut", lambda image: image**0.7, 0.034148751276),
@@ -100,7 +100,7 @@ def test_agrees_with_the_published_code(alex: Lpips, name, changed, expected):
 
 
 def test_prefers_a_small_warp_to_a_blur_where_squared_error_prefers_the_blur(alex: Lpips):
-    """Figure 1 of the paper: people find the warped patch nearer to the original, L2 and PSNR the blurred one."""
+    """Figure 1 of the paper: people find the warped patch closer to the original, L2 and PSNR the blurred one."""
     image = photo("coffee")[100:300, 150:450]
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, 200), torch.linspace(-1, 1, 300), indexing="ij")
     wave = torch.stack([columns + 0.009 * torch.sin(9 * rows), rows + 0.0135 * torch.sin(7 * columns)], dim=-1)
@@ -121,7 +121,7 @@ def test_agrees_with_a_direct_formulation_in_numpy(alex: Lpips):
 
 
 def lpips_directly(first: Array, second: Array) -> tuple[float, Array]:
-    """LPIPS with AlexNet as the paper's equation 1 is written; the input scaled as published, from -1..1."""
+    """Compute LPIPS with AlexNet by the paper's equation 1, with the input scaled as published, from -1 to 1."""
     tensors = {name: tensor.double().numpy() for name, tensor in load_perceptual("alex").items()}
     total, spatial = 0.0, np.zeros(first.shape[:2])
     pairs = zip(alexnet_directly(first, tensors), alexnet_directly(second, tensors), strict=True)
@@ -148,7 +148,7 @@ def alexnet_directly(rgb: Array, tensors: dict[str, Array]) -> list[Array]:
 
 
 def upsampled(values: Array, size: tuple[int, ...]) -> Array:
-    """Bilinear upsampling with pixel centers at +0.5, the border continued."""
+    """Upsample bilinearly, with pixel centers at +0.5 and a repeated border."""
 
     def matrix(cells: int, pixels: int) -> Array:
         positions = np.clip((np.arange(pixels) + 0.5) * cells / pixels - 0.5, 0, cells - 1)

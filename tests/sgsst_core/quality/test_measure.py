@@ -1,4 +1,4 @@
-"""How much of a job is measured: as the plan says, less where views take longer, the same after a resume."""
+"""Tests of how much of a job is measured: the plan's amount, less for slow views, and the same after resuming."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from tests.small_scenes import cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STEPS = 16
-#: Of steps that take hours: whatever is measured here is little beside them.
+#: Prediction of steps that take hours, so that any measurement is cheap in comparison.
 LONG = Prediction(1e3, 1e3, 0, job=1e6)
-#: What the loss takes is already more than is allowed.
+#: Prediction in which the loss alone takes more time than is allowed.
 EXPENSIVE = Prediction(1e3, 1e3, 0, losses=1e6, job=1e6)
 
 
@@ -38,7 +38,7 @@ def make(
 
 
 def measured(stylizer: Stylizer) -> list[int]:
-    """Run to the end; the steps after which it was measured."""
+    """Run a job to its end. Returns the steps after which it was measured."""
     measure = Measurements(stylizer)
     run(stylizer, Callbacks(measure=measure))
     measure.at_the_end()
@@ -50,7 +50,7 @@ def test_all_moments_where_they_are_cheap(tiny_weights: BackboneWeights) -> None
     assert measured(stylizer) == [0, 1, 2, 4, 8, 16]
     first = stylizer.measured[0]
     assert first["level"] == 0
-    assert len(first["novel_view_names"]) == 3  # first ones of the pairs of four views
+    assert len(first["novel_view_names"]) == 3  # first views of the pairs of four views
     assert first["again"] > 0 < first["seconds"]
     assert stylizer.seconds_by_part["measuring"] >= sum(entry["seconds"] for entry in stylizer.measured)
 
@@ -67,7 +67,7 @@ def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: Ba
 
 
 def test_what_the_first_view_takes_thins_the_rest_out(tiny_weights: BackboneWeights) -> None:
-    """Nothing is allowed: the start has been measured by then, and the end is measured all the same."""
+    """No time is allowed, but the start has been measured by then, and the end always is."""
     stylizer = make(tiny_weights, EXPENSIVE)
     assert measured(stylizer) == [0, 16]
     assert stylizer.measured[0]["level"] == NOTHING - 1
@@ -89,7 +89,7 @@ def test_what_nothing_pays_for_is_not_measured(tiny_weights: BackboneWeights) ->
 
 
 def test_the_first_step_does_not_wait_for_the_start(tiny_weights: BackboneWeights) -> None:
-    """It is measured after the first step, from the unstylized colors: as it would have been before."""
+    """It is measured after the first step from the unstylized colors, with the same result as before it."""
     before, late = make(tiny_weights), make(tiny_weights)
     Measurements(before)(before)
     measure = Measurements(late)
@@ -104,7 +104,7 @@ def test_the_first_step_does_not_wait_for_the_start(tiny_weights: BackboneWeight
 
 
 def test_a_job_that_ends_before_the_first_moment_has_its_start_and_its_end(tiny_weights: BackboneWeights) -> None:
-    stylizer = make(tiny_weights, level=2)  # 0, 1, 4 and 16
+    stylizer = make(tiny_weights, level=2)  # moments 0, 1, 4 and 16
     asked = iter([True])
     measure = Measurements(stylizer)
     run(stylizer, Callbacks(measure=measure, stop=asked.__next__))
@@ -132,7 +132,7 @@ def test_nothing_is_measured_without_a_share_and_colors_are_the_same(tiny_weight
 
 
 def test_a_resumed_job_is_measured_as_it_was(tiny_weights: BackboneWeights) -> None:
-    """A plan made anew, or other prices, change nothing of what was decided at the first moment."""
+    """A new plan or other prices do not change what was decided at the first moment."""
     for prediction, steps in ((LONG, [0, 1, 2, 4, 8, 16]), (EXPENSIVE, [0, 16])):
         stopped = make(tiny_weights, prediction)
         measure = Measurements(stopped)
@@ -149,7 +149,10 @@ def test_a_resumed_job_is_measured_as_it_was(tiny_weights: BackboneWeights) -> N
 
 
 def test_seconds_left_of_measuring(tiny_weights: BackboneWeights) -> None:
-    """First the plan's, then what a moment takes after the first one, then their median; the loss at the end."""
+    """A moment's time is first the plan's, then the measured time of a repeated view, then the median of past moments.
+
+    The final loss is added.
+    """
     stylizer = make(tiny_weights, Prediction(1.0, 1.0, 0, losses=3.0, measuring=15.0, job=100.0))
     measure = Measurements(stylizer)
     assert measure.seconds_left(0) == 6 * 2.0 + 3.0  # 12 s of 6 moments
@@ -157,6 +160,6 @@ def test_seconds_left_of_measuring(tiny_weights: BackboneWeights) -> None:
     assert measure.seconds_left(0) == 5 * 1.5 + 3.0
     stylizer.measured += [{"step": step, "seconds": seconds} for step, seconds in ((1, 5.0), (2, 0.5), (4, 1.0))]
     assert measure.seconds_left(4) == 2 * 1.0 + 3.0
-    assert measure.seconds_left(8) == 2 * 1.0 + 3.0  # that of step 8 comes next
+    assert measure.seconds_left(8) == 2 * 1.0 + 3.0  # the moment of step 8 is still due
     stylizer.measured += [{"step": step, "seconds": 1.0} for step in (8, STEPS)]
     assert measure.seconds_left(STEPS) == 3.0

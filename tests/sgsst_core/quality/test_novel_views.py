@@ -1,4 +1,4 @@
-"""Novel views: where they stand, and what is measured on them."""
+"""Tests of novel views: their positions, and the measurements on them."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ AXIS = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
 
 
 def rotation(angle: float, axis: Tensor = AXIS) -> Tensor:
-    """[3, 3]: Rodrigues' formula."""
+    """Return the rotation [3, 3] by Rodrigues' formula."""
     x, y, z = (axis / axis.norm()).tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
 def posed(turned: Tensor, center: tuple[float, float, float] | Tensor, name: str = "a", width: int = 60) -> Camera:
-    """A camera of a rotation (world to camera) at a center."""
+    """Return a camera with a rotation (world to camera) at a center."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = turned
     pose[:3, 3] = -turned @ torch.as_tensor(center, dtype=torch.float64)
@@ -52,13 +52,13 @@ def posed(turned: Tensor, center: tuple[float, float, float] | Tensor, name: str
 
 
 def held_out_cameras(views: list[Camera], covered: Sequence[int]) -> list[Camera]:
-    """One camera between each two neighbors among the views of some indices."""
+    """Return a camera between each two neighbors among the views with some indices."""
     return [between(*pair) for pair in neighbors([views[index] for index in covered])]
 
 
 def angle_between(first: Camera, second: Camera) -> float:
     relative = first.world_to_camera[:3, :3] @ second.world_to_camera[:3, :3].T
-    # sine and cosine, so that small angles keep their digits
+    # Uses sine and cosine, so that small angles keep their digits.
     sine = torch.stack(
         [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
     )
@@ -66,7 +66,7 @@ def angle_between(first: Camera, second: Camera) -> float:
 
 
 def ring(count: int, radius: float = 3.0) -> list[Camera]:
-    """Cameras around the origin that look at it."""
+    """Return cameras around the origin that look at it."""
     origin, up = torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
     angles = [2 * math.pi * i / count for i in range(count)]
     return [
@@ -139,7 +139,7 @@ def test_no_camera_across_a_jump_or_a_wide_turn():
     near, far = ring(20), [replace(c, name="far " + c.name) for c in ring(20, radius=30)]
     found = names(held_out_cameras([*near[:8], *far[:8]], range(16)))
     assert found == [f"{i}–{i + 1}" for i in range(7)] + [f"far {i}–far {i + 1}" for i in range(7)]
-    assert len(held_out_cameras(ring(6), range(6))) == 5  # 60 degrees each
+    assert len(held_out_cameras(ring(6), range(6))) == 5  # 60 degrees between neighbors
     assert held_out_cameras(ring(5), range(5)) == []
     assert held_out_cameras([cameras(1)[0], blind_camera()], [0, 1]) == []
     upright = cameras(4)
@@ -188,14 +188,14 @@ def lpips(vgg16_weights) -> Lpips:
     return Lpips("alex")
 
 
-#: Shorter side of the coarsest scale where a test wants two scales of its small views.
+#: Shorter side of the coarsest scale in tests that need two scales of their small views.
 COARSEST = 40
 
 
 def novel_views(
     scene: Scene, views: list[Camera], network: FeatureNetwork, coarsest: int = COARSEST_SHORTER_SIDE, **options
 ) -> NovelViews:
-    """Of a job whose every view is covered and of one size."""
+    """Make the novel views of a job whose views are all covered and have the same size."""
     loss = SosLoss(network, coarsest=coarsest)
     rasterizer = make_rasterizer("cpu", scene, background=(0.2, 0.3, 0.4))
     targets = {}
@@ -211,7 +211,7 @@ def novel_views(
 
 
 def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | None) -> dict[int, float]:
-    """Scale to the sum over layers of w_G mean((G - G_v)^2), float64."""
+    """Compute the sum over layers of w_G mean((G - G_v)^2) by scale, in float64."""
 
     def gram(features: Tensor, position: Tensor | None) -> Tensor:
         flat = features.reshape(-1, features.shape[-1])
@@ -239,7 +239,7 @@ def test_gram_distance_is_that_of_float64(tiny_weights, network, scene: Scene, w
     views = cameras(6)
     measured = novel_views(scene, views, network, coarsest=COARSEST, weighted=weighted)
     assert measured.views == [0, 1, 2, 3]
-    sh_dc = 4 * scene.sh_dc  # colors far outside 0..1
+    sh_dc = 4 * scene.sh_dc  # colors far outside 0 to 1
     reference = make_rasterizer("reference", scene, background=(0.2, 0.3, 0.4))
     painting = resize_area(style(), pyramid.style_size((96, 80), (48, 64)))
     expected: dict[int, float] = {0: 0.0, 1: 0.0}
@@ -394,7 +394,7 @@ def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, v
 
 
 def test_a_part_of_a_large_scene_covers_as_much_and_lies_as_deep() -> None:
-    """A ball of small Gaussians, and about every fourth of them at twice the size."""
+    """The sample of a ball of small Gaussians has about every fourth of them, at twice the size."""
     camera = cameras()[0]
     scene = ball(4001)
     scene = replace(scene, scales=scene.scales - 1.5)

@@ -1,29 +1,30 @@
-"""Comparing two rasterizers that may decide differently where a cut-off hangs by a thread.
+"""Comparison of two rasterizers that may decide differently at pixels very close to a cutoff.
 
-A contribution is skipped below ALPHA_MIN and a pixel ends at TRANSMITTANCE_MIN. Where a value lies within rounding of
-its cut, one rasterizer may keep what the other skips: a step of up to a few gray levels that is no error. Everywhere
-else the tolerance holds, and such steps are counted.
+A contribution is skipped below ALPHA_MIN, and a pixel ends at TRANSMITTANCE_MIN. If a value is within rounding error of
+such a cutoff, one rasterizer may keep what the other skips: a jump of up to a few gray levels that is not an error.
+These jumps are counted; everywhere else the tolerance applies.
 """
 
 from __future__ import annotations
 
 from torch import Tensor
 
-#: A contribution just above ALPHA_MIN, or a crossing Gaussian at a transmittance of up to 1e-2, times a color up to 2.
+#: Largest jump: a contribution just above ALPHA_MIN, or a Gaussian that crosses a transmittance of up to 1e-2, times a
+#: color up to 2.
 LARGEST_STEP = 2e-2
 
 
 def assert_close_outside_band(
     actual: Tensor,  # [h, w, ...]
     expected: Tensor,  # [h, w, ...]
-    band: Tensor,  # [h, w] bool, where a decision is close
+    band: Tensor,  # [h, w] bool, close to a cutoff
     *,
     tolerance: float,
     largest_share: float = 1e-3,
 ) -> int:
     """Assert equality within `tolerance` where `band` is False, and within LARGEST_STEP where it is True.
 
-    Also that no more than `largest_share` of all pixels make such a step. Returns how many do.
+    Also asserts that at most `largest_share` of all pixels jump. Returns the number of those that do.
     """
     assert actual.shape == expected.shape, f"shapes {tuple(actual.shape)} and {tuple(expected.shape)}"
     difference = (actual.double() - expected.double()).abs()
@@ -41,6 +42,6 @@ def assert_close_outside_band(
 
 
 def relative_error(actual: Tensor, expected: Tensor) -> float:
-    """|actual - expected| / |expected| in the Euclidean norm; 0 where both are 0."""
+    """Return |actual - expected| / |expected| in the Euclidean norm; 0 if both are 0."""
     difference = float((actual.double() - expected.double()).norm())
     return difference / float(expected.double().norm()) if difference else 0.0

@@ -1,4 +1,4 @@
-"""The comparison helper finds what it must and forgives what it may."""
+"""Tests of the comparison of rasterizers: it detects errors and tolerates jumps at cutoffs."""
 
 from __future__ import annotations
 

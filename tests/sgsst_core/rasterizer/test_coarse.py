@@ -1,4 +1,4 @@
-"""`coarse` against the float64 reference and the box average, and the edges of both."""
+"""Tests of `coarse` against the float64 reference with box average, including edge cases."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, single, turned_pose
 
-#: Float32 moves a decision only within this relative distance of its cut.
+#: Relative distance from a cutoff within which float32 may decide otherwise.
 CLOSE = 2e-5
 SCALES = [1, 2, 3, 4, 5]
 BACKGROUND = (1.0, 0.25, 0.5)
 
-#: No side is a multiple of 16 but of the last, which a square of any tested scale divides.
+#: Sizes with no side a multiple of 16, except for the last, which is divisible by the squares of all tested scales.
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "cloud": lambda: (cloud(), camera()),
     "turned": lambda: (cloud(600, seed=1), camera(73, 39, pose=turned_pose())),
@@ -41,13 +41,13 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 
 
 def coarse_pixels(view: Camera, scale: int, seed: int = 6) -> Tensor:
-    """A random gradient [H >> scale, W >> scale, 3] of a coarse image, float32."""
+    """Return a random gradient [H >> scale, W >> scale, 3] of a coarse image, float32."""
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(view.height >> scale, view.width >> scale, 3, generator=generator)
 
 
 def upscaled(gradient: Tensor, view: Camera, scale: int) -> Tensor:
-    """D^T of a coarse gradient: [H, W, 3], in its dtype."""
+    """Return D^T of a coarse gradient, [H, W, 3], in its dtype."""
     whole = torch.zeros(view.height, view.width, 3, dtype=gradient.dtype)
     add_upscaled_(whole, gradient, scale)
     return whole
@@ -87,7 +87,7 @@ def test_gradient_is_the_transpose(scale: int) -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_what_fills_no_square_does_not_count(scale: int) -> None:
-    """The Gaussian covers the last pixel of the last row alone, which is in no square: nothing is kept of it."""
+    """The Gaussian covers only the last pixel of the last row. It belongs to no square, so nothing is cached for it."""
     side = 1 << scale
     view = camera(3 * side + 1, 2 * side + 1)
     corner = ((view.width - 0.5 - view.cx) / view.fx, (view.height - 0.5 - view.cy) / view.fy, 1.0)
@@ -170,7 +170,10 @@ def test_background_fills_what_is_not_covered() -> None:
 
 
 def test_many_gaussians_in_a_pixel_lose_no_digits() -> None:
-    """One coarse pixel sees 17,000 Gaussians: one float32 sum of all is wrong by 1e-6, one a pixel of `cpu` is not."""
+    """One coarse pixel sees 17,000 Gaussians.
+
+    A single float32 sum over all of them is wrong by 1e-6; separate sums per pixel, as in `cpu`, are not.
+    """
     count, view = 20_000, camera(16, 16, focal=16.0)
     generator = torch.Generator().manual_seed(2)
     scene = replace(

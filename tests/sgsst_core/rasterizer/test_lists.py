@@ -1,4 +1,4 @@
-"""Depth order and raster lists, built on all cores, against plain loops; any number of threads gives the same."""
+"""Tests that depth order and tile intersections match plain loops and do not depend on the number of threads."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_values_are_in_order_of_depth(threads: None) -> None:
 
 
 def listed_in_turn(scene: Scene, view: Camera) -> list[list[int]]:
-    """Ranks of each raster tile: one Gaussian after the other, whose own lists tell which tiles it touches."""
+    """Return the ranks in each raster tile, from the intersections of one Gaussian at a time."""
     gaussians = project(scene, view).gaussians
     tiles: list[list[int]] = [[] for _ in range(-(-view.width // 16) * -(-view.height // 16))]
     for rank, gaussian in enumerate(gaussians):
@@ -71,7 +71,7 @@ def listed_in_turn(scene: Scene, view: Camera) -> list[list[int]]:
 
 
 def check_slots(lists: RasterLists) -> None:
-    """Every pair has a slot of its own, those of a Gaussian side by side, from its first tile to its last."""
+    """Check that every pair has a slot, and that those of a Gaussian are adjacent and ordered by tile."""
     order = np.argsort(lists.slots, kind="stable")
     assert np.array_equal(lists.slots[order], np.arange(len(lists.slots)))
     assert np.array_equal(
@@ -91,7 +91,7 @@ def test_lists_are_those_of_one_gaussian_after_the_other(count: int, threads: No
 
 
 def check_same(found: RasterLists, expected: RasterLists) -> None:
-    """The same bits in every array."""
+    """Check that all arrays are bit-identical."""
     for name in ("starts", "ranks", "slots", "first_slots"):
         own, other = getattr(found, name), getattr(expected, name)
         assert own.dtype == other.dtype
@@ -153,7 +153,7 @@ def test_lists_beside_others_keep_what_these_leave_of_their_bytes() -> None:
     host.lists(views[0])
     guests[0].lists(views[1])
     guests[1].lists(views[2])
-    guests[1].lists(views[0])  # all bytes are taken
+    guests[1].lists(views[0])  # uses up all bytes
     assert kept() == [[True, False, False], [False, True, False], [False, False, True]]
     check_same(guests[1].lists(views[0]), host.lists(views[0]))
     host.lists(views[1])

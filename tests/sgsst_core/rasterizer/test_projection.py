@@ -1,4 +1,4 @@
-"""The compiled projection against plain PyTorch and against exact rational arithmetic."""
+"""Tests of the compiled projection against plain PyTorch and against exact rational arithmetic."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_agrees_with_plain_pytorch() -> None:
 
 @pytest.mark.parametrize("length", [1.0, 1e3, 1e6])
 def test_needles_keep_their_width(length: float) -> None:
-    """The determinant of a slanted needle, a million times longer than wide, against exact arithmetic."""
+    """The determinant of a slanted needle, a million times longer than wide, matches exact arithmetic."""
     half = math.sqrt(0.5)
     view = camera(focal=64.0)
     scene = single((0.0, 0.0, 4.0), scales=(length, length * 1e-6, length * 1e-6), quat=(math.cos(0.3), 0, 0, half))
@@ -62,7 +62,7 @@ def test_needles_keep_their_width(length: float) -> None:
     eps = Fraction(EPS2D)
     p, q, r = m0[0] ** 2 + m0[1] ** 2 + eps, m0[0] * m1[0] + m0[1] * m1[1], m1[0] ** 2 + m1[1] ** 2 + eps
     det = p * r - q * q
-    # 1e-7: the projection takes exponentials in float64 of logarithms in float32, as this test does
+    # The tolerance is 1e-7, because projection and test compute float64 exponentials of float32 logarithms.
     assert row[Column.SKEW] == pytest.approx(float(q / r), rel=1e-12)
     assert row[Column.U_SCALE] ** 2 == pytest.approx(_HALF_LOG2_E * float(r / det), rel=1e-9)
     assert row[Column.W_SCALE] ** 2 == pytest.approx(_HALF_LOG2_E / float(r), rel=1e-12)
@@ -100,7 +100,7 @@ def test_equal_depths_keep_the_order_of_the_file() -> None:
 def test_values_without_a_projection_are_left_out_and_counted() -> None:
     scene = together([((0, 0, 4), 0.5, (0.1,) * 3, (1, 0, 0, 0))] * 4)
     scene.quats[1] = 0
-    scene.quats[2] = 1e-30  # short, but a direction
+    scene.quats[2] = 1e-30  # short, but still a direction
     scene.scales[3] = 500  # e^500 squared overflows
     found = project(scene, camera())
     assert found.gaussians.tolist() == [0, 2]

@@ -1,4 +1,4 @@
-"""`cpu` and `cached` against `reference`, `reference` against a loop over pixels, and the edges of all of them."""
+"""Tests of `cpu` and `cached` against `reference`, and of `reference` against a loop over pixels, with edge cases."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from tests.sgsst_core.splat_scenes import (
     turned_pose,
 )
 
-#: Float32 moves a decision only within this relative distance of its cut.
+#: Relative distance from a cutoff within which float32 may decide otherwise.
 CLOSE = 2e-5
 FAST = ["cpu", "cached"]
 BLACK = (0.0, 0.0, 0.0)
@@ -68,7 +68,7 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 
 
 def _needles() -> Scene:
-    """A million times longer than wide, at all angles, some far longer than the view."""
+    """Return needles a million times longer than wide, at all angles, some far longer than the view."""
     scene = cloud(200, seed=9)
     long = torch.linspace(-3, 7, 200)[:, None]
     return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
@@ -96,14 +96,17 @@ def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera
         assert torch.equal(coverage, plain)
         assert torch.equal(weights, gradient)
         assert_close_outside_band(coverage, expected, band, tolerance=1e-4)
-        # A pixel where a cut-off flips moves weights of at most 1 from one Gaussian to others.
+        # At a pixel where a cutoff flips, a weight of at most 1 moves from one Gaussian to others.
         assert float((weights - summed).abs().max()) <= 1e-4 * float(summed.max()) + 2 * int(band.sum())
 
 
 def assert_agree(
     names: list[str], scene: Scene, view: Camera, background: tuple[float, float, float], rows: Rows | None = None
 ) -> int:
-    """Images within 1e-4, gradients within 1e-5, but where a cut-off flips; returns how many pixels flipped at most."""
+    """Assert that images agree within 1e-4 and gradients within 1e-5, except where a cutoff flips.
+
+    Returns the largest number of flipped pixels.
+    """
     rows = (0, view.height) if rows is None else rows
     colors, pixels = colors_of(scene), pixels_like(view)[rows[0] : rows[1]]
     reference = ReferenceRasterizer(scene, background=background)
@@ -160,7 +163,7 @@ def test_gradient_is_the_transpose_and_agrees_with_differences(name: str) -> Non
     assert float((gradient * colors).sum()) == pytest.approx(
         float(((rasterizer.render(colors, view).double() - black) * pixels).sum()), rel=1e-5, abs=1e-4
     )
-    # The image is linear in the colors, so a difference over a step of 1 is exact but for rounding.
+    # The image is linear in the colors, so a difference over a step of 1 is exact up to rounding.
     for gaussian in gradient.abs().sum(1).topk(5).indices.tolist():
         changed = colors.clone()
         changed[gaussian, 1] += 1
@@ -184,7 +187,7 @@ def test_bands_put_together_are_the_whole(name: str, cuts: tuple[int, ...]) -> N
         assert torch.equal(image, whole.render(colors, view))
         assert torch.equal(coverage, whole.coverage(view))
     assert relative_error(gradient, whole.color_gradient(pixels, view)) < 1e-6
-    # and bands that the whole view's operator serves are the same
+    # Bands give the same result from the cached operator of the whole view.
     of_band = [rasterizer.color_gradient(pixels[5:20], view, (5, 20)) for rasterizer in (whole, parts)]
     assert relative_error(*of_band) < 1e-6
     assert torch.allclose(whole.render(colors, view, (5, 20)), image[5:20], atol=1e-14)
@@ -264,7 +267,7 @@ def test_equal_depths_blend_in_the_order_of_the_file(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["reference", *FAST])
 def test_a_gaussian_that_would_end_a_pixel_is_not_blended(name: str) -> None:
-    """Two opaque Gaussians would leave (1 - 0.99)^2 = TRANSMITTANCE_MIN: the second one already is cut."""
+    """Two opaque Gaussians would leave (1 - 0.99)^2 = TRANSMITTANCE_MIN, so the second one is already skipped."""
     scene = together([((0, 0, z), 0.9999, (50.0,) * 3, (1, 0, 0, 0)) for z in (3.0, 4.0, 5.0)])
     image = make_rasterizer(name, scene).render(torch.eye(3), camera(20, 20))
     assert float((image[..., 0] - 0.99).abs().max()) < 1e-6
@@ -273,10 +276,10 @@ def test_a_gaussian_that_would_end_a_pixel_is_not_blended(name: str) -> None:
 
 
 def test_a_far_off_center_keeps_its_digits() -> None:
-    """A Gaussian of a billion pixels whose edge crosses the view: float32 offsets would be off by tens of pixels."""
+    """The edge of a Gaussian of a billion pixels crosses the view; float32 offsets would be off by tens of pixels."""
     scene = single((-4e6, 0, 4.0), scales=(2e6, 1e-3, 1e-3), opacity=0.9)
     view = camera(64, 16, focal=1e3)
-    # the perspective is linearized at the frustum's edge, so what matters is agreement, not the picture
+    # The perspective is linearized at the edge of the frustum, so only the agreement matters, not the image.
     assert_agree(FAST, scene, view, BLACK)
     assert float(CpuRasterizer(scene).coverage(view).max()) > 0
 
@@ -321,7 +324,7 @@ def test_half_precision_weights_are_rounded_to_float16() -> None:
     colors, pixels = colors_of(scene), pixels_like(view)
     full, half = CachedRasterizer(scene), CachedRasterizer(scene, precision="half")
     image = full.render(colors, view)
-    # each weight has a relative error of at most 2^-11, and all are positive
+    # Each weight has a relative error of at most 2^-11, and all weights are positive.
     assert bool(((half.render(colors, view) - image).abs() <= 2**-11 * image + 1e-6).all())
     assert relative_error(half.color_gradient(pixels, view), full.color_gradient(pixels, view)) < 5e-4
     assert half.kept_bytes < 0.65 * full.kept_bytes
@@ -406,7 +409,7 @@ def test_too_many_intersections_are_an_error_with_figures() -> None:
 
 
 def test_kernels_run_where_no_folder_can_be_written(tmp_path: Path) -> None:
-    """Machine code is then kept in memory only: Numba's own answer would be an exception at import."""
+    """Machine code is then kept in memory only; Numba itself would raise an exception at import."""
     package = Path(__file__).resolve().parents[3]
     code = (
         "import numba.core.caching as c\n"
@@ -427,7 +430,10 @@ def test_kernels_run_where_no_folder_can_be_written(tmp_path: Path) -> None:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """PyTorch on one thread: the reference makes thousands of small operations, for which waking threads costs more."""
+    """Run PyTorch on one thread.
+
+    The reference makes thousands of small operations, for which waking threads costs more than the work.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -453,7 +459,7 @@ def test_real_scenes_agree_with_the_reference(shared_data: Path, name: str, side
 
 
 def test_a_real_scene_looks_like_its_photo(shared_data: Path) -> None:
-    """Spherical harmonics, projection, order and blending together: 28 dB on average was measured after training."""
+    """The test covers SH, projection, order and blending together; after training, 28 dB on average were measured."""
     scene = read_scene(shared_data / "scenes" / "snowmiku_plush" / "point_cloud.ply").scene
     view = read_cameras(shared_data / "scenes" / "snowmiku_plush" / "cameras.json")[0]
     colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, view))
@@ -465,7 +471,7 @@ def test_a_real_scene_looks_like_its_photo(shared_data: Path) -> None:
 
 
 def test_kernels_leave_the_number_of_torch_threads_alone() -> None:
-    """In a fresh process: Numba's first kernel sets the OpenMP library that PyTorch may share to all cores."""
+    """In a fresh process, Numba's first kernel sets an OpenMP library that PyTorch may share to all cores."""
     code = (
         "import torch; torch.set_num_threads(1)\n"
         "from tests.sgsst_core.splat_scenes import camera, cloud\n"

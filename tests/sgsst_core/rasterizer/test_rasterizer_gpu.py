@@ -1,4 +1,4 @@
-"""gsplat's kernels against the reference with the same clamp; and the errors where gsplat or the GPU is missing."""
+"""Tests of gsplat's kernels against the reference with the same clamp, and of the errors without gsplat or GPU."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HAS_GSPLAT = importlib.util.find_spec("gsplat") is not None
 HAS_GPU = torch.cuda.is_available()
 needs_gpu = pytest.mark.skipif(not HAS_GPU, reason="no CUDA GPU that PyTorch can use")
 needs_gsplat = pytest.mark.skipif(not HAS_GSPLAT, reason="gsplat, the extra [cuda], is not installed")
-#: gsplat projects in float32 and takes exponentials with the fast intrinsic.
+#: gsplat projects in float32 and computes exponentials with the fast intrinsic.
 CLOSE = 2e-3
 
 

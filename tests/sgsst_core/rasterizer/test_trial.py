@@ -1,4 +1,4 @@
-"""Trials of rasterizers that compile their kernels: one process of a machine at a time."""
+"""Tests that trials of rasterizers, which compile their kernels, run in one process per machine at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPAWN = multiprocessing.get_context("spawn")
 
 
 def build(folder: Path) -> None:
-    """What fails where another process does the same at the same time, as a compiler that cleans up first."""
+    """Fail if another process builds at the same time, like a compiler that cleans up first."""
     mark = folder / "building"
     mark.touch(exist_ok=False)
     time.sleep(0.05)

@@ -1,7 +1,7 @@
-"""`triton` against `reference` and the lists of `cpu`: on a GPU where there is one, else in Triton's interpreter.
+"""Tests of `triton` against `reference` and the intersections of `cpu`, on a GPU or in Triton's interpreter.
 
-The interpreter runs the kernels' own source on CPU tensors; that they can be compiled is shown for real targets by
-`benchmarks.triton_targets`, which needs no GPU either.
+The interpreter runs the kernels' own source on CPU tensors. `benchmarks.triton_targets` checks that they compile for
+real targets; it needs no GPU either.
 """
 
 from __future__ import annotations
@@ -37,24 +37,27 @@ ROOT = Path(__file__).resolve().parents[3]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
 BACKGROUND = (1.0, 0.25, 0.5)
-#: Float32 moves a decision only within this relative distance of its cut.
+#: Relative distance from a cutoff within which float32 may decide otherwise.
 CLOSE = 2e-5
 
 
 def needles() -> Scene:
-    """A million times longer than wide, at all angles, some far longer than the view."""
+    """Return needles a million times longer than wide, at all angles, some far longer than the view."""
     scene = cloud(60, seed=9)
     long = torch.linspace(-3, 7, 60)[:, None]
     return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
 
 
 def opaque() -> Scene:
-    """Every pixel ends behind a few Gaussians: what a backward pass that divides by 1 - alpha gets wrong."""
+    """Return Gaussians that end every pixel after a few of them.
+
+    Backward passes that divide by 1 - alpha fail on them.
+    """
     return replace(cloud(300, seed=2, log_scale=-1.5), opacities=torch.full((300,), 7.0))
 
 
 def far_away() -> tuple[Scene, Camera]:
-    """A million units from the origin of the world, where float32 has steps of 1/16."""
+    """Return a scene and a camera a million units from the origin, where float32 positions are 1/16 apart."""
     scene, view = cloud(150, seed=12), camera(40, 33)
     offset = torch.tensor([1e6, -2e6, 1.5e6])
     means = scene.means.double().round(decimals=0) + offset.double()
@@ -110,7 +113,7 @@ def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera
     band = reference.near_cutoff(view, CLOSE)
     expected, summed = reference.survey(view)
     assert_close_outside_band(coverage.cpu(), expected, band, tolerance=1e-5)
-    # A pixel where a cut-off flips moves weights of at most 1 from one Gaussian to others.
+    # At a pixel where a cutoff flips, a weight of at most 1 moves from one Gaussian to others.
     assert float((weights.cpu() - summed).abs().max()) <= 1e-5 * float(summed.max()) + 2 * int(band.sum())
     assert relative_error(weights, gradient) < 1e-6
 
@@ -196,14 +199,14 @@ def test_made_by_its_name() -> None:
 
 @pytest.mark.slow
 def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
-    """Survey, plan, both phases: the whole way of a job through the rasterizer's protocol."""
-    # The other tests need not even pydantic: they run on a bare machine that has a GPU.
+    """The whole job uses the rasterizer's protocol: survey, plan, both phases."""
+    # The other tests do not even need pydantic, so they run on a bare machine with a GPU.
     from sgsst_core.settings import make_settings
     from sgsst_core.stylizing.stylizer import Stylizer
     from tests.small_scenes import cameras, style, wall
 
     settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=16)
-    views = cameras(2, 32, 32)  # so small that a step in the interpreter takes seconds
+    views = cameras(2, 32, 32)  # so small that a step in the interpreter takes only seconds
     losses = {}
     for name in ("cpu", "triton"):
         stylizer = Stylizer.planned(wall(), views, style(), settings, weights=tiny_weights, rasterizer=name)
@@ -227,7 +230,7 @@ def test_without_a_gpu_the_error_says_what_to_do() -> None:
 
 @pytest.mark.slow
 def test_kernels_compile_for_real_targets_within_their_registers() -> None:
-    """Spilled registers cost memory traffic in the innermost loop: none on NVIDIA, few on AMD."""
+    """Spilled registers cost memory traffic in the innermost loop: none are allowed on NVIDIA, few on AMD."""
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     command = [sys.executable, "-m", "benchmarks.triton_targets"]
     ended = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)

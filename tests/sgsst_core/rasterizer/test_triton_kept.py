@@ -1,4 +1,4 @@
-"""Kept weights on GPUs against `reference` and `triton`: on a GPU where there is one, else in Triton's interpreter."""
+"""Tests of cached weights on GPUs against `reference` and `triton`, on a GPU or in Triton's interpreter."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ pytest.importorskip("triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.usefixtures("one_thread"), *([pytest.mark.gpu] if DEVICE == "cuda" else [])]
 BACKGROUND = (1.0, 0.25, 0.5)
-#: Float32 moves a decision only within this relative distance of its cut.
+#: Relative distance from a cutoff within which float32 may decide otherwise.
 CLOSE = 2e-5
-#: Of images and gradients, relative to exact weights; each weight of the second is off by at most 2^-11.
+#: Relative errors of images and gradients. Weights in half precision are off by at most 2^-11 each.
 ERRORS: dict[Precision, float] = {"float32": 5e-6, "half": 2**-11}
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
@@ -82,13 +82,13 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera]) -> None:
 
 
 def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
-    """Down to the least weights: a faint Gaussian behind opaque ones."""
+    """The bound holds down to the smallest weights, of a faint Gaussian behind opaque ones."""
     scene, view = cloud(150, seed=7, log_scale=-1.0), camera(18, 17)
     uncached = on_device(scene)
     exact, half = (CachedRasterizer(scene, uncached=uncached).count(view).keep(form) for form in ERRORS)
     weights = exact.weights.double()  # type: ignore[attr-defined]
     rounded = half.weights.double() / half.scale  # type: ignore[attr-defined]
-    # On a GPU the exact ones come from another kernel, which may round differently.
+    # On a GPU the exact weights come from another kernel, which may round differently.
     assert bool(((rounded - weights).abs() <= (2**-11 + 1e-6) * weights).all())
     assert 0 < float(weights[weights > 0].min()) < 1e-5
     assert half.weights.dtype == torch.float16  # type: ignore[attr-defined]
@@ -112,14 +112,14 @@ def test_bands_put_together_are_the_whole() -> None:
     whole, parts = (CachedRasterizer(scene, uncached=uncached) for _ in range(2))
     bands = [(0, 16), (16, 21), (21, 35)]
     image, gradient = whole.render(colors, view), whole.color_gradient(pixels, view)
-    # A block that a band cuts may have fewer pieces, which are then added up in other groups.
+    # A block that a band divides may have fewer pieces, which are then summed in other groups.
     together = torch.cat([parts.render(colors, view, rows) for rows in bands])
     assert float((together - image).abs().max()) < 1e-6
     assert torch.equal(together[:16], image[:16])
     assert torch.equal(torch.cat([parts.coverage(view, rows) for rows in bands]), whole.coverage(view))
     own = [parts.color_gradient(pixels[start:stop], view, (start, stop)) for start, stop in bands]
     assert relative_error(torch.stack(own).sum(0), gradient) < 1e-6
-    # and a band that the whole view's weights serve is the same
+    # A band gives the same result from the cached weights of the whole view.
     assert torch.equal(whole.render(colors, view, (16, 21)), image[16:21])
     assert relative_error(whole.color_gradient(pixels[16:21], view, (16, 21)), own[1]) < 1e-6
 
@@ -172,7 +172,7 @@ def test_a_piece_holds_a_weight_and_every_slot_is_filled_once() -> None:
 
 @contextmanager
 def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Names of the calls that wait for a device, where it is one."""
+    """Yield the names of the calls that would wait for a device."""
     found: list[str] = []
 
     def noted(name: str) -> Callable[..., Any]:
@@ -191,7 +191,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 
 def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The wait of the lists is for their length, that of the weights for the number of pieces."""
+    """Intersections wait for their length, and weights for the number of pieces."""
     scene, view = cloud(60, seed=22), camera(20, 17)
     kept, colors, pixels = kept_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
     kept.uncached.lists(view)
@@ -216,7 +216,7 @@ def test_made_by_its_name() -> None:
 # --- plan and job --------------------------------------------------------------------------------------------------
 
 
-#: So small that a step in the interpreter takes seconds.
+#: So small that a step in the interpreter takes only seconds.
 VIEWS = cameras(2, 32, 24)
 
 

@@ -1,4 +1,4 @@
-"""A report as `build_report` makes it, without a job."""
+"""Sample report with the structure of `build_report`, made without a job."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sgsst_core.loss.terms import TERMS
 
 
 def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, Any]:
-    """A report of version 2 with a value in every field, of so many steps."""
+    """Return a report of version 2 with a value in every field and the given number of steps."""
     history = [_record(step, "coarse" if step <= coarse else "sos", scales) for step in range(1, coarse + sos + 1)]
     seconds = history[-1]["seconds"] if history else 0.0
     before = {str(scale): _terms(1e6 / 4**scale) for scale in range(scales)}
@@ -106,7 +106,7 @@ def _record(step: int, stage: str, scales: int) -> dict[str, Any]:
 
 
 def _decision(index: int) -> dict[str, Any]:
-    """Decisions with and without seconds and bytes."""
+    """Return a decision, with or without seconds and bytes."""
     saved = {"seconds": 0.25 * index or None, "bytes": 4_000_000 * index or None}
     texts = {name: f"{name} number {index}" for name in ("item", "decision", "reason", "error")}
     return {**texts, **saved}

@@ -28,12 +28,15 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def finished(tiny_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evaluation]:
-    """Six views of a ball of which one sees nothing, after seven steps; the loss before and after."""
+    """Run seven steps on six views of a ball, one of which sees nothing.
+
+    Returns the job, and the loss before and after.
+    """
     views = [*cameras(3), blind_camera(), *cameras(2)]
     plain: dict[str, Any] = {
         "training_background": "background",
         "warm_start": False,
-    }  # steps' losses compare with the start's
+    }  # makes the losses of steps comparable with the start's
     settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3, **plain)
     stylizer = Stylizer.planned(ball(), views, style(), settings, weights=tiny_weights)
     before = stylizer.evaluate(stylizer.evaluation_views)
@@ -56,7 +59,7 @@ def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluat
     stylizer, before, after = finished
     report = build_report(stylizer, sources, "finished", before, after)
     assert report["version"] == REPORT_VERSION
-    assert report["graphs"] is None  # a CPU has none
+    assert report["graphs"] is None  # there are no graphs on a CPU
     assert report["steps"] == {"coarse": {"planned": 0, "done": 0}, "sos": {"planned": 7, "done": 7}}
     told = {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2, "refined": None}
     assert report["scene"] == told
@@ -77,7 +80,10 @@ def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluat
 def test_first_and_later_visits_are_told_apart(
     finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Steps of 9, 5, 2, 4 and 2 s; the first one has the style in it. With several views to a step nothing is known."""
+    """Steps take 9, 5, 2, 4 and 2 s; the first one includes the style.
+
+    With several views per step, first visits cannot be distinguished.
+    """
     stylizer, before, after = finished
     visits = [(1, 9.0), (4, 14.0), (1, 16.0), (0, 20.0), (4, 22.0)]
     history = [
@@ -101,7 +107,7 @@ def test_what_was_measured_and_its_share(
     monkeypatch.setitem(stylizer.seconds_by_part, "measuring", 30.0)
     entries = [
         {"step": 0, "novel_views": None, "approximation": None, "novel_view_names": ["a", "b"], "seconds": 9.0},
-        {"step": 7, "novel_views": None, "approximation": None},  # of a version that did not tell
+        {"step": 7, "novel_views": None, "approximation": None},  # from a version that did not record this
     ]
     monkeypatch.setattr(stylizer, "measured", entries)
     monkeypatch.setattr(stylizer, "plan", replace(stylizer.plan, prediction=Prediction(1, 1, 1, job=450, measuring=50)))
@@ -138,7 +144,7 @@ def test_losses_in_the_report_are_those_of_the_steps(
 
 
 def test_what_the_time_bought(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
-    """Two views a round: the mean of the last two losses counts."""
+    """With two views per round, the mean of the last two losses counts."""
     stylizer = finished[0]
     kept, seconds, covered = stylizer.history, stylizer.seconds, stylizer.views.covered
     losses = [8.0, 8.0, 4.0, 4.0, 0.48, 0.48, 0.48]
@@ -205,7 +211,7 @@ def test_contact_sheet_shows_style_original_and_stylized(
     with Image.open(tmp_path / "s.jpg") as image:
         assert image.format == "JPEG"
         sheet = np.asarray(image, dtype=np.float64) / 255
-    # cells of 64x48 views are 440x330; the style's column, 275 wide, comes first
+    # Cells of 64x48 views are 440x330; the first column is the style, 275 wide.
     left, cells = 12 + 275 + 12, []
     for top in (18 + 12, 18 + 12 + 330 + 18 + 12):
         cell = torch.from_numpy(sheet[top : top + 330, left : left + 440]).permute(2, 0, 1)

@@ -27,7 +27,7 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.report.sample import sample_report
 from tests.small_scenes import ball, cameras, style
 
-#: What the layout of a figure cannot do it says in a warning.
+#: Warning of matplotlib if it cannot lay out a figure.
 pytestmark = pytest.mark.filterwarnings("error")
 
 VOID = {"meta", "link", "img", "input", "br", "hr"}
@@ -35,7 +35,7 @@ HOSTILE = '"><script>alert(\'x\')</script><b onclick="y">&amp; {{ 7 * 7 }} $x^2$
 
 
 class Page(HTMLParser):
-    """Elements and text of a page; fails where tags do not nest."""
+    """Elements and text of a page; parsing fails if tags do not nest."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -110,12 +110,12 @@ def parsed(report: dict[str, Any], sheet: bytes | None = None) -> Page:
 
 
 def parsed_without_figures(report: dict[str, Any]) -> Page:
-    """Figures take most of a page's time, and some tests look at other things."""
+    """Parse a page without figures, which take most of the time."""
     return parsed({**report, "history": []})
 
 
 def losses_alone(coarse: int = 6, sos: int = 12) -> dict[str, Any]:
-    """A report whose only figures are those of the loss."""
+    """Return a report whose only figures are those of the loss."""
     report = sample_report(coarse, sos)
     for record in report["history"]:
         del record["memory_bytes"]
@@ -220,7 +220,7 @@ def test_terms_that_a_loss_does_not_have_are_not_drawn() -> None:
     for record in report["history"]:
         for terms in record["scales"].values():
             terms["nearest"] = 0.0
-            del terms["content"]  # as a report of before there was the term
+            del terms["content"]  # as in a report from before this term existed
     words = Page(draw_figures(report)[1].svg["seconds"]).text
     assert TERMS["gram"] in words
     assert TERMS["nearest"] not in words
@@ -228,7 +228,7 @@ def test_terms_that_a_loss_does_not_have_are_not_drawn() -> None:
 
 
 def test_both_axes_of_the_loss_are_logarithmic() -> None:
-    """Novel points of which each has twice the step and half the value of the one before lie evenly spaced."""
+    """Points with twice the step and half the value of the previous one are evenly spaced."""
     report = sample_report(0, 64)
     for moment, step in zip(report["novel_views"]["moments"], (0, 4, 8), strict=True):
         moment.update(step=step, gram_relative=1 / step if step else 1.0)
@@ -270,7 +270,7 @@ def test_hostile_names_are_text() -> None:
 
 def test_names_that_are_no_unicode_cost_nothing_but_themselves(tmp_path: Path) -> None:
     report = sample_report()
-    report["scene"]["path"] = "caf\udce9.ply"  # as Python names a file of another encoding
+    report["scene"]["path"] = "caf\udce9.ply"  # Python's name for a file in another encoding
     write_page(tmp_path / "page.html", report, None)
     assert "caf?.ply" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
@@ -354,7 +354,7 @@ def test_held_out_moments_are_in_a_table() -> None:
     page = parsed_without_figures(sample_report())
     titles = ["scale 0, absolute", "RMSE, short range", "LPIPS, short range", "RMSE, long range"]
     assert all(title in page.text for title in titles)
-    assert "LPIPS, long range" not in page.text  # a column without a value
+    assert "LPIPS, long range" not in page.text  # a column without values
     place = page.cells.index("0.8 s")
     row = ["4", "0.8 s", "0.45", "45,000", "13,500", "0.0445", "0.0775", "83 %", "0.0445", "83 %"]
     assert page.cells[place - 1 : place + 9] == row
@@ -369,7 +369,7 @@ def test_what_the_result_is_judged_to_be_stands_beside_the_start() -> None:
     assert page.cells[place + 1 : place + 3] == ["2 %", "2 %"]
     report["novel_views"]["judged"] = None
     assert "distance to the style" not in parsed_without_figures(report).text
-    del report["novel_views"]["judged"]  # a report of a version that did not judge
+    del report["novel_views"]["judged"]  # as in a report from before there was a judgment
     assert "distance to the style" not in parsed_without_figures(report).text
 
 
@@ -416,7 +416,7 @@ def test_held_out_views_without_numbers() -> None:
 
 @pytest.mark.parametrize("missing", ["short", "long"])
 def test_views_of_one_reach_alone_leave_both_panels_their_room(missing: str) -> None:
-    """Four cameras make too few novel views for the long range: it is in no panel, and nor is its name."""
+    """Four cameras give too few novel views for the long range, which then appears in no panel and no legend."""
     report = sample_report()
     for moment in report["novel_views"]["moments"]:
         moment["consistency"]["long"] = {**moment["consistency"]["short"], "gap": 7}
@@ -432,7 +432,7 @@ def test_views_of_one_reach_alone_leave_both_panels_their_room(missing: str) -> 
 
 
 def panel_borders(svg: str) -> list[tuple[float, float]]:
-    """Left and right ends of each panel's x axis, in points."""
+    """Return the left and right ends of each panel's x axis, in points."""
     paths = [attributes["d"] or "" for tag, attributes in Page(svg).elements if tag == "path"]
     lines = [re.fullmatch(r"M ([\d.]+) ([\d.]+) L ([\d.]+) ([\d.]+)", path) for path in paths]
     axes = [line for line in lines if line and line[2] == line[4]]
@@ -441,7 +441,7 @@ def panel_borders(svg: str) -> list[tuple[float, float]]:
 
 
 def test_probes_that_no_axis_shows_are_not_drawn() -> None:
-    """A probe before the first step has no place on a logarithmic axis."""
+    """A logarithmic axis cannot show a probe before the first step."""
     report = sample_report()
     report["approximations"]["moments"] = [{**report["approximations"]["moments"][0], "step": 0}]
     figure = {figure.name: figure for figure in draw_figures(report)}["approximations"]
@@ -463,7 +463,7 @@ def test_short_histories(coarse: int, sos: int) -> None:
     assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"] == ["loss", "split"]
     styles = [attributes.get("style") or "" for tag, attributes in page.elements if tag == "use"]
     marks = [style for style in styles if re.fullmatch(r"fill: (var\([^)]*\)); stroke: \1", style)]
-    assert bool(marks) == (1 in (coarse, sos))  # a single step is a mark: no line would show it
+    assert bool(marks) == (1 in (coarse, sos))  # a single step is a marker, because a line would be invisible
 
 
 def test_no_step_at_all() -> None:
@@ -508,7 +508,7 @@ def test_extreme_losses(size: float) -> None:
 def test_long_history_stays_small() -> None:
     report = sample_report(10_000, 10_000, scales=4)
     page = parsed(report)
-    assert len(page.html.encode()) < 1_500_000  # leaves as much for the sheet
+    assert len(page.html.encode()) < 1_500_000  # leaves as much again for the sheet
     points = [attributes["d"] or "" for tag, attributes in page.elements if tag == "path"]
     assert max(path.count("L") for path in points) < 2 * PLACES + 10
 

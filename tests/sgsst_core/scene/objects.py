@@ -1,4 +1,4 @@
-"""Made objects and rooms for cameras to go around, y pointing down as in captures."""
+"""Synthetic objects and rooms for cameras to orbit, with y pointing down as in captures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UP = (0.0, -1.0, 0.0)
 
 
 def scene_of(means: Tensor, size: float | Tensor = 0.02, opacities: Tensor | None = None) -> Scene:
-    """Gaussians of standard deviations `size` (one, or [N, 3])."""
+    """Return Gaussians with standard deviations `size` (a number, or [N, 3])."""
     n = len(means)
     sizes = torch.full((n, 3), float(size)) if not isinstance(size, Tensor) else size
     return Scene(
@@ -29,13 +29,13 @@ def scene_of(means: Tensor, size: float | Tensor = 0.02, opacities: Tensor | Non
 
 
 def joined(*scenes: Scene) -> Scene:
-    """All Gaussians of several scenes."""
+    """Return all Gaussians of several scenes."""
     names = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
     return Scene(*(torch.cat([getattr(scene, name) for scene in scenes]) for name in names))
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float], count: int = 1500, seed: int = 0) -> Tensor:
-    """[count, 3] points on the faces of a box, by their areas."""
+    """Return points [count, 3] on the faces of a box, in proportion to their areas."""
     generator = torch.Generator().manual_seed(seed)
     corner = torch.tensor(low, dtype=torch.float32)
     sides = torch.tensor(high, dtype=torch.float32) - corner
@@ -47,14 +47,14 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float], count
 
 
 def ball(center: tuple[float, float, float], radius: float, count: int = 800, seed: int = 0) -> Tensor:
-    """[count, 3] points on a sphere."""
+    """Return points [count, 3] on a sphere."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     return torch.tensor(center, dtype=torch.float32) + radius * directions
 
 
 def figure() -> Scene:
-    """Somebody who stands with feet apart, 1.8 tall, in the middle of the floor at y = 0."""
+    """Return a standing figure with feet apart, 1.8 tall, in the middle of the floor at y = 0."""
     parts = [
         box((-0.30, -0.08, -0.12), (-0.12, 0.0, 0.16), 400, 1),  # feet
         box((0.12, -0.08, -0.12), (0.30, 0.0, 0.16), 400, 2),
@@ -67,14 +67,14 @@ def figure() -> Scene:
 
 
 def ground(width: float = 2.0, count: int = 3000) -> Scene:
-    """A flat rough patch under y = 0."""
+    """Return a flat rough patch below y = 0."""
     generator = torch.Generator().manual_seed(9)
     points = (torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([width, 0.01, width])
     return scene_of(points, torch.tensor([0.03, 0.005, 0.03]).repeat(count, 1))
 
 
 def moved(scene: Scene, turn: Rotation, factor: float = 1.0, shift: tuple[float, float, float] = (0, 0, 0)) -> Scene:
-    """The scene turned, then enlarged, then shifted."""
+    """Return the scene rotated, then scaled, then translated."""
     matrix = torch.from_numpy(turn.as_matrix())
     quats = (turn * Rotation.from_quat(scene.quats.double().roll(-1, 1).numpy())).as_quat()
     return replace(

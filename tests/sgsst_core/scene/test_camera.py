@@ -1,4 +1,4 @@
-"""Cameras made from cameras."""
+"""Tests of cameras derived from other cameras."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def camera(width: int = 990, height: int = 742, name: str = "a") -> Camera:
 
 
 def project(view: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """[P, 2] pixels and [P] depths of points [P, 3]."""
+    """Return pixels [P, 2] and depths [P] of points [P, 3]."""
     local = points.double() @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
     lens = torch.tensor([[view.fx, view.fy], [view.cx, view.cy]], dtype=torch.float64)
     return local[:, :2] / local[:, 2:] * lens[0] + lens[1], local[:, 2]
@@ -66,7 +66,7 @@ def test_a_spread_subset_is_even_and_in_order(total: int, count: int) -> None:
     assert all(gap >= 1 for gap in gaps)
     if gaps:
         assert max(gaps) - min(gaps) <= 1
-        seam = chosen[0] + total - chosen[-1]  # in a ring the last and the first are neighbors
+        seam = chosen[0] + total - chosen[-1]  # in a ring, the last and the first are neighbors
         assert min(gaps) - 1 <= seam <= max(gaps) + 1
 
 

@@ -1,4 +1,7 @@
-"""Rings of cameras: the subject is whole in every frame and fills it; they turn and grow with the scene."""
+"""Tests of rings of cameras around a subject.
+
+The subject is whole in every frame and fills it, and rings follow the scene's pose and scale.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ TURN = Rotation.from_euler("xyz", [40, 65, -130], degrees=True)
 
 
 def project(view: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """[P, 2] places in the picture, 0 to 1 each, and [P] depths of points [P, 3]."""
+    """Return positions [P, 2] in the image, each 0 to 1, and depths [P] of points [P, 3]."""
     local = points.double() @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
     lens = torch.tensor([[view.fx, view.fy], [view.cx, view.cy]], dtype=torch.float64)
     size = torch.tensor([view.width, view.height], dtype=torch.float64)
@@ -60,7 +63,7 @@ def test_the_whole_object_fills_every_frame(
         assert bool(in_view(view, means).all())
         assert elevation(view, middle, axis) == pytest.approx(15, abs=1)
         places, _ = project(view, torch.stack([middle, middle + 0.1 * size * axis]))
-        assert float(places[1, 1]) < float(places[0, 1])  # up is up in the picture
+        assert float(places[1, 1]) < float(places[0, 1])  # up in the world is up in the image
         places, _ = project(view, means)
         if shape is None:
             assert view.width * view.height == pytest.approx(PIXELS, rel=2e-3)
@@ -80,7 +83,7 @@ def test_frames_are_of_few_shapes_that_follow_the_object() -> None:
 
 
 def test_the_picture_ends_beyond_the_object() -> None:
-    """Rendered, not computed: nothing is cut off, and the object takes most of its box's share of the picture."""
+    """In a render, nothing is cut off, and the object fills most of its box's area."""
     scene = figure()
     rasterizer = make_rasterizer("cpu", scene)
     for view in orbit(scene, 5, elevations=[10.0, 45.0]):
@@ -132,7 +135,7 @@ def test_a_radius_is_obeyed() -> None:
         for view in views:
             assert float((view.center - middle).norm()) == pytest.approx(radius)
             assert bool(in_view(view, scene.means).all())
-    for view in orbit(scene, 5, radius=0.05):  # inside: some of it is behind the camera
+    for view in orbit(scene, 5, radius=0.05):  # inside, with parts of it behind the camera
         assert bool(torch.isfinite(view.world_to_camera).all())
         assert view.fx > 0.2 * max(view.width, view.height)
 
@@ -184,7 +187,7 @@ def test_an_orbit_without_sense_is_refused(wrong: dict[str, object]) -> None:
 
 
 def fill(scene: Scene, views: list[Camera]) -> list[float]:
-    """Share of each view's pixels that the scene covers."""
+    """Return the fraction of each view's pixels that the scene covers."""
     rasterizer = make_rasterizer("cpu", scene, max_list_bytes=0)
     return [float(rasterizer.coverage(resized(view, 256)).mean()) for view in views]
 

@@ -1,4 +1,4 @@
-"""Colors brought back to what screens show."""
+"""Tests of the clamping of colors to what screens can show."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sgsst_core.scene.screen import LARGEST, on_screen, on_screen_by_luminance
 COEFFICIENT = st.floats(-1e6, 1e6, width=32)
 COLOR = st.tuples(COEFFICIENT, COEFFICIENT, COEFFICIENT)
 HIGHEST = 0.5 / SH_C0
-#: Of float32 coefficients below 2 in magnitude, twice.
+#: Rounding error of float32 coefficients below 2 in magnitude, twice.
 ROUNDING = 2.0**-22
 
 

@@ -1,4 +1,4 @@
-"""Which Gaussians lie somewhere, or have a property."""
+"""Tests of the selection of Gaussians by position or property."""
 
 import pytest
 import torch
@@ -37,7 +37,7 @@ def test_a_half_space_is_where_its_normal_points():
     ],
 )
 def test_comparisons(sign, wanted):
-    """With 0.1 as float32 has it, too; NaN compares with nothing."""
+    """0.1 is compared as float32 too; comparisons with NaN are false."""
     values = torch.tensor([0.0, 0.1, 0.2, NAN])
     assert where_property(values, sign, 0.1).tolist() == wanted
     assert where_property(values.double() * 10, sign, 1.0)[[0, 2, 3]].tolist() == [wanted[0], wanted[2], wanted[3]]

@@ -1,4 +1,4 @@
-"""Spherical harmonics: the basis against its definition, the clamp and its gradient, far-off worlds."""
+"""Tests of spherical harmonics: the basis by its definition, the clamp and its gradient, worlds far from the origin."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 
 
 def sphere(polar: int = 64, around: int = 128) -> tuple[Tensor, Tensor]:
-    """Directions and weights of a product quadrature that is exact for these polynomials."""
+    """Return directions and weights of a product quadrature that is exact for these polynomials."""
     step = 2 * math.pi / around
     x, w = torch.from_numpy(_gauss(polar)[0]), torch.from_numpy(_gauss(polar)[1])
     angle = torch.arange(around, dtype=torch.float64) * step
@@ -57,7 +57,7 @@ def test_basis_is_orthonormal() -> None:
 
 
 def test_basis_has_the_signs_and_the_order_of_3dgs_files() -> None:
-    # Evaluated by hand at (x, y, z) = (2, 3, 6) / 7 with the tabulated constants of the real harmonics.
+    # Computed by hand at (x, y, z) = (2, 3, 6) / 7 with the tabulated constants of the real harmonics.
     x, y, z = 2 / 7, 3 / 7, 6 / 7
     expected = [
         -0.48860251190292 * y,
@@ -95,7 +95,7 @@ def test_rest_colors_of_a_degree_use_only_its_coefficients(degree: int) -> None:
 
 def test_a_world_moved_far_away_keeps_its_colors() -> None:
     scene, view = cloud(50, degree=3), camera(pose=turned_pose())
-    scene = replace(scene, means=(scene.means * 16).round() / 16)  # so that moving it by 1e6 is exact
+    scene = replace(scene, means=(scene.means * 16).round() / 16)  # so that a translation by 1e6 is exact
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     moved_pose = view.world_to_camera.clone()
     moved_pose[:3, 3] -= moved_pose[:3, :3] @ offset
@@ -119,14 +119,14 @@ def far_from_the_origin() -> tuple[Scene, Camera]:
 
 
 def at_the_center() -> tuple[Scene, Camera]:
-    """Also so near to it, and so far, that squares would vanish or overflow."""
+    """Return Gaussians at the camera's center, and so near to it or far from it that squares underflow or overflow."""
     scene = cloud(5, degree=3)
     means = torch.tensor([[0.0, 0, 0], [1e-38, 0, 0], [1e38, 1e38, 0], [0, 1e-45, -1e-45], [0, 0, -2.0]])
     return replace(scene, means=means), camera()
 
 
 def huge_coefficients() -> tuple[Scene, Camera]:
-    """Some of them cancel."""
+    """Return Gaussians with huge coefficients, some of which cancel."""
     scene = cloud(300, degree=3)
     sizes = torch.logspace(0, 36, 300)[:, None, None]
     return replace(scene, sh_rest=held(scene.sh_rest) * sizes), camera(pose=turned_pose())
@@ -144,7 +144,7 @@ KERNEL_CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("name", KERNEL_CASES)
 def test_the_kernel_agrees_with_float64(name: str, degree: int) -> None:
-    """Of a file of that degree, and of one with higher bands that are left out."""
+    """Files have this degree, or higher bands that are not used."""
     pytest.importorskip("triton")
     scene, view = KERNEL_CASES[name]()
     whole = held(scene.sh_rest)
@@ -198,7 +198,7 @@ def test_colors_are_clamped_and_the_gradient_follows() -> None:
 
 
 def test_revived_colors_only_come_back() -> None:
-    """Where the clamp holds a color at 0, a gradient that would raise it passes, one that would lower it does not."""
+    """At a color clamped to 0, a gradient passes if it would raise the color, not if it would lower it."""
     colors = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
     gradient = torch.tensor([[-1.0, 1.0, 2.0], [0.0, -3.0, -4.0]])
     found = view_colors_gradient(gradient, colors, clamp_aware_gradient=True)
@@ -206,7 +206,7 @@ def test_revived_colors_only_come_back() -> None:
 
 
 def test_dark_colors_come_back_when_revived() -> None:
-    """Descent on |c - 0.6|^2 from far below 0: stuck without, at its target with."""
+    """Descent on |c - 0.6|^2 from far below 0 is stuck without the clamp-aware gradient, and converges with it."""
     ends = []
     for clamp_aware_gradient in (False, True):
         sh_dc = torch.full((1, 3), -4.0)

@@ -1,4 +1,4 @@
-"""Gaussians in pieces: moments kept whatever the shape, finite whatever the numbers, and nothing else changed."""
+"""Tests of splitting Gaussians: moments are preserved, values stay finite, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ NUMBERS = [1, *range(3, MOST_PIECES + 1)]
 
 
 def covariances(scene: Scene) -> Tensor:
-    """[N, 3, 3] float64."""
+    """Return covariances [N, 3, 3] in float64."""
     factors = rotation_matrices(scene.quats.double()) * scene.scales.double().exp()[:, None, :]
     return factors @ factors.transpose(1, 2)
 
 
 def mixtures(children: Scene, parents: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Mean [N, 3] and covariance [N, 3, 3] of each parent's children, weighted by their opacity, in float64."""
+    """Return mean [N, 3] and covariance [N, 3, 3] of each parent's children, weighted by opacity, in float64."""
     opacity = torch.sigmoid(children.opacities.double())
     share = opacity / torch.zeros(count, dtype=torch.float64).index_add(0, parents, opacity)[parents]
     mean = torch.zeros(count, 3, dtype=torch.float64).index_add(0, parents, share[:, None] * children.means.double())
@@ -64,7 +64,7 @@ def test_an_axis_in_pieces_has_its_variance_and_nearly_its_density(number: int) 
     error = np.sqrt(((parts @ cut.weights - density) ** 2).sum() / (density**2).sum())
     assert mixture_error(cut) == pytest.approx(error, abs=1e-6)
     assert error < 0.03
-    # what a child's opacity is multiplied with: never more than the parent's own
+    # Factor on the opacity of a child, which never exceeds the parent's.
     assert float((cut.weights * cut.ratio).max()) <= 1
 
 
@@ -81,7 +81,7 @@ def test_the_mixture_of_the_children_has_mean_and_covariance_of_the_parent(
     mean, covariance = mixtures(children, parents, 30)
     expected = covariances(scene)
     size = expected.diagonal(dim1=1, dim2=2).sum(1)
-    rounding = 1e-6 * scene.means.abs().amax(1).double()  # of places that are stored in float32
+    rounding = 1e-6 * scene.means.abs().amax(1).double()  # of positions stored in float32
     assert bool(((mean - scene.means).norm(dim=1) < 1e-5 * size.sqrt() + rounding).all())
     apart = (covariance - expected).flatten(1).norm(dim=1)
     assert bool((apart < 1e-5 * size + 10 * rounding * size.sqrt() + rounding**2).all())
@@ -106,7 +106,7 @@ def test_what_is_not_cut_and_all_that_is_no_shape_is_the_parents_to_the_bit(monk
 
 
 def test_extreme_gaussians_have_finite_children_or_stay_whole() -> None:
-    """Needles, points, huge and coincident ones, opacity 0 and 1."""
+    """Cases are needles, points, huge and coincident Gaussians, and opacities of 0 and 1."""
     count = 9
     scene = replace(
         cloud(count, degree=1),
@@ -150,7 +150,7 @@ def test_other_numbers_of_pieces_are_refused(pieces: list[list[int]]) -> None:
 
 @pytest.mark.parametrize(("opacity", "least"), [(0.1, 45.0), (0.4, 40.0), (0.7, 33.0)])
 def test_a_gaussian_in_pieces_looks_as_before(opacity: float, least: float) -> None:
-    """One on black, white itself, with nothing around that would hide a change: the hardest case."""
+    """A single white Gaussian on black is the hardest case, because nothing around it hides a change."""
     scene = single((0.1, 0, 4.0), opacity=opacity, scales=(0.5, 0.3, 0.02), quat=(0.9, 0.1, 0.1, 0.3))
     pieces = torch.tensor([[6, 4, 1]], dtype=torch.uint8)
     images = []

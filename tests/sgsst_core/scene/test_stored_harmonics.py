@@ -1,4 +1,4 @@
-"""Spherical harmonics in the scene's file: the same bits as in memory, and never those of another file."""
+"""Tests of SH coefficients left in the scene's file: bit-identical to those in memory, and never from another file."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small scenes have many blocks then, of which some end within the scene."""
+    """Make blocks so small that small scenes have many, some of which end within the scene."""
     monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
     monkeypatch.setattr(ply, "READ_BYTES", 3000)
     monkeypatch.setattr(ply, "BLOCK_ROWS", 17)
 
 
 def both(path: Path, *, drop: bool = False) -> tuple[Scene, Scene]:
-    """A file's scene with its harmonics in the file, and in memory."""
+    """Return a file's scene with its coefficients in the file, and in memory."""
     stored = read_scene(path, drop_invalid=drop, held_bytes=0).scene
     plain = read_scene(path, drop_invalid=drop).scene
     assert isinstance(stored.sh_rest, StoredHarmonics)
@@ -52,7 +52,7 @@ def written(folder: Path, count: int = 100, degree: int = 3) -> Path:
 
 
 def rewritten(path: Path, comment: bytes, extra: tuple[str, ...], position: int, elements: bytes) -> None:
-    """Another file of the same scene: longer header, properties before or among the others, an element in front."""
+    """Write another file of the same scene, with a longer header, extra properties or an element in front."""
     raw = path.read_bytes()
     head, _, body = raw.partition(b"end_header\n")
     old = np.frombuffer(body, [(line.split()[-1].decode(), "<f4") for line in head.splitlines() if b"property" in line])
@@ -146,7 +146,7 @@ def test_small_scenes_are_held_in_memory(tmp_path: Path) -> None:
 
 
 def test_what_follows_from_coefficients_is_the_same(tmp_path: Path) -> None:
-    """Fingerprints of jobs, so that they can be resumed either way, and the largest coefficients."""
+    """These are fingerprints of jobs, so that a job can be resumed either way, and the largest coefficients."""
     stored, plain = both(written(tmp_path))
     found = [fingerprint(scene, [camera()], torch.zeros(2, 2, 3), make_settings(), "w") for scene in (stored, plain)]
     assert found[0] == found[1]
@@ -206,7 +206,7 @@ def test_a_file_that_changes_meanwhile_is_an_error_and_no_signal(tmp_path: Path,
         path.write_bytes(b"")
     elif change == "overwritten":
         path.write_bytes(data[:-4] + b"\0\0\0\0")
-        os.utime(path, ns=(0, 0))  # file systems may be slow to tell the time
+        os.utime(path, ns=(0, 0))  # file systems may update times late
     else:
         path.write_bytes(data + b"\0")
     with pytest.raises(SceneError, match="was changed after it was read"):
@@ -282,12 +282,12 @@ _PEAK = textwrap.dedent("""
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is looked for in Linux's /proc")
 def test_memory_holds_neither_the_harmonics_nor_the_result(tmp_path: Path) -> None:
-    """A Gaussian takes 56 bytes, in the subset once more, its color 12 and its row 4; its harmonics would take 180."""
+    """A Gaussian takes 56 bytes, in the subset again, plus 12 for its color and 4 for its row; SH would take 180."""
     write_scene(tmp_path / "scene.ply", cloud(10, degree=3))
     count, one = 300_000, cloud(3000, degree=3)
     write_scene(tmp_path / "large.ply", one.subset(torch.arange(3000).repeat(count // 3000)))
     run = [sys.executable, "-c", _PEAK, str(tmp_path)]
     found = subprocess.run(run, capture_output=True, text=True, check=True, cwd=Path(ply.__file__).parents[2]).stdout
     held_bytes, writing = map(int, found.split())
-    assert held_bytes < 236  # what a scene in memory takes without its subset
-    assert writing < 40 << 20  # one block of rows, and what compares its colors: the file has 74 MB
+    assert held_bytes < 236  # a scene in memory without its subset
+    assert writing < 40 << 20  # one block of rows plus the comparison of its colors; the file has 74 MB

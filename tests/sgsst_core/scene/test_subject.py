@@ -1,4 +1,4 @@
-"""What a scene is about: strays, needles and background count for nothing, and nothing of the object is lost."""
+"""Tests of the subject of a scene: outliers, needles and background do not count, and all of the object does."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ OBJECT = scene_of(box((-0.5, -1.5, -0.3), (0.5, 1.5, 0.3), 3000))
 
 
 def extent(scene: object) -> torch.Tensor:
-    """[2, 3]: the lower and the upper corner of the subject's box."""
+    """Return the lower and the upper corner of the subject's box, [2, 3]."""
     subject = find_subject(scene)  # type: ignore[arg-type]
     return torch.stack([subject.hull.amin(0), subject.hull.amax(0)])
 

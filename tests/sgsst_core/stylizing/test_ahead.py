@@ -1,4 +1,4 @@
-"""Photos that are read in advance: on a pretend GPU, on which they must not be waited for."""
+"""Tests of photos that are read in advance, on a simulated GPU that must not wait for them."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ VIEWS, STEPS, SIDE, SEED = 3, 6, 32, 4
 PHOTO_BYTES = SIDE * SIDE * 3 * 4
 #: Bytes of a handful of numbers.
 SCALARS = 256
-#: Seconds after which a thread is taken to be stuck.
+#: Seconds after which a thread counts as stuck.
 STUCK = 60.0
 
 
 class Photos:
-    """Reads photos from files, and remembers which and in which thread.
+    """Photos in files, with a record of which are read in which thread.
 
     Args:
-        folder: into which they are written.
-        broken: index of the photo whose file ends too soon.
-        side: of the photos as they are read.
+        folder: Folder that they are written to.
+        broken: Index of a photo whose file is truncated.
+        side: Side of the photos when read.
 
     Attributes:
-        asked: indices in the order in which they were read.
-        here: those of them that were read in the thread that made this object.
+        asked: Indices in the order in which they were read.
+        here: Those of them that were read in the thread that made this object.
     """
 
     def __init__(self, folder: Path, broken: int | None = None, side: int = SIDE) -> None:
@@ -72,11 +72,11 @@ class Photos:
         return self.read(index)
 
     def read(self, index: int) -> Tensor:
-        """Without remembering it."""
+        """Read a photo without recording it."""
         return load_photo(self._paths[index], self._cameras[index])
 
     def wait_for(self, count: int) -> None:
-        """Until so many were read."""
+        """Wait until `count` photos have been read."""
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.asked) >= count, STUCK), f"{self.asked} were read"
 
@@ -88,7 +88,7 @@ def counts() -> Iterator[Counts]:
 
 
 def make(weights: BackboneWeights, photos: Photos, **values: Any) -> Stylizer:
-    """Two scales, both in each step; content features are not kept, unless `keep` says otherwise."""
+    """Make a job with two scales in each step; content features are not cached unless `keep` is overridden."""
     options = {"steps_coarse": 0, "steps_sos": STEPS, "coarsest_side": 16, "position_weights": "off", "seed": SEED}
     settings = make_settings("paper", **{**options, "keep": ("content",), **values})
     views = cameras(VIEWS, SIDE, SIDE)
@@ -96,7 +96,7 @@ def make(weights: BackboneWeights, photos: Photos, **values: Any) -> Stylizer:
 
 
 def drawn() -> list[int]:
-    """The order of views in two rounds."""
+    """Return the order of views in two rounds."""
     generator = torch.Generator().manual_seed(SEED)
     return [int(i) for _ in range(2) for i in torch.randperm(VIEWS, generator=generator).flip(0)]
 
@@ -114,7 +114,7 @@ def on_host(tensor: Tensor) -> Tensor:
 def test_a_step_reads_the_next_photo_and_waits_once(
     tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two rounds of the views: in the first one, what is kept of each view is made."""
+    """In the first of two rounds, cached data of each view are computed."""
     photos = Photos(tmp_path)
     stylizer = make(tiny_weights, photos)
     gradient = stylizer.views.gradient
@@ -131,10 +131,10 @@ def test_a_step_reads_the_next_photo_and_waits_once(
             assert sum(counts.waits.values()) == 1, counts.waits
             large = {line: size for line, size in counts.copies.items() if size > SCALARS}
             assert list(large.values()) == [PHOTO_BYTES], large  # the photo, and nothing else
-        assert len(stylizer.state().queue) == -(step + 1) % VIEWS  # it was looked at, not filled
+        assert len(stylizer.state().queue) == -(step + 1) % VIEWS  # the queue was read, not refilled
     stylizer.views.end_look_ahead()
     assert photos.asked == drawn() == [record.view for record in stylizer.history]
-    assert photos.here == drawn()[::VIEWS]  # the first of a round, which is not known before; the thread read the rest
+    assert photos.here == drawn()[::VIEWS]  # only the first of a round is unknown in advance; the thread reads the rest
     assert not threads()
 
 
@@ -156,7 +156,7 @@ def test_losses_are_those_of_photos_read_when_they_are_needed(
     assert [record.loss for record in stylizer.history] == [record.loss for record in expected.history]
     assert torch.equal(stylizer.stylized(), expected.stylized())
     assert plain.here == plain.asked == photos.asked
-    assert photos.here == photos.asked[:1]  # all others were named in the queue, or in the step
+    assert photos.here == photos.asked[:1]  # the queue or the step announced all others
     assert not threads()
 
 
@@ -186,11 +186,11 @@ def test_on_a_cpu_there_is_no_thread(tiny_weights: BackboneWeights, tmp_path: Pa
 
 
 def test_photos_come_out_as_they_were_read(counts: Counts, tmp_path: Path) -> None:
-    photos = Photos(tmp_path, side=160)  # CUDA takes 64 KB along without a wait, pinned or not
+    photos = Photos(tmp_path, side=160)  # CUDA transfers up to 64 KB without waiting, pinned or not
     ahead = PhotosAhead(photos, DEVICE)
     ahead.begin(1)
     ahead.begin(1)  # already under way
-    assert torch.equal(on_host(ahead(2)), photos.read(2))  # out of turn
+    assert torch.equal(on_host(ahead(2)), photos.read(2))  # out of order
     assert torch.equal(on_host(ahead(1)), photos.read(1))
     assert sorted(photos.asked) == [1, 2]
     assert photos.here == [2]

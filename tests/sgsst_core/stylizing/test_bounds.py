@@ -1,4 +1,4 @@
-"""Colors kept within what screens show, through whole jobs."""
+"""Tests of whole jobs with colors kept within what screens can show."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def make(weights: BackboneWeights, scene: Scene, regions: Regions | None = None,
 
 
 def bright_wall() -> Scene:
-    """Reaches beyond the views, with many colors that no screen shows."""
+    """Return a wall that extends beyond the views, with many colors that no screen can show."""
     scene = wall(60, 40, sh_degree=1)
     scene.sh_dc.mul_(2)
     return scene
@@ -92,7 +92,7 @@ def test_kept_gaussians_may_be_what_no_screen_shows(tiny_weights: BackboneWeight
 
 
 def test_what_is_not_left_out_is_bounded_alike(tiny_weights: BackboneWeights) -> None:
-    """Rendering what no view sees changes nothing, to the bit, although its colors begin beyond the bounds."""
+    """Rendering unseen Gaussians gives bit-identical results, although their colors start out of bounds."""
     lean, full = (
         make(tiny_weights, bright_wall(), bounded=True, cached_weights="none", keep=keep) for keep in ((), ("unseen",))
     )
@@ -102,7 +102,7 @@ def test_what_is_not_left_out_is_bounded_alike(tiny_weights: BackboneWeights) ->
 
 
 def adam(start: Tensor, gradients: list[Tensor], rate: float) -> Tensor:
-    """Projected Adam (Kingma and Ba 2015, algorithm 1) in float64, by its definition."""
+    """Run projected Adam (Kingma and Ba 2015, algorithm 1) in float64, by its definition."""
     colors, first, second = start.double(), torch.zeros(start.shape).double(), torch.zeros(start.shape).double()
     for step, gradient in enumerate(gradients, start=1):
         first = 0.9 * first + 0.1 * gradient.double()

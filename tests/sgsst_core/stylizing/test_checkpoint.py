@@ -79,7 +79,7 @@ def kept(state: StylizerState) -> Checkpoint:
 
 
 def assert_same(expected: object, found: object) -> None:
-    """Equal, tensors to the bit, field by field."""
+    """Assert equality field by field, with bit-identical tensors."""
     assert type(expected) is type(found)
     for name in type(expected).__dataclass_fields__:  # type: ignore[attr-defined]
         one, other = getattr(expected, name), getattr(found, name)
@@ -138,7 +138,7 @@ def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Che
 
 
 def with_terms(kept: Checkpoint, **terms: float) -> Checkpoint:
-    """A checkpoint whose one step has these terms."""
+    """Return a checkpoint whose single step has these loss terms."""
     record = replace(kept.state.history[0], terms={0: LossTerms(**terms)})
     return replace(kept, state=replace(kept.state, history=[record]))
 
@@ -147,7 +147,7 @@ def test_a_term_that_the_loss_did_not_have_yet_is_0(
     kept: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.delitem(TERMS, "nearest")  # the last one, which comes back to its place
+        patch.delitem(TERMS, "nearest")  # the last term, so that undoing the patch restores the order
         save_checkpoint(tmp_path / "c", with_terms(kept, gram=1.0, mean=2.0, std=3.0), "job")
     (record,) = load_checkpoint(tmp_path / "c", "job").state.history
     assert record.terms == {0: LossTerms(gram=1.0, mean=2.0, std=3.0, nearest=0.0)}
@@ -165,7 +165,7 @@ def test_a_term_that_the_loss_does_not_have_is_refused_by_name(
 
 
 def flipped(data: bytes, at: int) -> bytes:
-    """One bit of the data is another one."""
+    """Return the data with one bit flipped."""
     return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
 
 

@@ -1,4 +1,4 @@
-"""Colors that get the distribution of others: against a plain transport without samples, and on what is degenerate."""
+"""Tests of color transport: against a plain version without sampling, and on degenerate distributions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 def colors(count: int, seed: int) -> Tensor:
-    """Two heaps of colors, one of them long and thin."""
+    """Return two clusters of colors, one of them long and thin."""
     generator = torch.Generator().manual_seed(seed)
     heap = 0.2 + 0.05 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
     long = 0.7 + 0.2 * torch.randn(count, 1, generator=generator, dtype=torch.float64) * torch.tensor([0.6, 0.3, -0.7])
@@ -28,7 +28,10 @@ def weights(count: int, seed: int) -> Tensor:
 
 
 def plain(moved: Array, weight: Array, wanted: Array) -> Array:
-    """The same with all colors and without knots: each value becomes the one at its own share of the weight."""
+    """Transport all colors without sampling and without knots.
+
+    Along each axis, a value is replaced by the target at the same cumulative weight.
+    """
     moved = moved.copy()
     for axes in (turn.numpy() for turn in _turns()):
         turned, targets = moved @ axes, np.sort(wanted @ axes, axis=0)
@@ -42,7 +45,7 @@ def plain(moved: Array, weight: Array, wanted: Array) -> Array:
 
 
 def distance(first: Tensor, second: Tensor) -> float:
-    """Mean distance of the distributions' quantiles along many directions."""
+    """Return the mean distance of the distributions' quantiles along many directions."""
     directions = torch.randn(50, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     shares = torch.linspace(0, 1, 300, dtype=torch.float64)
     parts = [
@@ -74,7 +77,7 @@ def test_samples_and_knots_are_near_a_transport_without_them() -> None:
     own, count, wanted = colors(3000, 3), weights(3000, 4), 1 - colors(2000, 5)
     expected = torch.from_numpy(plain(own.numpy(), count.numpy(), wanted.numpy()))
     error = (transported(own, count, wanted) - expected).norm(dim=1)
-    seen = count > 0.01  # what hardly counts lies anywhere between its neighbors
+    seen = count > 0.01  # colors with little weight may lie anywhere between their neighbors
     assert float(error[seen].median()) < 0.01
     assert float(error[seen].quantile(0.95)) < 0.06
     assert float((own - expected).norm(dim=1).median()) > 0.2
@@ -118,7 +121,7 @@ def test_one_color_becomes_the_mean_whatever_rounding_makes_of_it() -> None:
 @pytest.mark.parametrize("case", ["heaps", "far", "flat", "two"])
 def test_the_compiled_kernel_does_what_tensors_do(case: str) -> None:
     own, count, wanted = colors(3000, 13), weights(3000, 14), colors(700, 15)
-    if case == "far":  # most knots in one of the cells
+    if case == "far":  # most knots fall into one cell
         own[::100] *= 50
     if case == "flat":
         own[:] = 0.3
@@ -127,7 +130,7 @@ def test_the_compiled_kernel_does_what_tensors_do(case: str) -> None:
     begun = own.clamp(-10, 10)
     rounds = _rounds(begun[_drawn(count)], wanted)
     outside = torch.cat([begun, 3 * begun - 1, torch.full((1, 3), -10.0), torch.full((1, 3), 10.0)])
-    for only in rounds:  # one by one: maps may be as steep as 1e6, and steep ones multiply what was rounded
+    for only in rounds:  # one round at a time, because slopes of up to 1e6 amplify rounding errors
         torch.testing.assert_close(_through_compiled(outside, [only]), _through(outside, [only]), rtol=0, atol=1e-8)
     errors = (_through_compiled(outside, rounds) - _through(outside, rounds)).abs()
     assert float(errors.median()) < 1e-12

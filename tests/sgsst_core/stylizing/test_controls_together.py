@@ -1,4 +1,4 @@
-"""Controls that change what others work on: regions of a refined scene, several styles in luminance, all at once."""
+"""Tests of controls that affect each other: regions of a refined scene, several styles in luminance, all at once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def halves() -> Regions:
-    """The left of the wall is kept, the right has a style of its own, and what is in the middle is the rest."""
+    """Return regions of the wall: left frozen, right with a style of its own, and the background between them."""
     across = large_wall().means[:, 0]
     labels = torch.zeros(len(across), dtype=torch.uint8)
     labels[across < -0.5], labels[across > 0.5] = 1, 2

@@ -1,4 +1,4 @@
-"""Whole steps with graphs of the loss, on a pretend device: the same bits, and few launches."""
+"""Tests that steps with graphs of the loss are bit-identical on a simulated GPU, and need few launches."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.small_scenes import ball, cameras, style, wall
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-#: Launches of a step around its graph, at most: views and style are there, the rasterizer has its lists.
+#: Maximum number of launches of a step outside its graph, with views, style and intersections cached.
 MOST_LAUNCHES = 60
 
 
@@ -47,7 +47,7 @@ def make(
     training_background: PlannedBackground = "background",
     **values: Any,
 ) -> Stylizer:
-    """Of two views in two scales, three steps in each phase unless told otherwise."""
+    """Make a job of two views on two scales, with three steps in each phase by default."""
     scene, views = ball(40) if scan else wall(10, 8), cameras(2, 48, 32)
     settings = make_settings(**{"coarsest_side": 16, "steps_coarse": 3, "steps_sos": 3, **values})
     looked = survey(scene, views, make_rasterizer("cpu", scene))
@@ -73,8 +73,8 @@ def make(
 def test_steps_with_graphs_are_the_same_to_the_bit(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, scan: bool
 ) -> None:
-    """Both phases, views in turn: of two that share a graph, the first one prepares it and the second is captured."""
-    if not scan:  # once is enough for the network's kernels in Triton, which take their time in the interpreter
+    """In both phases, the first of two views that share a graph prepares it, and the second is captured."""
+    if not scan:  # once is enough for the network's Triton kernels, which are slow in the interpreter
         leave_out_kernels(monkeypatch)
     plain, graphs = (make(tiny_weights, graphs=graphs, scan=scan) for graphs in (False, True))
     for _ in range(plain.total):
@@ -96,7 +96,7 @@ def test_steps_with_graphs_are_the_same_to_the_bit(
 def test_a_color_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One graph serves every color, and nothing is waited for or copied because of it."""
+    """One graph serves every background color, which causes no wait and no copy."""
     leave_out_kernels(monkeypatch)
     options: dict[str, Any] = {"scan": True, "rasterizer": "triton", "steps_coarse": 0, "steps_sos": 8}
     plain, graphs = (
@@ -121,9 +121,9 @@ def test_a_color_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
 def test_several_views_a_step_and_a_resumed_run(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second view of a step does not change what was found of the first; a resumed run captures anew.
+    """The second view of a step does not change the first one's results, and a resumed run captures new graphs.
 
-    With kernels of PyTorch alone, and a rasterizer of the CPU: images and gradients come from there and go there.
+    The kernels are PyTorch's, and the rasterizer runs on the CPU.
     """
     leave_out_kernels(monkeypatch)
     options: dict[str, Any] = {"rasterizer": "cpu", "views_per_step": 2, "scan": True, "steps_sos": 5}

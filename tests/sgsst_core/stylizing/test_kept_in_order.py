@@ -1,4 +1,4 @@
-"""Which views' blend weights are kept, where not all of them fit, and so a job's bits: the steps alone decide it."""
+"""Tests that the choice of cached views, and so a job's result, depends on the steps alone if not all weights fit."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.small_scenes import cameras, style, wall
 
 VIEWS = cameras(6)
 STEPS = 7
-#: So many visits of each view that the coarsest scale has kept weights of its own.
+#: Enough visits of each view for cached weights on the coarsest scale.
 PHASES = {"steps_coarse": 30, "steps_sos": 6, "coarsest_side": 16}
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
-    """In memory for the blend weights of about half the views."""
+    """Make a job with memory for the blend weights of about half the views."""
     scene = wall()
     kept = CachedRasterizer(scene, precision="float32" if form == "float32" else "half")
     size = sum(kept.operator_bytes(camera) for camera in VIEWS) // 2

@@ -1,4 +1,4 @@
-"""The style's colors once more behind the last step, where the loss has no statistics that would hold them."""
+"""Tests of the color transfer after the last step, for losses without statistics that would preserve the colors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def settings_of(**values: Any) -> Settings:
 
 
 def in_bfloat16(weights: BackboneWeights) -> Stylizer:
-    """Planned by hand: which processor computes it faster is not the question."""
+    """Make a job in bfloat16, planned by hand so that the precision does not depend on the processor."""
     scene, settings = wall(60, 40), settings_of()
     plan, _ = make_plan(scene, cameras(), settings, weights=weights)
     return Stylizer(replace(plan, precision="bfloat16"), scene, cameras(), style(), settings, weights=weights)
@@ -70,7 +70,7 @@ def test_results_have_the_styles_distribution_and_steps_go_on_without_it(tiny_we
     "values", [{"style_loss": "sos"}, {"style_loss": "mixed"}, {"warm_start": False}, {"steps_sos": 1, "steps": 0}]
 )
 def test_other_results_are_what_steps_have_found(tiny_weights: BackboneWeights, values: dict[str, Any]) -> None:
-    """Of a loss with statistics, of a cold start, and of a job that has made no step yet."""
+    """Cases are losses with statistics, a cold start, and a job without any step."""
     steps = values.pop("steps", None)
     stylizer = make(tiny_weights, **values)
     run(stylizer, Callbacks(stop=lambda: steps == stylizer.step))
@@ -85,7 +85,7 @@ def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights) ->
     run(whole)
     for _ in range(3):
         first.run_step()
-        first.stylized()  # as a preview has it made
+        first.stylized()  # as for a preview
     again = Stylizer(first.plan, wall(60, 40), cameras(), style(), first.settings, weights=tiny_weights)
     again.load_state(first.state())
     run(again)
@@ -124,7 +124,7 @@ def test_chroma_is_kept_where_luminance_alone_changes(tiny_weights: BackboneWeig
 
 
 def test_what_is_reported_is_what_is_written(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
-    """Loss and pictures are of the colors in the file; the error of bfloat16 is that of one and the same colors."""
+    """Loss and images belong to the colors in the file; the error of bfloat16 compares gradients at the same colors."""
     stylizer = in_bfloat16(tiny_weights)
     run(stylizer)
     measure = Measurements(stylizer)

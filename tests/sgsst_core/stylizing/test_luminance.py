@@ -1,4 +1,4 @@
-"""Colors that change in luminance alone, through whole jobs."""
+"""Tests of whole jobs that change colors in luminance alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-#: Of a value around 1, when it has been rounded to float32 once and was rounded before.
+#: Rounding error of a value around 1 that is rounded to float32 for the second time.
 ROUNDING = 2**-22
 
 
@@ -42,7 +42,7 @@ def make(weights: BackboneWeights, scene: Scene, steps: int = 4, **values: Any) 
 
 
 def chroma_off(found: torch.Tensor, scene: Scene) -> float:
-    """How far what each Gaussian's channels have changed by is from being the same."""
+    """Return the largest difference between the changes of a Gaussian's channels."""
     change = found.double() - scene.sh_dc.double()
     size = torch.maximum(found.abs(), scene.sh_dc.abs()).amax(1, keepdim=True).clamp_min(1).double()
     return float(((change - change.mean(1, keepdim=True)).abs() / size).max())
@@ -80,7 +80,7 @@ def test_every_gaussian_keeps_its_chroma(
 
 
 def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: BackboneWeights) -> None:
-    """dE/d(what is added to all three channels of a Gaussian), by autograd through definitions in float64."""
+    """The derivative is with respect to a value added to all channels of a Gaussian, by autograd from definitions."""
     scene, view = wall(), cameras(1)[0]
     settings = make_settings(preserve_colors="luminance", coarsest_side=24, steps_coarse=0, clamp_aware_gradient=False)
     stylizer = Stylizer.planned(scene, [view], style(), settings, weights=tiny_weights)
@@ -139,7 +139,7 @@ def test_the_style_takes_the_scenes_luminance() -> None:
 
 
 def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
-    """A dark picture and a bright one stay dark and bright: the mixture has the scene's mean and deviation."""
+    """Dark and bright images stay dark and bright; only the mixture has the scene's mean and deviation."""
     colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=torch.Generator().manual_seed(1))
     dark, bright = (0.2 + 0.1 * picture(40, 60, seed=2), 0.6 + 0.1 * picture(60, 40, seed=3))
     mixture = StyleMixture.weighted([dark.float(), bright.float()], [3, 1])
@@ -153,7 +153,7 @@ def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
     torch.testing.assert_close(mean, values.mean(), atol=1e-5, rtol=0)
     torch.testing.assert_close((second_moment - mean**2).sqrt(), values.std(correction=0), atol=0, rtol=1e-3)
     start = luminance_start((colors - 0.5) / SH_C0, ones, mixture)
-    # Some are as dark as a picture can be.
+    # Some pixels are as dark as possible.
     wanted = 0.75 * luminance(dark).mean() + 0.25 * luminance(bright).mean()
     torch.testing.assert_close(luminance(0.5 + SH_C0 * start.double()).mean(), wanted, atol=5e-3, rtol=0)
 

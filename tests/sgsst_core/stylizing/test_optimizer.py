@@ -1,4 +1,4 @@
-"""Adam's steps against those of PyTorch's class, to the bit, and what a process that makes them loads."""
+"""Tests that Adam's steps are bit-identical to PyTorch's, and that they load no unneeded modules."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STEPS = 6
 
 
 def gradients() -> list[Tensor]:
-    """As they come: of sizes far apart, and none for Gaussians that a view does not show."""
+    """Return gradients of very different sizes, 0 for Gaussians that a view does not show."""
     generator = torch.Generator().manual_seed(1)
     sizes = 10.0 ** torch.linspace(-18, 18, 90)[:, None]
     found = [torch.randn((90, 3), generator=generator) * sizes for _ in range(STEPS)]
@@ -58,7 +58,7 @@ def test_loaded_moments_go_on_to_the_bit() -> None:
 
 
 def test_a_step_does_not_load_pytorchs_compiler() -> None:
-    """It takes two seconds and 140 MB of every process that optimizes."""
+    """The compiler would take two seconds and 140 MB in every process that optimizes."""
     code = (
         "import sys, torch\n"
         "from sgsst_core.stylizing.optimizer import ColorOptimizer\n"

@@ -1,4 +1,4 @@
-"""The whole method on real scenes: the loss falls in every scale, and on views that were held out."""
+"""Tests of the whole method on real scenes: the loss falls on every scale, and on novel views."""
 
 import pytest
 
@@ -25,7 +25,7 @@ def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data,
     scene = read_scene(folder / "point_cloud.ply").scene
     cameras = cameras_of(folder, scene, 12)
     style = load_image(shared_data / "styles" / "starry_night.jpg")
-    # from the scene's own colors, and with nothing else behind it in a step than where the loss is judged
+    # Starts from the scene's own colors, with the background that losses are measured on.
     settings = make_settings(
         steps_coarse=10,
         steps_sos=50,

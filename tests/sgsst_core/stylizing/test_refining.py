@@ -1,4 +1,4 @@
-"""A scene of large Gaussians is refined: the picture stays, the result repeats, and nobody is cut who is small."""
+"""Tests of refining a scene of large Gaussians: images stay, results repeat, and small Gaussians are not split."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def large_wall() -> Scene:
-    """The wall of small Gaussians with a dozen of large faint ones in front of it, and a needle."""
+    """Return the wall of small Gaussians behind a dozen large faint ones and a needle."""
     behind = wall()
     before = wall(4, 3, 0)
     before = replace(
@@ -67,7 +67,7 @@ def test_large_gaussians_are_cut_within_the_budget_and_the_picture_stays(
     assert found.psnr >= found.lowest_psnr >= LEAST_PSNR
     cut = refined(scene, found)
     errors = []
-    for camera in cameras():  # by the slow rasterizer, in float64
+    for camera in cameras():  # with the slow float64 rasterizer
         before, after = (render(each, ReferenceRasterizer(each), camera).clamp(0, 1) for each in (scene, cut))
         errors.append(float((after - before).square().mean()))
     assert psnr(max(errors)) == pytest.approx(found.lowest_psnr, abs=0.01)
@@ -91,7 +91,7 @@ def test_nothing_is_cut_where_nothing_is_large(tiny_weights: BackboneWeights) ->
 def test_nothing_is_cut_that_would_change_the_picture(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a bound that nothing can keep, all are taken back; with none, no one is."""
+    """An impossible bound undoes all splits, and no bound undoes none."""
     monkeypatch.setattr(refining, "LEAST_PSNR", 200.0)
     found = made(tiny_weights, 4.0)
     assert found.split == 0
@@ -141,7 +141,7 @@ def test_somebody_who_waits_is_shown_how_far_it_is(tiny_weights: BackboneWeights
         weights=tiny_weights,
         show=lambda now: told.append((now.done, now.total)),
     )
-    assert told == 2 * [(0, 3), (1, 3), (2, 3)]  # looked at, and asked for their gradient
+    assert told == 2 * [(0, 3), (1, 3), (2, 3)]  # surveyed, and asked for their gradient
 
 
 def test_views_are_spread_evenly() -> None:
@@ -157,7 +157,7 @@ def test_footprints_and_pictures_are_those_of_the_fast_rasterizer() -> None:
 
 
 def on_a_rank(collectives: object, factor: float) -> Refinement | None:
-    """For the ranks' test, which runs it in other processes."""
+    """Refine the wall; the test of ranks runs this in other processes."""
     weights = make_tiny_weights()
     return refine(
         large_wall(),

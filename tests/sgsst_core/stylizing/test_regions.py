@@ -1,4 +1,4 @@
-"""Regions of a scene in the optimizer: what is kept, what changes, and by which style."""
+"""Tests of regions in the optimizer: which are frozen, which change, and toward which style."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def other_style() -> Tensor:
 
 
 def halves(scene: Scene, left: Region | None = None, right: Region | None = None) -> Regions:
-    """The scene left and right of x = 0; the rest is the left."""
+    """Return regions left and right of x = 0; the left one is the background."""
     labels = (scene.means[:, 0] >= 0).to(torch.uint8)
     return Regions((left or Region("rest"), right or Region("right", style=StyleMixture.of(other_style()))), labels)
 
@@ -88,7 +88,7 @@ def test_maps_of_a_region_are_exactly_0_where_it_is_not() -> None:
 )
 @pytest.mark.parametrize("kept", ["rest", "right"])
 def test_kept_gaussians_stay_to_the_bit(tiny_weights: BackboneWeights, kept: str, values: dict[str, Any]) -> None:
-    scene = wall(60, 40, sh_degree=1)  # reaches beyond the views
+    scene = wall(60, 40, sh_degree=1)  # extends beyond the views
     scene.sh_dc[::7] = -0.0
     keep = {"left": Region("rest", freeze=True)} if kept == "rest" else {"right": Region("right", freeze=True)}
     regions = halves(scene, **keep)
@@ -115,7 +115,7 @@ def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> Non
 
 
 def test_a_region_of_everything_is_a_job_with_its_style(tiny_weights: BackboneWeights) -> None:
-    """To the bit, what no view sees included."""
+    """Results are bit-identical, including unseen Gaussians."""
     scene = wall(60, 40, sh_degree=1)
     whole = Regions(
         (Region("rest"), Region("all", style=StyleMixture.of(other_style()))), torch.ones(len(scene), dtype=torch.uint8)
@@ -140,14 +140,14 @@ def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
 
 
 def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights) -> None:
-    """And not to the other's: flat dark and flat bright pictures tell them apart."""
+    """It does not approach the other's; a flat dark and a flat bright image tell them apart."""
     scene = wall()
     dark, bright = torch.full((40, 40, 3), 0.1), torch.full((40, 40, 3), 0.9)
     regions = halves(scene, right=Region("right", style=StyleMixture.of(bright)))
     stylizer = make(tiny_weights, scene, regions, dark, steps_sos=60, content_weight=0.0, early_stop=False)
     run(stylizer)
     labels, found = regions.labels[stylizer.plan.seen], stylizer.stylized()[stylizer.plan.seen]
-    far = scene.means[stylizer.plan.seen][:, 0].abs() > 0.5  # features at the border see both
+    far = scene.means[stylizer.plan.seen][:, 0].abs() > 0.5  # features at the border see both regions
     left, right = (float((0.5 + 0.28209479 * found[(labels == place) & far]).mean()) for place in (0, 1))
     assert left < 0.4 < 0.6 < right
 
@@ -193,7 +193,7 @@ def test_unseen_gaussians_follow_their_own_region() -> None:
     assert found[2:, 0].tolist() == [1.0, 2.0, 0.0]
     without = replace(regions, labels=torch.tensor([0, 0, 1, 0, 2], dtype=torch.uint8))
     found = neighbors_change_by_region(means, change, weights, without)
-    assert found[2, 0] == 1.5  # nothing of its region is optimized
+    assert found[2, 0] == 1.5  # nothing in its region is optimized
 
 
 def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights, tmp_path: Path) -> None:

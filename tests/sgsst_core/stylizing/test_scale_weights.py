@@ -1,4 +1,4 @@
-"""Whole jobs in which some scales count."""
+"""Tests of whole jobs with scale weights."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_the_plan_counts_what_is_computed(tiny_weights: BackboneWeights) -> None
     expected = [job.plan.prediction for job in (whole, coarse)]
     assert expected[0] is not None
     assert expected[1] is not None
-    assert expected[1].style < 0.2 * expected[0].style  # a sixteenth of the pixels, and halos
+    assert expected[1].style < 0.2 * expected[0].style  # a sixteenth of the pixels, plus halos
 
 
 def test_scales_that_the_views_have_not_are_refused_before_anything_is_looked_at(tiny_weights: BackboneWeights) -> None:

@@ -1,4 +1,4 @@
-"""How long a job will still take, on simulated histories whose seconds are known."""
+"""Tests of the remaining time on simulated histories with known seconds."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import pytest
 from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
 
 VIEWS = 12
-#: What steps really take; sums of these are exact in binary.
+#: Actual times of the steps; their sums are exact in binary.
 COARSE = ExpectedPhase("coarse", 30, 1.0, 8.0)
 SOS = ExpectedPhase("sos", 60, 4.5, 2.25)
 
 
 @dataclass(frozen=True)
 class Told:
-    """After a step: what was told to be left, and what there was."""
+    """Predicted and actual remaining time after a step."""
 
     stage: str
-    number: int  # of the phase's steps in this session, from 1
+    number: int  # counts the phase's steps in this session from 1
     left: float
     truth: float
 
@@ -28,7 +28,10 @@ class Told:
 def session(
     phases: list[ExpectedPhase], expected: list[ExpectedPhase], start: int = 0, views_per_step: int = 1, seed: int = 0
 ) -> list[Told]:
-    """Steps of a job from `start` on, in rounds of all views; what is made at first visits is made anew after it."""
+    """Simulate the steps of a job from `start` on, in rounds of all views.
+
+    Data of first visits are recomputed after `start`, as after resuming.
+    """
     chance = random.Random(seed)
     pace = SecondsLeft(expected, range(VIEWS), views_per_step)
     queue: list[int] = []
@@ -56,7 +59,7 @@ def session(
 @pytest.mark.parametrize("start", [0, 7, 30, 40])
 @pytest.mark.parametrize("views_per_step", [1, 3])
 def test_where_steps_take_what_was_expected_nothing_is_off(start: int, views_per_step: int) -> None:
-    """From the first step to the last, over both phases, and after a resume in the middle of either."""
+    """The prediction is exact in both phases, also after resuming in the middle of either."""
     told = session([COARSE, SOS], [COARSE, SOS], start, views_per_step)
     assert len(told) == 90 - start
     for entry in told:
@@ -74,7 +77,7 @@ def test_another_machine_than_expected_is_noticed_when_views_come_again(factor: 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("known", "first"), [(1.0, 4.0), (1.25, 0.25), (0.8, 0.0), (1.25, 6.0)])
 def test_after_five_steps_of_the_last_phase_a_quarter_is_not_missed(known: float, first: float, seed: int) -> None:
-    """Steps and first visits are off by factors of their own; the first five steps are all first visits."""
+    """Steps and first visits are off by different factors, and the first five steps are all first visits."""
     real = [replace(p, seconds=p.seconds * known, first_visit=p.first_visit * first) for p in (COARSE, SOS)]
     for start in (0, 40):
         for entry in session(real, [COARSE, SOS], start, seed=seed):
@@ -91,7 +94,10 @@ def test_without_expectations_the_steps_themselves_tell() -> None:
 
 
 def test_an_unfinished_round_is_a_mean() -> None:
-    """4 steps are left: 2 of this round, 2 of the next one's 12; of these, 3 views are new, 1 of them comes soon."""
+    """Four steps are left: two of this round and two of the 12 of the next one.
+
+    Three views are new, one of them in this round.
+    """
     phase = ExpectedPhase("sos", 20, 1.0, 6.0)
     pace = SecondsLeft([phase], range(VIEWS))
     for view in range(9):
@@ -101,7 +107,7 @@ def test_an_unfinished_round_is_a_mean() -> None:
 
 
 def test_measuring_checkpoints_and_the_time_limit() -> None:
-    """Checkpoints have taken a quarter of the steps' time, and will; a limit bounds the steps alone."""
+    """Checkpoints keep taking a quarter of the steps' time; the time limit applies to steps alone."""
     pace = SecondsLeft([ExpectedPhase("sos", 10)], [0])
     pace.add_step("sos", [0], 3.0)
     pace.add_step("sos", [0], 1.0)

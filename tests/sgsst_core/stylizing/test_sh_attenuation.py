@@ -1,4 +1,4 @@
-"""Jobs whose spherical harmonics fade: what is optimized is what is written."""
+"""Tests that jobs with SH attenuation write the same colors that they optimize."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def picture(height: int = 40, width: int = 60) -> torch.Tensor:
 
 
 def ramp(height: int, width: int, slope_y: float, slope_x: float) -> torch.Tensor:
-    """0.5 in the middle, and a plane through it."""
+    """Return a linear ramp with 0.5 in the middle."""
     y = torch.arange(height) - (height - 1) / 2
     x = torch.arange(width) - (width - 1) / 2
     return (0.5 + slope_y * y[:, None] + slope_x * x).unsqueeze(2).expand(-1, -1, 3).contiguous()
@@ -40,15 +40,15 @@ def test_quarters_of_a_turn_move_pixels_only() -> None:
 @pytest.mark.parametrize("degrees", [1, 17, 45, 89, 107, -30, 200])
 @pytest.mark.parametrize("size", [(80, 80), (60, 150), (150, 60)])
 def test_a_plane_of_brightness_turns_with_the_picture(degrees: float, size: tuple[int, int]) -> None:
-    """What is inside comes from inside: no edge is drawn out, nothing is filled in."""
+    """Every pixel comes from inside the image: edges are not extended and nothing is filled in."""
     height, width = size
     found = turned(ramp(height, width, 0.001, 0.002), degrees)[..., 0]
     angle = math.radians(degrees)
-    # Against the clock, seen with y downwards: what lay to the right goes up.
+    # Counterclockwise, as seen with y pointing down: what was on the right moves up.
     slope_x = 0.002 * math.cos(angle) + 0.001 * math.sin(angle)
     slope_y = 0.001 * math.cos(angle) - 0.002 * math.sin(angle)
     wanted = ramp(found.shape[0], found.shape[1], slope_y, slope_x)[..., 0]
-    shift = 0.0025  # where the cut is half a pixel off the middle
+    shift = 0.0025  # the crop is half a pixel off center
     torch.testing.assert_close(found - found.mean(), wanted - wanted.mean(), atol=1e-4, rtol=0)
     assert abs(float(found.mean()) - 0.5) <= shift
 
@@ -128,7 +128,7 @@ def test_a_style_may_be_as_large_as_a_view_may_be() -> None:
     line = torch.zeros(1, 100, 3)
     most = MAX_RESOLUTION / 100
     check_style_size(line, [view], most)
-    check_style_size(torch.zeros(1, MAX_RESOLUTION + 1, 3), [view], 1)  # is never made larger
+    check_style_size(torch.zeros(1, MAX_RESOLUTION + 1, 3), [view], 1)  # the style is never enlarged
     with pytest.raises(SettingsError, match=rf"for views of {view.width} x {view.height}; 16,384 may be"):
         check_style_size(line, [view], most + 0.1)
 

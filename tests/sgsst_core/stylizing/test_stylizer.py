@@ -1,4 +1,4 @@
-"""The optimizer loop, on scenes so small that a step is quick."""
+"""Tests of the optimizer loop, on scenes so small that a step is quick."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
 def test_raster_lists_of_the_survey_are_not_built_again(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, cached_weights: str
 ) -> None:
-    """They are cut down to what the views see, with the same bits as lists that are built for it."""
+    """They are reduced to the Gaussians in view, and bit-identical to recomputed intersections."""
     built: list[int] = []
 
     def build(scene: Scene, camera: Camera, **options: Any) -> RasterLists:
-        if len(scene) > 1:  # of one Gaussian, the plan makes them to have kernels compiled
+        if len(scene) > 1:  # the plan makes those of one Gaussian to compile the kernels
             built.append(len(scene))
         return build_raster_lists(scene, camera, **options)
 
@@ -85,7 +85,7 @@ def test_raster_lists_of_the_survey_are_not_built_again(
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, scene: Scene, tmp_path: Path) -> None:
-    """Stopped in the middle of a round of views: the queue, the random generator and Adam's moments must come back."""
+    """It stops in the middle of a round, so queue, random generator and Adam's moments must be restored."""
     whole = make(tiny_weights, scene, steps_sos=8)
     run(whole)
     stopped = make(tiny_weights, scene, steps_sos=8)
@@ -109,7 +109,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, sc
 
 
 def test_phase_1_at_its_own_scale_has_the_same_gradient(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    """With little memory phase 1 keeps the weights of the coarsest scale only; nothing else may change."""
+    """With little memory, phase 1 caches only the weights of the coarsest scale, which must change nothing else."""
     options: dict[str, Any] = {"steps_coarse": 20, "steps_sos": 2, "coarsest_side": 24, "memory_limit": 400_000}
     views = [resized(camera, 100) for camera in cameras(2)]
     lean = Stylizer.planned(scene, views, style(), make_settings(**options), weights=tiny_weights)
@@ -120,7 +120,7 @@ def test_phase_1_at_its_own_scale_has_the_same_gradient(tiny_weights: BackboneWe
     assert not plain.plan.coarse_weights
     for scales in ([2], [0, 1, 2]):
         gradients = [stylizer.gradient(1, scales)[0] for stylizer in (lean, plain)]
-        assert relative_error(*gradients) < (1e-5 if scales == [2] else 0.02)  # half-precision weights in phase 2
+        assert relative_error(*gradients) < (1e-5 if scales == [2] else 0.02)  # phase 2 has half-precision weights
     assert run(lean) == "finished"
 
 
@@ -208,7 +208,7 @@ def test_time_budget_ends_the_run_with_a_checkpoint(tiny_weights: BackboneWeight
     stylizer = make(tiny_weights, scene, max_seconds=1e-6)
     saved: list[int] = []
     assert run(stylizer, Callbacks(checkpoint=lambda s: saved.append(s.step))) == "max-seconds"
-    assert stylizer.step == 1  # the budget is looked at between steps
+    assert stylizer.step == 1  # the budget is checked between steps
     assert saved == [1]
 
 
@@ -228,7 +228,7 @@ def test_stop_ends_the_run_between_steps(tiny_weights: BackboneWeights, scene: S
 def test_the_style_is_taken_for_no_views_price(
     tiny_weights: BackboneWeights, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It takes a thousand seconds of the first step, which none of the seconds left expects again."""
+    """The style takes a thousand seconds of the first step, which must not recur in the predicted remaining time."""
     stylizer, seen = make(tiny_weights, scene), list[Progress]()
     style_targets, clock, late = stylizer.loss.style_targets, time.perf_counter, [0.0]
 
@@ -260,7 +260,7 @@ def test_a_result_is_made_once_for_the_same_colors(tiny_weights: BackboneWeights
 
 
 def test_a_target_is_a_share_of_the_loss_before(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    """Which is taken when every view has been visited; jobs without a target take it when they are asked."""
+    """The initial loss is known once every view has been visited; jobs without a target measure it on request."""
     stylizer = make(tiny_weights, scene, steps_sos=40, target_loss=0.8, early_stop=False)
     assert stylizer.start() == make(tiny_weights, scene, steps_sos=40).start()
     stylizer = make(tiny_weights, scene, steps_sos=40, target_loss=0.8, early_stop=False)
@@ -370,7 +370,7 @@ def test_stylize_leaves_the_scene_as_it_is(tiny_weights: BackboneWeights, scene:
 
 
 class ClockEvent:
-    """A mark in the stream of a device that does at once what it is given."""
+    """Event in a device's stream; the device finishes all work immediately."""
 
     def record(self) -> None:
         self.at = time.perf_counter()
@@ -386,10 +386,10 @@ class ClockEvent:
 
 
 def test_a_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    """They are complete when the step is, as a GPU's are."""
+    """Parts are complete when the step is, as with a GPU's events."""
     clock, events = (make(tiny_weights, scene) for _ in range(2))
     events.timer = events.loss.timer = Timer(event=ClockEvent)
-    for _ in range(6):  # the last one on all scales
+    for _ in range(6):  # the last step is on all scales
         expected, found = clock.run_step(), events.run_step()
         assert found.parts.keys() == expected.parts.keys()
         assert all(seconds > 0 for seconds in found.parts.values())

@@ -1,4 +1,4 @@
-"""What lies behind an object in a step: the same color for the same seed, step and view, and nothing else changes."""
+"""Tests of the training background of an object: it is determined by seed, step and view, and changes nothing else."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def make(weights: BackboneWeights, scene: Scene, views: int = 3, **values: Any) 
 
 
 def test_a_color_follows_from_seed_step_and_view_alone() -> None:
-    """One of them is written down: it must be the same on every machine and with every version."""
+    """One color is hard-coded, because it must be the same on every machine and with every version."""
     picture_ = style()
     assert drawn_color("random", 5, 7, 11, picture_) == (0.659657205637411, 0.3164479498593752, 0.6750821160034983)
     colors = {
@@ -51,7 +51,7 @@ def test_random_colors_are_uniform() -> None:
     drawn = torch.tensor([drawn_color("random", 7, step, 2, style()) for step in range(4000)])
     assert 0 <= float(drawn.min()) < 0.01
     assert 0.99 < float(drawn.max()) < 1
-    # Standard errors are 0.0046 of the means and about 0.0013 of the covariances.
+    # Standard errors are 0.0046 for the means and about 0.0013 for the covariances.
     torch.testing.assert_close(drawn.mean(0), torch.full((3,), 0.5), rtol=0, atol=0.02)
     torch.testing.assert_close(torch.cov(drawn.T), torch.eye(3) / 12, rtol=0, atol=0.006)
 
@@ -89,7 +89,7 @@ def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Co
 def test_a_steps_gradient_is_that_of_a_job_with_this_background(
     tiny_weights: BackboneWeights, scales: list[int], kept: Literal["kept", "uncached"]
 ) -> None:
-    """Content included, whether or not images of it are kept."""
+    """This includes the content, whether or not its images are cached."""
     keep = () if kept == "kept" else ("content",)
     drawn = make(tiny_weights, ball(), training_background="random", background=(0.1, 0.1, 0.5), keep=keep)
     fixed = make(tiny_weights, ball(), training_background="background", background=COLOR)
@@ -118,7 +118,7 @@ def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeight
 
 
 def test_measures_keep_the_background(tiny_weights: BackboneWeights) -> None:
-    """Loss before and after, on the color of the settings, whatever was behind in steps."""
+    """Losses before and after are measured on the background of the settings, whatever the steps used."""
     values: dict[str, Any] = {"background": (0.3, 0.2, 0.1), "warm_start": False}
     drawn, fixed = (
         make(tiny_weights, ball(), training_background=kind, **values) for kind in ("palette", "background")
@@ -154,7 +154,7 @@ def test_runs_repeat_and_resume_to_the_bit(tiny_weights: BackboneWeights, tmp_pa
 
 
 def test_a_covered_scene_is_stylized_as_if_nothing_could_be_drawn(tiny_weights: BackboneWeights) -> None:
-    """To the last bit as with a fixed background."""
+    """Results are bit-identical to those with a fixed background."""
     plain = make(tiny_weights, wall(), training_background="background")
     automatic = make(tiny_weights, wall())
     for stylizer in (plain, automatic):
@@ -175,7 +175,7 @@ def test_the_paper_is_the_papers_for_scans_too(tiny_weights: BackboneWeights) ->
 def test_losses_with_different_colors_behind_do_not_end_a_run_early(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A target is compared with the loss on the background, once in a round."""
+    """A target is compared with the loss on the fixed background, once per round."""
     drawn, fixed = (
         make(
             tiny_weights,

@@ -1,4 +1,4 @@
-"""Colors that start as the style's: with its distribution, or with its mean and covariance alone."""
+"""Tests of the warm start: the style's color distribution, or its mean and covariance alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Start = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean and covariance, written out once more."""
+    """Compute weighted mean and covariance in plain loops."""
     share = weights / weights.sum()
     mean = (colors * share[:, None]).sum(0)
     covariance = torch.zeros(3, 3, dtype=torch.float64)
@@ -34,7 +34,7 @@ def colors_of(sh_dc: Tensor) -> Tensor:
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
 def test_weighted_mean_and_covariance_become_the_styles(scale: float) -> None:
     generator = torch.Generator().manual_seed(0)
-    # a style of little contrast in the middle of the range, so that no color is clamped
+    # A style of low contrast in the middle of the range, so that no color is clamped.
     style = 0.45 + 0.1 * picture(40, 50, seed=3).float()
     sh_dc = torch.randn(500, 3, generator=generator) @ torch.tensor([[1.0, 0.5, 0], [0, 1, 0.3], [0, 0, 0.2]])
     weights = scale * torch.rand(500, generator=generator, dtype=torch.float64) ** 4
@@ -57,7 +57,7 @@ def test_colors_that_match_already_stay(start: Start) -> None:
 
 
 def test_a_dark_scene_gets_both_colors_of_a_bright_style() -> None:
-    """Mean and covariance alone end in the brighter one for most of what should have been the darker one."""
+    """Matching only mean and covariance gives the brighter color to most Gaussians that should get the darker one."""
     style = torch.full((30, 30, 3), 0.9)
     style[:10] = torch.tensor([0.1, 0.2, 0.6])
     generator = torch.Generator().manual_seed(4)
@@ -70,7 +70,7 @@ def test_a_dark_scene_gets_both_colors_of_a_bright_style() -> None:
 
 
 def test_pictures_of_a_style_count_by_their_weights() -> None:
-    """Were they of any size: colors are as frequent as in the mixture."""
+    """Colors are as frequent as in the mixture, whatever the sizes of the images."""
     pictures = [torch.full((8, 8, 3), 0.2), torch.full((300, 400, 3), 0.8)]
     mixture = StyleMixture.weighted(pictures, [3.0, 1.0])
     sh_dc = torch.randn(4000, 3, generator=torch.Generator().manual_seed(5))
@@ -98,4 +98,4 @@ def test_flat_scenes_and_styles_give_finite_colors_in_range(case: str, start: St
     assert bool(found.isfinite().all())
     assert -1e-6 <= float(found.min()) <= float(found.max()) <= 1 + 1e-6
     expected = style.reshape(-1, 3).double().mean(0)
-    torch.testing.assert_close(found.mean(0), expected, rtol=0, atol=0.06)  # clamping moves the mean a little
+    torch.testing.assert_close(found.mean(0), expected, rtol=0, atol=0.06)  # clamping changes the mean slightly
