@@ -12,6 +12,8 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 TEST_PROCESSES ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
+SPELLED := api benchmarks deploy docs service sgsst_core tests worker *.md Makefile mkdocs.yml pyproject.toml
+
 .PHONY: demo test test-all test-slow lint lint-page docs clean
 
 # Stylize the built-in scene and say where the results are.
@@ -32,10 +34,11 @@ test-slow: $(VENV)/installed-dev
 test-all: test
 	$(MAKE) test-slow
 
-# Layout, lint, types, and the directions of imports.
+# Layout, lint, spelling, types, and the directions of imports.
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/codespell $(SPELLED)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/pre-commit validate-config

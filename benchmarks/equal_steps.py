@@ -23,7 +23,7 @@ import torch
 from benchmarks.cameras import read_views
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.bench.quality import novel_view_names
+from sgsst_core.bench.quality import make_novel_views
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene
@@ -83,7 +83,7 @@ def main() -> None:
 def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
     """Make a judge of all views between those of a job."""
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
-    novel_views = novel_view_names(stylizer)
+    novel_views = make_novel_views(stylizer)
     views = [novel_views.cameras[index] for index in novel_views.views]
     return Judge(Lpips(), style, scene, novel_views.rasterizer, views, stylizer.settings.background)
 

@@ -94,7 +94,7 @@ def _shares(float32: float, tf32: float, bfloat16: float, ieee: float, product: 
 
 
 SHARES = {
-    "optimiztic": _shares(0.85, 0.75, 0.75, 0.6, 0.5, 0.85, 0.5, 0.5, 3e-6),
+    "optimistic": _shares(0.85, 0.75, 0.75, 0.6, 0.5, 0.85, 0.5, 0.5, 3e-6),
     "likely": _shares(0.7, 0.6, 0.6, 0.4, 0.3, 0.7, 0.35, 0.7, 4e-6),
     "pessimistic": _shares(0.5, 0.4, 0.4, 0.25, 0.15, 0.55, 0.25, 1.0, 6e-6),
 }
@@ -405,7 +405,7 @@ def table(found: Mapping[str, Mapping[str, Any]]) -> str:
         cells = []
         for each in found.values():
             values = {n: factor * (v[part] if part else v) for n, v in each[kind].items()}
-            low, mid, high = (values[n] for n in ("optimiztic", "likely", "pessimistic"))
+            low, mid, high = (values[n] for n in ("optimistic", "likely", "pessimistic"))
             cells.append(f"{mid:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})")
         return f"| {name} | " + " | ".join(cells) + " |"
 

@@ -9,6 +9,7 @@ import importlib.util
 import inspect
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -81,9 +82,10 @@ def test_ray_binds_to_loopback_where_it_is_no_part_of_a_cluster() -> None:
 
 
 def test_the_store_of_ranks_takes_a_socket() -> None:
-    from torch.distributed.distributed_c10d import TCPStore
+    import torch.distributed as dist
 
-    assert "master_listen_fd" in (TCPStore.__init__.__doc__ or ""), (
+    store: Any = dist.TCPStore  # type: ignore[attr-defined]
+    assert "master_listen_fd" in (store.__init__.__doc__ or ""), (
         "PyTorch's store no longer takes a socket that listens already. Find how it can be bound to one address, and "
         "change `_meet` in worker/ranks/process_group.py; else it listens on every interface, without "
         "authentication."
@@ -91,6 +93,7 @@ def test_the_store_of_ranks_takes_a_socket() -> None:
 
 
 def test_a_process_group_forgets_its_device() -> None:
+    import torch.distributed as dist
 
     assert isinstance(getattr(dist.ProcessGroup, "bound_device_id", None), property), (
         "A process group no longer has bound_device_id. Find how groups of some ranks are made without the others, and "

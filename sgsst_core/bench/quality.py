@@ -150,7 +150,7 @@ def compare_quality(
     if lpips is None:
         raise WeightsError("results are judged by AlexNet, which is not installed: run `sgsst weights fetch vgg16`.")
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings), weights=weights)
-    novel_views = novel_view_names(stylizer)
+    novel_views = make_novel_views(stylizer)
     views = [novel_views.cameras[index] for index in novel_views.views]
     judge = Judge(lpips, style, scene, novel_views.rasterizer, views, stylizer.settings.background)
     if not judge.cameras:
@@ -181,7 +181,7 @@ def compare_quality(
     return Quality(outcomes, curves, judge, style)
 
 
-def novel_view_names(stylizer: Stylizer) -> NovelViews:
+def make_novel_views(stylizer: Stylizer) -> NovelViews:
     """Make the novel views of a job, with its whole scene."""
     exact = ExactLoss(stylizer, "sos")
     return NovelViews(

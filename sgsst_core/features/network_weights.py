@@ -186,7 +186,7 @@ def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
 
 
 def _parts(name: str) -> list[str]:
-    """The sets of weights that fetching `name` installs."""
+    """Return the sets of weights that fetching `name` installs."""
     return [part for part, fetched_with in FETCHED_WITH.items() if fetched_with == name]
 
 

@@ -21,7 +21,7 @@ class Decision:
 
     Attributes:
         item: Subject of the decision.
-        decision: What was decided.
+        decision: Decision as text.
         reason: Evidence for it.
         seconds: Estimated seconds saved per iteration; None if unknown.
         bytes: Memory saved in bytes; None if unknown.

@@ -263,7 +263,7 @@ def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
         "seconds": round(seconds, 3),
         "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
         "loss_views": len(stylizer.evaluation_views),
-        "novel_view_names": len(stylizer.measured[0].get("novel_view_names", [])) if stylizer.measured else 0,
+        "novel_view_count": len(stylizer.measured[0].get("novel_view_names", [])) if stylizer.measured else 0,
         "moments": [
             {"step": entry["step"], "seconds": round(entry["seconds"], 3) if "seconds" in entry else None}
             for entry in stylizer.measured

@@ -94,7 +94,7 @@ def test_what_is_kept_is_not_made_anew() -> None:
 def test_the_range_holds_the_likely_figure() -> None:
     found = forecast.forecast(SMALL, "tf32", LAUNCHES)
     for kind in ("sos", "coarse"):
-        low, mid, high = (found[kind][name]["total"] for name in ("optimiztic", "likely", "pessimistic"))
+        low, mid, high = (found[kind][name]["total"] for name in ("optimistic", "likely", "pessimistic"))
         assert 0 < low < mid < high
     assert found["coarse"]["likely"]["total"] <= found["sos"]["likely"]["total"]
     assert "| **a step** |" in forecast.table({"tf32": found})

@@ -97,7 +97,7 @@ def test_a_full_waiting_room_is_the_owners_own() -> None:
 
 
 def test_every_place_comes_back_whoever_gives_up() -> None:
-    """Any order of requests, ends and cancelations: at most one place an owner, none lost, none had twice."""
+    """Any order of requests, ends and cancellations: at most one place an owner, none lost, none had twice."""
 
     async def run(seed: int) -> None:
         chance = random.Random(seed)

@@ -89,7 +89,7 @@ def test_a_reader_that_is_taken_over_reaches_nothing(
     assert "secret" not in found["environment"].values()
     assert found["environment"].keys() <= {*inspector._ENVIRONMENT, *ADDED}
     assert found["log"] == "/dev/null"
-    assert len(found["descriptors"]) == 4, "nothing, thrice, and the pipe that its answer goes through"
+    assert len(found["descriptors"]) == 4, "nothing, three times, and the pipe that its answer goes through"
     assert sorted(path.name for path in Path(target["outside"]).iterdir()) == ["there"]
 
 

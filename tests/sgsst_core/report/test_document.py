@@ -117,7 +117,7 @@ def test_what_was_measured_and_its_share(
         "seconds": 30.0,
         "of_steps": 0.15,
         "loss_views": 4,
-        "novel_view_names": 2,
+        "novel_view_count": 2,
         "moments": [{"step": 0, "seconds": 9.0}, {"step": 7, "seconds": None}],
     }
 

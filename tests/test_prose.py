@@ -1,0 +1,85 @@
+"""Docstrings and their entries start with a noun or a verb, as docs/style.md asks for."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Packages whose docstrings follow docs/style.md. Add a package once it passes.
+PACKAGES = (
+    "benchmarks",
+    "sgsst_core/bench",
+    "sgsst_core/features",
+    "sgsst_core/loss",
+    "sgsst_core/parallel",
+    "sgsst_core/planning",
+    "sgsst_core/quality",
+    "sgsst_core/rasterizer",
+    "sgsst_core/report",
+    "sgsst_core/scene",
+    "sgsst_core/stylizing",
+)
+OPENERS = ("Of", "Who", "What", "That", "From which", "In which")
+SECTIONS = ("Args", "Attributes", "Raises")
+OPENS_BADLY = re.compile(rf"(?:{'|'.join(OPENERS)})\b", re.IGNORECASE)
+#: An entry: an indented name, or several with commas between, a colon, and its text.
+ENTRY = re.compile(r"^ {4}[\w.*, ]+: *(.*)$")
+
+
+def entries(docstring: str) -> Iterator[str]:
+    """Yield the texts of the entries of `Args:`, `Attributes:` and `Raises:`."""
+    section = ""
+    for line in docstring.splitlines():
+        if heading := re.match(r"(\w+):$", line):
+            section = heading[1]
+        elif line and not line.startswith(" "):
+            section = ""
+        elif section in SECTIONS and (entry := ENTRY.match(line)):
+            yield entry[1]
+
+
+def prose(docstring: str) -> list[str]:
+    """Return the docstring and the texts of its entries."""
+    return [docstring, *entries(docstring)]
+
+
+def docstrings(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the line and text of each docstring of a file, those of private functions included."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and (
+            text := ast.get_docstring(node)
+        ):
+            yield getattr(node, "lineno", 1), text
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_docstrings_start_with_a_noun_or_a_verb(package: str) -> None:
+    paths = sorted((ROOT / package).rglob("*.py"))
+    assert paths
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {text.splitlines()[0]}"
+        for path in paths
+        for line, docstring in docstrings(path)
+        for text in prose(docstring)
+        if OPENS_BADLY.match(text)
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("docstring", "bad"),
+    [
+        ("Of the network on images.", ["Of the network on images."]),
+        ("Return the mean.\n\nArgs:\n    device: that computes.\n    rows: Rows.", ["that computes."]),
+        ("A report.\n\nAttributes:\n    first, second: from which it was made.", ["from which it was made."]),
+        ("Read a file.\n\nRaises:\n    ValueError: what is wrong.", ["what is wrong."]),
+        ("Offset of a row.\n\nReturns:\n    That row.\n\nArgs:\n    whatever: Offset.", []),
+    ],
+)
+def test_bad_openers_are_found(docstring: str, bad: list[str]) -> None:
+    assert [text for text in prose(docstring) if OPENS_BADLY.match(text)] == bad
