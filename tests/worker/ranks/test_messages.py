@@ -79,7 +79,7 @@ def test_errors_keep_their_type() -> None:
     assert found.args == ("scene.ply: is empty.",)
 
 
-@pytest.mark.parametrize("value", [object(), {1}, ValueError("no"), Path, len, np.float32(1)], ids=repr)
+@pytest.mark.parametrize("value", [object(), {1}, ValueError("no"), Path, len, np.float32(1)], ids=lambda value: type(value).__name__)
 def test_what_no_message_can_hold_is_refused(value: Any) -> None:
     with pytest.raises(TypeError, match=r"A message between ranks cannot hold a|is not a class of"):
         encode(value)
