@@ -24,6 +24,7 @@ PACKAGES = (
     "sgsst_core/report",
     "sgsst_core/scene",
     "sgsst_core/stylizing",
+    "tests/api",
 )
 OPENERS = ("Of", "Who", "What", "That", "From which", "In which")
 SECTIONS = ("Args", "Attributes", "Raises")
