@@ -244,7 +244,7 @@ def _parse_parameters(text: str) -> dict[str, Any]:
 
 @contextmanager
 def _transfer(what: str) -> Iterator[Any]:
-    """Show a progress bar of transferred bytes; on other outputs than terminals, show nothing."""
+    """Show a progress bar of transferred bytes on a terminal, and nothing elsewhere."""
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
         task = bar.add_task(what, total=None)

@@ -122,7 +122,7 @@ def lift_pair() -> Scene:
     known = np.isfinite(measured)
     disparity, behind_left = _fill(measured.astype(np.float64), known, left)
 
-    # A guessed disparity is wrong if its pixel would show in the right photo with another color than there.
+    # A guessed disparity is wrong if its pixel would be visible in the right photo, but the color there differs.
     moved, _ = _move_to_right(disparity)
     rows, columns, inside = _in_other_photo(disparity, -1)
     shows = inside & (disparity > moved[rows, columns] - EDGE_STEP)

@@ -136,7 +136,7 @@ def _stylize(
     """Stylize a scene and print the plan and the results.
 
     Args:
-        arguments: Arguments of this command, from which the command to resume the job is made.
+        arguments: Arguments of this command; the command to resume the job is built from them.
     """
     from worker.ranks.attempts import WorkerOptions
     from worker.request import check_request

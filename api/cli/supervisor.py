@@ -17,8 +17,8 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError
 
-#: Seconds of a short life, after which a process is restarted only after a wait. The wait doubles up to the second
-#: value.
+#: A process that dies within the first number of seconds is restarted after a wait, which doubles each time up to the
+#: second number of seconds.
 _SHORT_LIFE, _LONGEST_WAIT = 5.0, 10.0
 _LOOK_SECONDS = 0.2
 #: Seconds that processes have to stop, on top of the time that jobs have to save their state.

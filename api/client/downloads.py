@@ -41,7 +41,7 @@ class Download:
         return {"Range": f"bytes={self._done}-", "If-Range": self._stamp.read_text()}
 
     def begin(self, response: httpx.Response) -> bool:
-        """Take the head of an answer that is not an error, or of 416: no bytes follow those already received.
+        """Process the headers of a successful answer, or of a 416: there are no bytes beyond those received.
 
         Returns:
             Whether the answer's body must be written.
@@ -84,7 +84,7 @@ class Download:
         self._part.replace(self._target)
 
     def _sha256(self) -> str:
-        """Return the hash of the partial file. Bytes that this program has not received were left by an earlier one."""
+        """Return the SHA-256 of the partial file; bytes left by an earlier program are read and hashed here."""
         with self._part.open("rb") as file:
             file.seek(self._hashed)
             while block := file.read(BLOCK):

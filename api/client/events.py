@@ -37,7 +37,7 @@ class EventStream:
         return {"headers": headers, "timeout": httpx.Timeout(30.0, read=_SILENCE_SECONDS)}
 
     def refuse(self, response: httpx.Response) -> None:
-        """Take an answer without events.
+        """Handle an answer without events, which ends the watch.
 
         Raises:
             RequestError, ApiError: If the answer is an error.

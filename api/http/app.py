@@ -129,7 +129,7 @@ class Observed:
         self._app, self._state = app, state
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request, then record its status and duration."""
+        """Serve a request; record its status and the time until its response starts."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

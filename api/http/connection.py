@@ -36,8 +36,8 @@ class Connection(HttpToolsProtocol):
     It reads at most one piece of a body ahead of the app, and drops trailers.
 
     Attributes:
-        head_seconds: Time limit in seconds for a head, from the connection or the head's first byte to its end. Also
-            the limit for the rest of a body that the app did not read, from the answer on.
+        head_seconds: Time limit in seconds for a head (request line and headers), from the connection or the head's
+            first byte to its end. Also the limit for the rest of a body that the app did not read, from the answer on.
         most: Maximum number of simultaneous connections of this process; further ones are answered with 503.
     """
 
@@ -65,7 +65,7 @@ class Connection(HttpToolsProtocol):
         self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the timer and the count of this connection."""
+        """Stop the timer, and stop counting the connection."""
         memory.connections -= 1
         self._stop_timer()
         super().connection_lost(exc)

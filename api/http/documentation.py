@@ -98,7 +98,7 @@ _WITH_KEY: tuple[ServiceError, ...] = (
 
 
 def problems(*errors: ServiceError, key: bool = True) -> Responses:
-    """Return the documentation of an operation's errors, by status, each with the answer as its example.
+    """Return the documentation of an operation's errors by status, with an example answer for each.
 
     Args:
         errors: One error for each `code` of this operation. The errors that every operation may raise are added.

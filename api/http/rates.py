@@ -29,7 +29,7 @@ class Rates:
             a_second: Requests per second that the owner may send on average; None for no limit.
 
         Raises:
-            RateLimitError: If the owner has no request left.
+            RateLimitError: If the owner has used up its allowance.
         """
         if a_second is None:
             return

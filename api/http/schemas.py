@@ -18,7 +18,7 @@ from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
 if TYPE_CHECKING:
     StatusName = str
     OutcomeName = str
-else:  # named inline: the OpenAPI document would have a separate schema for each enumeration
+else:  # inlined in the OpenAPI document; enumerations would get schemas of their own
     StatusName = Literal[tuple(map(str, JobStatus))]
     OutcomeName = Literal[tuple(map(str, AttemptOutcome))]
 

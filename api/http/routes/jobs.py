@@ -216,7 +216,7 @@ def _resolve_inputs(
 ) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
     """Return the entries of all files of a job, and their blobs by digest.
 
-    These are the files of the request and earlier uploads. The store holds them for now.
+    They are the files of the request and of earlier uploads. The store does not delete the blobs for now.
     """
     inputs = list(received.files)
     ids = [upload_id for _, _, upload_id in received.uploads if is_id(upload_id)]

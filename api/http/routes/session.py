@@ -111,8 +111,7 @@ async def _end(request: Request, context: Context) -> None:
 def _answer(request: Request, text: str, seconds: int) -> Response:
     """Return 204 with the cookie.
 
-    Behind a proxy that terminates TLS, the request itself arrives without; `Origin` has the scheme that the browser
-    uses.
+    Behind a proxy that terminates TLS, the request itself arrives by HTTP; `Origin` has the browser's scheme.
     """
     secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
     response = Response(status_code=204, headers={"Cache-Control": "no-store"})

@@ -97,9 +97,7 @@ def test_no_gaussian_is_stretched_over_an_edge(scene: Scene) -> None:
 
 
 def test_discs_lie_in_their_surface() -> None:
-    """Centers of discs lie on a slanted plane, thin axes along its normal, and projections are round and 1
-    pixel wide.
-    """
+    """Discs on a slanted plane have centers on it, thin axes along its normal, and round projections 1 pixel wide."""
     slope_x, slope_y, constant = 0.03, -0.05, 40.0
     generator = np.random.default_rng(0)
     x, y = generator.uniform(0, 741, 50), generator.uniform(0, 500, 50)

@@ -1437,7 +1437,7 @@ def test_connections_beyond_the_systems_limit(tmp_path: Path) -> None:
 
 
 def test_files_beyond_the_systems_limit(tmp_path: Path) -> None:
-    """Of concurrent uploads with a file each, those without a free descriptor get 503 with Retry-After."""
+    """Concurrent uploads for which no file descriptor is left get 503 with Retry-After."""
     running = Service(tmp_path / "data", alone=True)
     running._command = ["sh", "-c", 'ulimit -n 200 && exec "$@"', "sh", *running._command]
     head = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 1000000"
