@@ -1,1 +1,1 @@
-"""Everything that a user touches."""
+"""User interfaces: HTTP API, command line, Python client and web page."""

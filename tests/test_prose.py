@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 #: Packages whose docstrings follow docs/style.md. Add a package once it passes.
 PACKAGES = (
+    "api",
     "benchmarks",
     "sgsst_core/bench",
     "sgsst_core/features",
@@ -23,6 +24,7 @@ PACKAGES = (
     "sgsst_core/report",
     "sgsst_core/scene",
     "sgsst_core/stylizing",
+    "tests/api",
 )
 OPENERS = ("Of", "Who", "What", "That", "From which", "In which")
 SECTIONS = ("Args", "Attributes", "Raises")

@@ -1,4 +1,4 @@
-"""`python -m api.cli` is `sgsst`."""
+"""Run the `sgsst` command by `python -m api.cli`."""
 
 from api.cli.main import main
 

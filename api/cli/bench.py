@@ -1,4 +1,4 @@
-"""`sgsst bench`: measurements that a user can repeat on their own scene and machine."""
+"""`sgsst bench`: benchmarks that users can run on their own scene and machine."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class VariantsRequest:
-    """What `sgsst bench error-time` and `sgsst bench quality` were asked for.
+    """Request of `sgsst bench error-time` or `sgsst bench quality`.
 
     Attributes:
-        source: scene and cameras.
-        style: style image.
-        out: folder for table, plot, JSON and scenes.
-        variants: names; none for all.
-        seconds: of optimization, for each variant.
+        source: Scene and cameras.
+        style: Style image.
+        out: Folder for table, plot, JSON and scenes.
+        variants: Names of variants; empty for all.
+        seconds: Seconds of optimization per variant.
         backbone: "auto", "vgg19" or "vgg16".
-        settings: on top of the standard preset, for all variants.
+        settings: Settings of all variants, on top of the standard preset.
     """
 
     source: SceneRequest
@@ -53,13 +53,13 @@ class VariantsRequest:
 
     @property
     def title(self) -> str:
-        """Scene and style, for people."""
+        """Scene and style, for titles of plots."""
         return f"{self.source.scene.parent.name or self.source.scene.stem}, {self.style.stem}"
 
 
 @dataclass(frozen=True)
 class _Inputs:
-    """What a request names, read."""
+    """Contents of the files that a request names."""
 
     file: SceneFile
     cameras: list[Camera]
@@ -69,7 +69,7 @@ class _Inputs:
 
     @staticmethod
     def of(request: VariantsRequest) -> _Inputs:
-        """Check and read; the quick checks come first."""
+        """Check and read the files of a request; the quick checks come first."""
         check_choice(request.source)
         variants = choose_variants(request.variants)
         check_folder(request.out)
@@ -80,12 +80,12 @@ class _Inputs:
         return _Inputs(file, cameras, style, weights, variants)
 
     def run(self, measure: Callable[..., Found], request: VariantsRequest, progress: Any) -> Found:
-        """Of a function with the arguments of `error_time`."""
+        """Call `measure` with the arguments of `error_time`, and return its result."""
         arguments = (self.file.scene, self.cameras, self.style, self.variants, request.seconds)
         return measure(*arguments, weights=self.weights, progress=progress, **request.settings)
 
     def as_dict(self, request: VariantsRequest) -> dict[str, Any]:
-        """For JSON."""
+        """Return the request as a JSON object."""
         return {
             "version": 1,
             "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
@@ -100,13 +100,13 @@ class _Inputs:
 
 
 def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
-    """Run the variants and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
+    """Run the variants, and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
 
     Args:
-        progress: called with a variant and each of its points.
+        progress: Callback that gets a variant and each of its points.
 
     Raises:
-        InvalidInputError: in one of its forms, for the first input that cannot be used.
+        InvalidInputError: If an input cannot be used; the first one is reported.
     """
     inputs = _Inputs.of(request)
     curves = inputs.run(error_time, request, progress)
@@ -122,10 +122,10 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
     """Run the variants, judge them, and write `quality.json`, plots, `quality.jpg` and scenes into the folder.
 
     Args:
-        progress: called with a variant and each of its points.
+        progress: Callback that gets a variant and each of its points.
 
     Raises:
-        InvalidInputError: in one of its forms, for the first input that cannot be used.
+        InvalidInputError: If an input cannot be used; the first one is reported.
     """
     inputs = _Inputs.of(request)
     quality = inputs.run(compare_quality, request, progress)
@@ -139,7 +139,7 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 
 
 def quality_table(quality: Quality) -> Table:
-    """Outcomes against what they were judged by; a star for those on the front."""
+    """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
     figures = ("style", "color_distance", "content", "features", "background_sensitivity", "saturated")
     columns = (*figures, "short RMSE", "long RMSE", "loss left", "steps")
     table = Table(
@@ -168,7 +168,7 @@ def _number(value: float | None) -> str:
 
 
 def error_time_table(curves: Sequence[Curve]) -> Table:
-    """Variants against what was left of the loss at each moment, and of each scale's at the end."""
+    """Return a table of each variant's remaining loss over time, and of the final remaining loss on each scale."""
     shown = [curve for curve in curves if curve.points]
     scales = sorted({scale for curve in shown for scale in curve.points[-1].by_scale})
     moments = [f"{point.seconds:.0f} s" for point in shown[0].points] if shown else []
@@ -189,16 +189,16 @@ def error_time_table(curves: Sequence[Curve]) -> Table:
 
 
 def point_line(variant: Variant, point: Point) -> str:
-    """One evaluation, for a log."""
+    """Return one evaluation as a line for a log."""
     return f"{variant.name}: {point.relative:.2%} of the loss left after {point.seconds:.1f} s, {point.step} steps"
 
 
 def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> list[tuple[Case, Measurement]]:
-    """Measure the hard cases whose name or group holds `only`.
+    """Measure the stability cases whose name contains `only` or whose group is `only`.
 
     Raises:
-        SettingsError: no case is called so.
-        OutputError: the file cannot be written.
+        SettingsError: If no case matches.
+        OutputError: If the file cannot be written.
     """
     chosen = [case for case in all_cases() if only in case.name or only == case.group]
     if not chosen:
@@ -218,7 +218,7 @@ def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> li
 
 
 def stability_table(found: Sequence[tuple[Case, Measurement]]) -> Table:
-    """Cases against errors."""
+    """Return a table of the error of each case."""
     result = Table("case", "measure", "error", "bound", "", "note", title="Numerical stability")
     group = ""
     for case, measured in found:
@@ -234,7 +234,7 @@ def stability_table(found: Sequence[tuple[Case, Measurement]]) -> Table:
 
 
 def _stability_row(case: Case, measured: Measurement) -> dict[str, object]:
-    """One case for JSON; errors that are not finite are words there."""
+    """Return one case as a JSON object, with non-finite errors as strings."""
     outcome = measured.result
     return {
         "group": case.group,

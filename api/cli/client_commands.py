@@ -1,4 +1,4 @@
-"""Commands for those who use a service: `submit`, `status`, `watch`, `download` and so on. They import no PyTorch."""
+"""Client commands: `submit`, `status`, `watch`, `download` and others. They do not import PyTorch."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.", 
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add all commands of this module."""
+    """Add all commands of this module to the app."""
     for command in (submit, status, watch, download, cancel, retry, delete, jobs):
         app.command()(command)
 
@@ -81,7 +81,7 @@ def submit(
     url: UrlOption = None,
     key: KeyOption = None,
 ) -> None:
-    """Send a job to a service. Options are those of stylize; with --out, wait for the result."""
+    """Submit a job to a service. Options are those of stylize; with --out, wait for the result."""
     told = options.model_dump(mode="json", exclude_unset=True)
     styles = parse_styles(style)
     if len(styles) > 1:
@@ -115,10 +115,10 @@ def submit(
 
 
 def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Regions in JSON.
+    """Return regions as the API expects them.
 
     Args:
-        names: under which their styles' pictures are sent, in the order of `region_requests`.
+        names: Names under which the style images of the regions are sent, in the order of `region_requests`.
     """
     told = {each.name: each.model_dump(mode="json", exclude_defaults=True) for each in regions}
     left = iter(names)
@@ -129,14 +129,14 @@ def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> 
 
 
 def status(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Tell how a job is."""
+    """Show the status of a job."""
     with _client(url, key) as client:
         found = client.job(job)
     out_console.print(json.dumps(found.data) if as_json else _job_text(found))
 
 
 def watch(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Show a job's progress until it has ended; exits with 1 where it has not succeeded."""
+    """Show a job's progress until it has ended; exit with 1 if it has not succeeded."""
     with _client(url, key) as client:
         found = _follow(client, job, as_json)
     if not as_json:
@@ -158,7 +158,7 @@ def download(
     url: UrlOption = None,
     key: KeyOption = None,
 ) -> None:
-    """Download a job's result, or another of its files; what was cut off goes on where it stopped."""
+    """Download a job's result, or another of its files. An interrupted download resumes where it stopped."""
     with _client(url, key) as client:
         names = [entry["name"] for entry in client.artifacts(job)] if name == "all" else [name]
         written = []
@@ -183,14 +183,14 @@ def cancel(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None,
 
 
 def retry(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Queue a job again that failed or was canceled."""
+    """Queue a failed or canceled job again."""
     with _client(url, key) as client:
         found = client.retry(job)
     out_console.print(json.dumps(found.data) if as_json else _job_text(found))
 
 
 def delete(job: JobArgument, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Remove a job that has ended, with its results."""
+    """Delete a job that has ended, with its results."""
     with _client(url, key) as client:
         client.delete(job)
 
@@ -202,7 +202,7 @@ def jobs(
     url: UrlOption = None,
     key: KeyOption = None,
 ) -> None:
-    """List jobs, the newest first."""
+    """List jobs, newest first."""
     with _client(url, key) as client:
         found = list(client.jobs(status=status or (), limit=limit))
     if as_json:
@@ -244,7 +244,7 @@ def _parse_parameters(text: str) -> dict[str, Any]:
 
 @contextmanager
 def _transfer(what: str) -> Iterator[Any]:
-    """A bar for bytes on a terminal, nothing elsewhere."""
+    """Show a progress bar of transferred bytes on a terminal, and nothing elsewhere."""
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
         task = bar.add_task(what, total=None)
@@ -253,7 +253,7 @@ def _transfer(what: str) -> Iterator[Any]:
 
 @contextmanager
 def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
-    """One bar for the files' bytes and then for the views that are looked at, on a terminal; nothing elsewhere."""
+    """Show one progress bar, first of the sent bytes, then of the surveyed views; only on a terminal."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
     with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
         task = bar.add_task("checking", total=None, text="")
@@ -270,7 +270,7 @@ def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
 
 
 def _follow(client: Client, job_id: str, as_json: bool) -> Job:
-    """Show events until the job has ended: a live bar on a terminal, lines elsewhere, or JSON lines."""
+    """Show events until the job has ended: as a live bar on a terminal, as lines elsewhere, or as JSON lines."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
     live = error_console.is_terminal and not as_json
     with Bar(*columns, console=error_console, transient=True, disable=not live) as bar:
@@ -302,7 +302,7 @@ def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
 
 
 def _tell_loss(client: Client, job_id: str, form: PackedForm | None) -> None:
-    """Say what a packed result has lost."""
+    """Print the quality loss of a compressed result."""
     if form is None:
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -313,7 +313,7 @@ def _tell_loss(client: Client, job_id: str, form: PackedForm | None) -> None:
 
 
 def _packed_form(out: Path) -> PackedForm | None:
-    """The packed form that a file's name asks for."""
+    """Return the compressed format of a file name; None if it has none."""
     form = form_of_name(out.name)
     return form if form in PACKED_FORMS else None
 

@@ -1,9 +1,9 @@
-"""A real scene that needs no download: the Motorcycle stereo pair in scikit-image, lifted to Gaussians.
+"""Demo scene without a download: the Motorcycle stereo pair of scikit-image, lifted to Gaussians.
 
-The pair and its disparity are from the Middlebury 2014 benchmark (Scharstein et al., "High-resolution stereo
-datasets with subpixel-accurate ground truth", GCPR 2014). Every pixel of the left photo becomes a flat Gaussian that
-covers just that pixel as seen from the left camera; what only the right camera sees is added from the right photo, and
-a thin margin behind depth edges is invented, so that the views between and around the two have no cracks.
+The pair and its disparity are from the Middlebury 2014 benchmark (Scharstein et al., "High-resolution stereo datasets
+with subpixel-accurate ground truth", GCPR 2014). Every pixel of the left photo becomes a flat Gaussian that covers just
+that pixel as seen from the left camera. Surfaces that only the right camera sees are added from the right photo. A thin
+margin behind depth edges is invented, so that views between and around the two cameras have no cracks.
 
 World: meters, the left camera's axes (x right, y down, z forward), the origin at the left camera.
 """
@@ -31,42 +31,42 @@ from sgsst_core.scene.gaussians import Scene
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Calibration at the photos' size (741x500), as scikit-image's `stereo_motorcycle` documents it: Middlebury's
-#: (focal 3979.911 px, doffs 124.343 px at 2964x2000, baseline 193.001 mm) divided by 4.
+#: Calibration at the size of the photos (741x500), as documented by scikit-image's `stereo_motorcycle`. It is
+#: Middlebury's (focal 3979.911 px, doffs 124.343 px at 2964x2000, baseline 193.001 mm) divided by 4.
 FOCAL = 994.978
 CENTER_X, CENTER_Y = 311.193, 254.877
 BASELINE = 0.193001
 #: Difference of the two principal points' x: depth = FOCAL * BASELINE / (disparity + DISPARITY_OFFSET).
 DISPARITY_OFFSET = 31.086
 
-#: Standard deviation of a Gaussian in pixels of the photo it comes from. Wider blurs, narrower leaves a lattice.
+#: Standard deviation of a Gaussian in pixels of its photo. Larger values blur, smaller ones leave a visible lattice.
 PIXEL_SIGMA = 0.5
-#: The same for a Gaussian that stands for several pixels, to which the rasterizer's own blur of 0.3 px^2 adds less.
+#: The same for a Gaussian that replaces several pixels: the rasterizer's own blur of 0.3 px^2 widens it less.
 MERGED_SIGMA = 0.62
-#: Thickness of a disc against its smaller radius.
+#: Ratio of a disc's thickness to its smaller radius.
 FLATNESS = 0.1
 OPACITY = 0.97
-#: A surface seen more obliquely than this (depth per unit of width) is lifted as if it were no steeper; differences
-#: over an edge between two objects look like such surfaces, and would make needles.
+#: Maximum slope (depth per unit of width) of a lifted surface. Steeper slopes are clamped: they mostly are differences
+#: across an edge between two objects, and would make needles.
 MAX_SLOPE = 3.0
-#: Pixels: a step of disparity beyond this is an edge between two objects.
+#: Disparity step in pixels that counts as an edge between two objects.
 EDGE_STEP = 3.0
-#: Rows and columns in which the surface behind a pixel is looked for; half of it on each side of an edge is invented.
-#: Wide because the cameras lie side by side; low because the floor's disparity grows downwards.
+#: Rows and columns of the window that is searched for the surface behind a pixel; half of it on each side of an edge is
+#: invented. Wide because the cameras lie side by side; low because the floor's disparity grows downwards.
 EDGE_WINDOW = (13, 49)
-#: Pixels beside an edge that may be part of the foreground though the disparity is unknown there.
+#: Width in pixels of the rim beside an edge that may be foreground although its disparity is unknown.
 RIM = 3.0
-#: Difference of color (0..1) between the two photos beyond which a guessed disparity is dropped.
+#: Color difference (0..1) between the two photos above which a guessed disparity is dropped.
 WRONG_COLOR = 0.2
 #: Four pixels whose colors differ by less (0..1) and whose disparities lie on a plane within FLAT_STEP share one
-#: Gaussian: a third fewer of them for no visible difference.
+#: Gaussian. That saves a third of the Gaussians with no visible difference.
 FLAT_COLOR = 0.08
 FLAT_STEP = 0.3
 
-#: Views of the camera path: an ellipse through the neighborhood of both cameras, looking at the motorcycle.
+#: Views of the camera path: an ellipse around both cameras, looking at the motorcycle.
 VIEWS = 10
 VIEW_WIDTH, VIEW_HEIGHT = 720, 480
-#: Focal length of the views; a little longer than the photos', so that the rim of the photos stays outside.
+#: Focal length of the views; a little longer than the photos', so that the border of the photos stays out of view.
 VIEW_FOCAL = 1.14 * FOCAL
 PATH_RADIUS = (0.12, 0.035, 0.05)  # meters along x, y, z
 LOOK_AT = (0.13, 0.0, 2.7)
@@ -77,9 +77,9 @@ class DemoScene:
     """Files of the demo.
 
     Attributes:
-        ply: the scene, 3DGS PLY of SH degree 0.
-        cameras: its views, INRIA cameras.json.
-        style: the style image, JPEG.
+        ply: Scene, a 3DGS PLY of SH degree 0.
+        cameras: Views of the scene, an INRIA cameras.json.
+        style: Style image, JPEG.
     """
 
     ply: Path
@@ -88,7 +88,7 @@ class DemoScene:
 
 
 class Samples(NamedTuple):
-    """Pixels to be lifted: position, disparity, its gradient, color 0..1, and size in pixels; [n] or [n, 3]."""
+    """Pixels to lift: position, disparity and its gradient, color (0..1), and size in pixels; shape [n] or [n, 3]."""
 
     x: Array
     y: Array
@@ -100,10 +100,10 @@ class Samples(NamedTuple):
 
 
 def build_demo(folder: Path) -> DemoScene:
-    """Write the demo's scene, cameras and style image into a folder, which is created.
+    """Write the demo's scene, cameras and style image into a folder, and create the folder.
 
     Raises:
-        OutputError: the folder cannot be written.
+        OutputError: If the folder cannot be written.
     """
     ensure_writable_folder(folder)
     demo = DemoScene(folder / "motorcycle.ply", folder / "cameras.json", folder / "starry_night.jpg")
@@ -116,13 +116,13 @@ def build_demo(folder: Path) -> DemoScene:
 
 
 def lift_pair() -> Scene:
-    """The Gaussians of the stereo pair, of SH degree 0."""
+    """Return the stereo pair as Gaussians of SH degree 0."""
     left, right, measured = data.stereo_motorcycle()
     left, right = left / 255.0, right / 255.0
     known = np.isfinite(measured)
     disparity, behind_left = _fill(measured.astype(np.float64), known, left)
 
-    # A guessed disparity that would show on the right with another color than is there was a bad guess.
+    # A guessed disparity is wrong if its pixel would be visible in the right photo, but the color there differs.
     moved, _ = _move_to_right(disparity)
     rows, columns, inside = _in_other_photo(disparity, -1)
     shows = inside & (disparity > moved[rows, columns] - EDGE_STEP)
@@ -130,7 +130,7 @@ def lift_pair() -> Scene:
 
     moved, seen = _move_to_right(np.where(wrong, np.inf, disparity))
     filled, behind_right = _fill(moved, seen, right)
-    # One pixel more all around: the seam between the two photos has no cracks.
+    # One more pixel all around, so that the seam between the two photos has no cracks.
     only_right = ndimage.binary_dilation(~seen, np.ones((3, 3)))
     invented_left = behind_left.mask & _hidden(behind_left.disparity, filled, -1)
     invented_right = behind_right.mask & _hidden(behind_right.disparity, disparity, 1)
@@ -152,7 +152,7 @@ def lift_pair() -> Scene:
 
 
 class _Behind(NamedTuple):
-    """The surface behind depth edges: where it is invented, its disparity and color."""
+    """Invented surface behind depth edges: its mask, disparity and color."""
 
     mask: Mask
     disparity: Array
@@ -160,31 +160,31 @@ class _Behind(NamedTuple):
 
 
 def _fill(disparity: Array, known: Mask, photo: Array) -> tuple[Array, _Behind]:
-    """Disparity at unknown pixels, and the surface behind the foreground's rims.
+    """Return the disparity with unknown pixels filled in, and the surface behind the rims of the foreground.
 
-    Unknown pixels lie mostly beside a foreground object, where the other camera's sight of the background was
-    blocked: they get the disparity of the nearest pixel that is not foreground (nearer than something in its window).
+    Unknown pixels lie mostly beside a foreground object that hides the background from the other camera. They get the
+    disparity of the nearest pixel that is not foreground, that is, not nearer than something else in its window.
     """
     lowest = ndimage.minimum_filter(np.where(known, disparity, np.inf), size=EDGE_WINDOW)
     source = known & (disparity <= lowest + EDGE_STEP)
     rows, columns = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
     nearest = disparity[rows, columns]
     distance, (near_rows, near_columns) = ndimage.distance_transform_edt(~known, return_indices=True)
-    # Beside an edge an unknown pixel may still be foreground: its color tells.
+    # Beside an edge, an unknown pixel may still be foreground; its color decides.
     unlike_known = np.abs(photo - photo[near_rows, near_columns]).sum(axis=2)
     unlike_source = np.abs(photo - photo[rows, columns]).sum(axis=2)
     front = (distance <= RIM) & (unlike_known < unlike_source)
     filled = np.where(known | front, disparity[near_rows, near_columns], nearest)
     mask = known & ~source & (nearest < disparity - EDGE_STEP)
-    # Copies of the nearest pixel make streaks; invented colors are better blurred.
+    # Copies of the nearest pixel make streaks; blurring hides them.
     color = ndimage.gaussian_filter(photo[rows, columns], (3, 3, 0))
     return filled, _Behind(mask, nearest, color)
 
 
 def _in_other_photo(disparity: Array, direction: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
-    """Row and column of each pixel in the other photo (direction -1 from left to right, 1 back), and where it has one.
+    """Return row and column of each pixel in the other photo, and a mask of the pixels that lie inside it.
 
-    Columns outside are brought to the border.
+    `direction` is -1 from left to right and 1 from right to left. Columns outside are clamped to the border.
     """
     rows, columns = np.meshgrid(*map(np.arange, disparity.shape), indexing="ij")
     moved = np.rint(columns + direction * disparity)
@@ -193,17 +193,17 @@ def _in_other_photo(disparity: Array, direction: int) -> tuple[NDArray[np.intp],
 
 
 def _hidden(disparity: Array, other: Array, direction: int) -> Mask:
-    """Where a surface is out of the other photo's sight: behind something there, or beyond its border."""
+    """Return where a surface is hidden in the other photo: behind something there, or beyond its border."""
     rows, columns, inside = _in_other_photo(disparity, direction)
     return ~inside | (other[rows, columns] > disparity + EDGE_STEP)
 
 
 def _move_to_right(disparity: Array) -> tuple[Array, Mask]:
-    """The left photo's disparity as the right camera sees it, and where it sees any of it (0 elsewhere)."""
+    """Return the left photo's disparity as seen by the right camera (0 where it has none), and a mask of its pixels."""
     rows, columns, inside = _in_other_photo(disparity, -1)
     moved = np.full(disparity.shape, -np.inf)
     np.maximum.at(moved, (rows[inside], columns[inside]), disparity[inside])  # the nearest surface wins
-    # Slanted surfaces are stretched on the right: single columns between two that were hit are no gaps.
+    # Slanted surfaces are stretched in the right photo: a single column between two hits is not a gap.
     hit = ndimage.binary_closing(moved > 0, np.ones((1, 3)))
     between = hit & ~(moved > 0)
     moved[between] = ndimage.maximum_filter(moved, size=(1, 3))[between]
@@ -211,7 +211,7 @@ def _move_to_right(disparity: Array) -> tuple[Array, Mask]:
 
 
 def _samples(disparity: Array, photo: Array, chosen: Mask) -> Samples:
-    """Samples of the chosen pixels; four alike become one."""
+    """Return samples of the chosen pixels; four similar pixels become one sample."""
     slope_x, slope_y = (_slope(disparity, axis) for axis in (1, 0))
     rows, columns = np.meshgrid(*map(np.arange, disparity.shape), indexing="ij")
     fields = np.dstack([columns + 0.5, rows + 0.5, disparity, slope_x, slope_y, photo])
@@ -233,9 +233,10 @@ def _samples(disparity: Array, photo: Array, chosen: Mask) -> Samples:
 
 
 def _slope(disparity: Array, axis: int) -> Array:
-    """Gradient of the disparity: the smaller of the differences to both sides, 0 where their signs differ.
+    """Return the gradient of the disparity: the smaller of the differences to both sides, 0 if their signs differ.
 
-    So a pixel beside an edge takes the slope of its own surface. Two pixels wide, against noise.
+    A pixel beside an edge therefore takes the slope of its own surface. The differences span two pixels, to reduce
+    noise.
     """
     ahead = (np.roll(disparity, -2, axis) - disparity) / 2
     behind = (disparity - np.roll(disparity, 2, axis)) / 2
@@ -243,10 +244,11 @@ def _slope(disparity: Array, axis: int) -> Array:
 
 
 def _gaussians(samples: Samples, camera_x: float) -> tuple[Array, Array, Array, Array]:
-    """Means, quats, log scales and sh_dc of flat discs in the samples' surfaces; each projects to a round sample.
+    """Return means, quats, log scales and sh_dc of flat discs on the samples' surfaces. Each projects to a circle.
 
-    Depth is FOCAL * BASELINE / d with d = disparity + offset, so a surface whose disparity is linear is a plane, and
-    the derivatives of the 3D point with respect to the pixel span it: the disc's covariance is their outer products.
+    Depth is FOCAL * BASELINE / d with d = disparity + offset, so a surface whose disparity is linear is a plane. The
+    derivatives of the 3D point with respect to the pixel span that plane; the disc's covariance is the sum of their
+    outer products.
     """
     shifted = samples.disparity + DISPARITY_OFFSET
     depth = FOCAL * BASELINE / shifted
@@ -271,7 +273,10 @@ def _gaussians(samples: Samples, camera_x: float) -> tuple[Array, Array, Array, 
 
 
 def camera_path() -> list[dict[str, object]]:
-    """The views in the INRIA form: position, camera-to-world rotation (columns right, down, forward), focal lengths."""
+    """Return the views in the INRIA format.
+
+    Each has a position, a camera-to-world rotation (columns right, down, forward), and focal lengths.
+    """
     views = []
     for i in range(VIEWS):
         angle = 2 * np.pi * i / VIEWS

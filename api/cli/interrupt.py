@@ -1,4 +1,4 @@
-"""Ctrl-C that lets the step in hand finish; a second one ends the program at once."""
+"""Graceful Ctrl-C: the first one lets the current step finish, the second one ends the program at once."""
 
 from __future__ import annotations
 
@@ -10,27 +10,26 @@ from types import FrameType
 
 
 class StopFlag:
-    """Whether the user has asked to stop, and by which signal."""
+    """Flag that records whether a signal has asked the program to stop, and which."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
 
     def __call__(self) -> bool:
-        """Whether a signal has come."""
+        """Return whether a signal has arrived."""
         return self.signal is not None
 
     @property
     def exit_code(self) -> int:
-        """What a program that a signal ended returns: 130 for Ctrl-C."""
+        """Exit code of a program that was ended by the signal: 130 for Ctrl-C."""
         return 128 + (self.signal or signal.SIGINT)
 
 
 @contextmanager
 def stop_on_signal(announce: Callable[[], None]) -> Iterator[StopFlag]:
-    """Turn the first SIGINT or SIGTERM into a flag; `announce` is called when it comes.
+    """Turn the first SIGINT or SIGTERM into a flag, and call `announce` when it arrives.
 
-    The second one does what it always does. Outside of the main thread, where Python allows no handlers, nothing
-    is changed.
+    The second signal has its usual effect. Outside the main thread, where Python allows no handlers, nothing changes.
     """
     flag = StopFlag()
     if threading.current_thread() is not threading.main_thread():

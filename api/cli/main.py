@@ -26,7 +26,7 @@ from worker.options import RunOptions, StylizeOptions, ViewOptions
 from worker.regions import region_options, region_requests
 from worker.styles import parse_styles
 
-if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command imports what it needs
+if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
     from api.cli.bench import VariantsRequest
     from sgsst_core.bench.error_time import Curve
     from worker.description import Prepared
@@ -34,12 +34,12 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import: each command impo
     from worker.ranks.attempts import RanksResult, WorkerOptions
     from worker.request import Outputs, StylizeRequest
 
-#: Exit codes: an input that cannot be used (as for a wrong option), and everything else that goes wrong.
+#: Exit codes: an unusable input (as for a wrong option), and any other failure.
 BAD_INPUT, FAILURE = 2, 1
-#: Characters of tables that would be cut in a narrower terminal.
+#: Width in characters of tables that a narrower terminal would truncate.
 TABLE_WIDTH = 180
-#: The demo's resolution and steps, and seconds after which it stops on a slow machine: less than five minutes with all
-#: that is around.
+#: Resolution and steps of the demo, and seconds after which it stops on a slow machine; in total it takes less than
+#: five minutes.
 DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 180
 
 app = typer.Typer(
@@ -113,7 +113,7 @@ def stylize(
     options: StylizeOptions,
     run: RunOptions,
 ) -> None:
-    """Give a scene the style of a picture."""
+    """Stylize a scene with one or several style images."""
     settings = options.settings()
     from worker.ranks.attempts import WorkerOptions
     from worker.request import SceneRequest, StylizeRequest
@@ -133,7 +133,11 @@ def _stylize(
     workers: int | None = None,
     options: WorkerOptions | None = None,
 ) -> None:
-    """Prepare, run, and tell what was decided and what came out; `arguments` are for the command to go on with."""
+    """Stylize a scene and print the plan and the results.
+
+    Args:
+        arguments: Arguments of this command; the command to resume the job is built from them.
+    """
     from worker.ranks.attempts import WorkerOptions
     from worker.request import check_request
 
@@ -147,7 +151,7 @@ def _stylize(
 
 
 def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, checkpoint_seconds: float) -> None:
-    """One rank, in this process."""
+    """Stylize on one rank in this process."""
     from worker.description import describe
     from worker.execute import execute
     from worker.prepare import prepare
@@ -171,7 +175,7 @@ def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, check
 def _stylize_on_ranks(
     request: StylizeRequest, outputs: Outputs, command: str, workers: int, options: WorkerOptions
 ) -> None:
-    """Several ranks, in processes of their own."""
+    """Stylize on several ranks, each in a process of its own."""
     from worker.ranks.attempts import stylize_on_ranks
     from worker.ranks.listener import Listener
 
@@ -283,7 +287,7 @@ def plan(
     *,
     options: StylizeOptions,
 ) -> None:
-    """Tell what stylizing a scene would leave out, why, and what an iteration would cost."""
+    """Show what stylizing a scene would skip, why, and what an iteration would cost."""
     from api.cli.scene_tools import make_plan
     from worker.request import SceneRequest, StylizeRequest
 
@@ -323,7 +327,7 @@ def check(
     *,
     options: ViewOptions,
 ) -> None:
-    """Tell what is extreme in a scene, its views and its style, and what is done about it."""
+    """Report extreme values in a scene, its views and its style, and how they are handled."""
     from api.cli.scene_tools import look_for_extremes
     from worker.request import SceneRequest
 
@@ -391,7 +395,7 @@ def demo(
     _stylize(request, arguments)
 
 
-#: Of the options of a job, those that `bench` gives all variants.
+#: Options of a job that `bench` applies to all variants.
 _OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")
 BenchSeconds = Annotated[float, typer.Option(min=1, help="Of optimization, for each variant.")]
 
@@ -410,7 +414,7 @@ def bench_error_time(
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> None:
-    """Run variants of a job for the same time each, and plot the error that is left against seconds."""
+    """Run variants of a job for the same time each, and plot the remaining error over time."""
     from api.cli.bench import error_time_table, point_line, run_error_time
 
     request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)
@@ -433,7 +437,7 @@ def bench_quality(
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> None:
-    """Run variants of a job for the same time each, and judge results by a network that none of them optimizes."""
+    """Run variants of a job for the same time each, and judge them by a network that none of them optimizes."""
     from api.cli.bench import point_line, quality_table, run_quality
 
     request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)
@@ -443,7 +447,7 @@ def bench_quality(
 
 
 def _tell_what_was_left_out(curves: Sequence[Curve], out: Path) -> None:
-    """And where the results are."""
+    """Print which variants were left out, and where the results are."""
     for curve in curves:
         if curve.left_out:
             out_console.print(f"{curve.variant.name} was left out: {curve.left_out}")
@@ -460,7 +464,7 @@ def _variants_request(
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> VariantsRequest:
-    """What a command that runs variants was asked for."""
+    """Return the request of a command that runs variants."""
     from api.cli.bench import VariantsRequest
     from worker.request import SceneRequest
 
@@ -476,7 +480,7 @@ def bench_stability(
     quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes: minutes less.")] = False,
     out: Annotated[Path | None, typer.Option(help="JSON file to write.")] = None,
 ) -> None:
-    """Measure hard cases against float64 references; exits with 1 where one misses its bound."""
+    """Measure hard cases against float64 references; exit with 1 if one exceeds its bound."""
     from api.cli.bench import run_stability, stability_table
 
     found = run_stability(only, quick, out, lambda case: error_console.print(f"{case.group}: {case.name}"))
@@ -487,7 +491,7 @@ def bench_stability(
 
 @weights_app.command("list")
 def list_() -> None:
-    """Show which weights are installed and sound, and where the others come from; exits with 1 if some are damaged."""
+    """List the weights that are installed, and the sources of the others; exit with 1 if some are damaged."""
     from sgsst_core.features.network_weights import list_network_weights
     from sgsst_core.features.weight_files import damage_of
 
@@ -512,7 +516,7 @@ def fetch(
         Path | None, typer.Option("--from", help="Convert this file (.pth of torchvision or of Gatys et al.) instead.")
     ] = None,
 ) -> None:
-    """Download weights, convert them, and keep them in the cache folder; does nothing where they are installed."""
+    """Download and convert weights into the cache folder; do nothing if they are installed."""
     from sgsst_core.features.network_weights import fetch_network_weights
 
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
@@ -526,7 +530,7 @@ def fetch(
 
 @weights_app.command()
 def path() -> None:
-    """Print the folder in which weights are kept; SGSST_CACHE names another one."""
+    """Print the folder of the cached weights; SGSST_CACHE sets another one."""
     from sgsst_core.features.network_weights import cache_folder
 
     out_console.print(str(cache_folder()))
@@ -534,7 +538,7 @@ def path() -> None:
 
 @contextmanager
 def _status(text: str) -> Iterator[None]:
-    """A spinner on a terminal, nothing elsewhere."""
+    """Show a spinner on a terminal, and nothing elsewhere."""
     with error_console.status(text) if error_console.is_terminal else _nothing():
         yield
 
@@ -545,7 +549,7 @@ def _nothing() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; every expected error becomes one message on stderr and an exit code, without traceback."""
+    """Run the command line. Expected errors become one message on stderr and an exit code, without a traceback."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         _check_names(arguments)
@@ -558,7 +562,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         error_console.print("Aborted.")
         return 130
-    except BrokenPipeError:  # `sgsst weights list | head`
+    except BrokenPipeError:  # for example `sgsst weights list | head`
         return FAILURE
     except (MemoryError, RuntimeError) as error:
         if not _out_of_memory(error):
@@ -577,7 +581,10 @@ def _check_names(arguments: Sequence[str]) -> None:
 
 
 def _out_of_memory(error: Exception) -> bool:
-    """PyTorch raises a plain RuntimeError on the CPU, a subclass of it on GPUs."""
+    """Return whether an error reports a lack of memory.
+
+    PyTorch raises a plain RuntimeError on the CPU, and a subclass of it on GPUs.
+    """
     text = str(error)
     return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text
 

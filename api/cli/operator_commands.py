@@ -1,4 +1,4 @@
-"""Commands for those who run a service on this machine: `serve`, `keys` and `fsck`. They import no PyTorch."""
+"""Operator commands for a service on this machine: `serve`, `keys` and `fsck`. They do not import PyTorch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from service.settings import ServiceSettings
     from service.store import Store
 
-#: Exit codes of `sgsst fsck`, which are added up.
+#: Exit codes of `sgsst fsck`; the exit status is their sum.
 _FSCK_CODES = {"missing": 4, "damaged": 8, "orphaned": 16}
 _FSCK_ROLLED_BACK = 32
 
@@ -26,7 +26,7 @@ DataOption = Annotated[Path | None, typer.Option(help="Folder of the service. [S
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add all commands of this module."""
+    """Add all commands of this module to the app."""
     app.command()(serve)
     app.command()(fsck)
     keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
@@ -61,10 +61,10 @@ def fsck(
     data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare all files of the service with its database, beside a service that runs.
+    """Compare all files of the service with its database; the service may be running.
 
-    Exit code: 0 for no finding, else the sum of 4 (files are missing), 8 (damaged), 16 (orphaned) and 32 (the database
-    has gone back in time).
+    Exit code: 0 without findings, else the sum of 4 (files are missing), 8 (damaged), 16 (orphaned) and 32 (the
+    database has gone back in time).
     """
     store = _open_store(data)
     from service.fsck import FileCheck
@@ -98,7 +98,7 @@ def create_key(
     data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make an API key and print it; it is stored as a digest only, and cannot be shown again."""
+    """Create an API key and print it. Only its digest is stored, so it cannot be shown again."""
     from service.store.quotas import Quotas
 
     quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
@@ -129,7 +129,7 @@ def revoke_key(
     key_id: Annotated[str, typer.Argument(metavar="ID", help="As shown by keys list.", show_default=False)],
     data: DataOption = None,
 ) -> None:
-    """Make an API key useless from now on."""
+    """Revoke an API key."""
     row = _open_store(data).keys.revoke(key_id)
     error_console.print(f"Key {row.id} of {row.name!r} is revoked.")
 

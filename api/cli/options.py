@@ -1,4 +1,4 @@
-"""Options of commands, made from the fields that declare them."""
+"""Command-line options, generated from the model fields that declare them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def with_options(
     only: Collection[str] | None = None,
     without: Collection[str] = (),
 ) -> Callable[[Command], Command]:
-    """Offer the fields of a model as options of a command, in the place of one argument of its function.
+    """Return a decorator that replaces one argument of a command by options, one per field of a model.
 
-    The function gets a model of what was given: values that were not are unset in it.
+    The function gets a model with the given values; fields that were not given are unset in it.
 
     Args:
-        argument: of the function.
-        only: names of the options to offer; None for all.
-        without: names of options that are not offered.
+        argument: Name of the function's argument.
+        only: Names of the options to offer; None for all.
+        without: Names of options to leave out.
     """
     chosen = (declared(model).keys() if only is None else set(only)) - set(without)
     offered = {name: option for name, option in declared(model).items() if name in chosen}
@@ -63,7 +63,7 @@ def flags(option: Declared) -> str:
 
 
 def metavar(option: Declared) -> str:
-    """What stands for the value; empty for a switch."""
+    """Return the placeholder of an option's value in the help; empty for a switch."""
     kind = kind_of(option)
     if is_switch(option):
         return ""
@@ -74,7 +74,7 @@ def metavar(option: Declared) -> str:
 
 
 def help_text(option: Declared) -> str:
-    """What an option does, what holds without it, and what it may be."""
+    """Return the help of an option: its meaning, its default and its valid values."""
     form = FORMS.get(option.option.unit)
     parts = [option.help.removesuffix(".") + form.hint if form else option.help]
     default = option.text(option.info.default)
@@ -86,7 +86,7 @@ def help_text(option: Declared) -> str:
 
 
 def _parameter(option: Declared) -> inspect.Parameter:
-    """Of a command's function. Words and switches are typer's to check, all else is the model's."""
+    """Return the parameter of a command's function. typer checks words and switches, the model all other values."""
     form = FORMS.get(option.option.unit)
     kind: Any = kind_of(option) if is_switch(option) or get_origin(kind_of(option)) is Literal else str
     shown: dict[str, Any] = {} if is_switch(option) else {"metavar": metavar(option)}
@@ -97,7 +97,7 @@ def _parameter(option: Declared) -> inspect.Parameter:
 
 
 def kind_of(option: Declared) -> Any:
-    """The type of its values, without None; the first of several, and without its bounds."""
+    """Return the type of an option's values without None and bounds; the first type of a union."""
     found = option.info.annotation
     kinds = [kind for kind in get_args(found) if kind is not type(None)]
     first = kinds[0] if type(None) in get_args(found) else found
@@ -105,12 +105,16 @@ def kind_of(option: Declared) -> Any:
 
 
 def is_switch(option: Declared) -> bool:
-    """Whether it is on or off, and has no value."""
+    """Return whether an option is a switch, which takes no value."""
     return kind_of(option) is bool
 
 
 def _checked(model: type[M], given: dict[str, object]) -> M:
-    """A model of what was given, or an error that names the option."""
+    """Return a model of the given values.
+
+    Raises:
+        SettingsError: If a value is invalid; the message names the option.
+    """
     try:
         return model.model_validate(given)
     except ValidationError as error:

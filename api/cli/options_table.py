@@ -1,4 +1,4 @@
-"""The reference of all options, made from their declarations: `python -m api.cli.options_table > docs/options.md`."""
+"""Generator of the options reference: `python -m api.cli.options_table > docs/options.md`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Made by `python -m api.cli.options_table > docs/options.md` from the fields that
 
 
 def reference() -> str:
-    """The page, as Markdown."""
+    """Return the reference page as Markdown."""
     told, settings = declared(JobParameters), declared(Settings).keys()
     seen = ViewOptions.model_fields.keys()
     groups = {
@@ -52,7 +52,7 @@ def _table(title: str, options: Iterable[Declared], *, api: bool = True) -> str:
 
 
 def _values(option: Declared) -> str:
-    """What an option may be, and in what unit."""
+    """Return the valid values of an option, and their unit."""
     if is_switch(option) or _words(option):
         return ", ".join(_words(option)) or "on, off"
     bounds = f"`{option.bounds}`" if option.bounds else ""
@@ -60,7 +60,7 @@ def _values(option: Declared) -> str:
 
 
 def _words(option: Declared) -> tuple[str, ...]:
-    """What it may be, where that is one of some words."""
+    """Return the words that an option accepts; empty if it accepts other values."""
     kind = kind_of(option)
     return get_args(kind) if get_origin(kind) is Literal else ()
 

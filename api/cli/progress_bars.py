@@ -1,4 +1,4 @@
-"""How far a job is, on a terminal: live bars, or a line a minute where they cannot be drawn."""
+"""Progress of a job on a terminal: live bars, or a line per minute where bars cannot be drawn."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     from sgsst_core.stylizing.loop import Progress as StepProgress
     from worker.description import Prepared
 
-#: Where no bar can be drawn (a log file), a line is printed instead, this often.
+#: Seconds between lines where no bar can be drawn, such as in a log file.
 LOG_SECONDS = 60.0
 _STAGES = {"coarse": "coarsest scale", "sos": "all scales", "measuring": "measuring"}
 
 
 def live_bar(console: Console, *columns: ProgressColumn) -> Progress:
-    """A live progress bar on a terminal; nothing elsewhere, where it could not be drawn over."""
+    """Return a progress bar that is live on a terminal and prints nothing elsewhere."""
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 class JobBar:
-    """The progress of a job, from its reading to its last step; see `job_bar`."""
+    """Progress of a job, from reading the scene to the last step; see `job_bar`."""
 
     def __init__(self, bar: Progress) -> None:
         self._bar = bar
@@ -34,13 +34,13 @@ class JobBar:
         self._last_line = time.monotonic()
 
     def show_planning(self, planning: PlanningProgress) -> None:
-        """Show how many views have been looked at."""
+        """Show how many views have been surveyed."""
         left = "" if planning.seconds_left is None else f"{clock(planning.seconds_left)} left"
         self._show("Looking at the views", planning.done, planning.total, left)
         self._print_now_and_then(f"Looking at the views: {planning.done} of {planning.total}", left)
 
     def start(self, prepared: Prepared) -> None:
-        """Show where the steps begin."""
+        """Show the first step."""
         self._show("starting", prepared.step, prepared.total, "")
 
     def show(self, progress: StepProgress) -> None:
@@ -61,7 +61,7 @@ class JobBar:
 
 @contextmanager
 def job_bar(console: Console) -> Iterator[JobBar]:
-    """A live bar, or a line a minute where there is no terminal."""
+    """Show the progress of a job as a live bar, or as a line per minute if there is no terminal."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -73,7 +73,7 @@ def job_bar(console: Console) -> Iterator[JobBar]:
 
 
 def clock(seconds: float) -> str:
-    """A duration as minutes and seconds, or hours, minutes and seconds."""
+    """Return a duration as minutes and seconds, or hours, minutes and seconds."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

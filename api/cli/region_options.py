@@ -1,4 +1,4 @@
-"""How regions of a scene are asked for on the command line; `worker.regions` says what becomes of it."""
+"""Command-line options that define regions of a scene. `worker.regions` interprets them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""What `plan`, `check` and `render` do with a scene: read and check every input, work, write outputs. Prints nothing.
+"""Implementation of the commands `plan`, `check` and `render`.
 
-`stylize` is `worker.prepare` and `worker.execute`, on one rank or several.
+They read and check all inputs, compute, and write the outputs. They print nothing. `stylize` is implemented by
+`worker.prepare` and `worker.execute`, on one rank or several.
 """
 
 from __future__ import annotations
@@ -32,19 +33,19 @@ from worker.request import SceneRequest, StylizeRequest, check_choice, check_fol
 
 
 def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None, sheet: Path | None = None) -> Plan:
-    """Plan a job as `sgsst stylize` would, and write the plan as JSON; no step is made.
+    """Plan a job as `sgsst stylize` would, without making a step, and write the plan as JSON.
 
     Args:
-        request: whose `out` is the plan's.
-        sheet: JPEG of the views to write, before the plan is made; None for none.
-        show_planning: shows how far the survey of the views has come.
+        request: Request whose `out` is the file of the plan.
+        show_planning: Callback that shows the progress of the survey of the views.
+        sheet: JPEG of the views, written before the plan is made; None for none.
 
     Raises:
-        InvalidInputError: in one of its forms, for the first input that cannot be used.
+        InvalidInputError: If an input cannot be used; the first one is reported.
     """
     source, settings, out = request.source, request.settings, request.out
     check_choice(source)
-    if out.is_dir() or out.suffix.lower() != ".json":  # a slip of the hand must not replace a scene or its cameras
+    if out.is_dir() or out.suffix.lower() != ".json":  # a typing mistake must not replace a scene or its cameras
         raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as plan.json.")
     if source.cameras and out.exists() and source.cameras.exists() and out.samefile(source.cameras):
         raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
@@ -56,7 +57,7 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     file, cameras, orbit = read_scene_and_cameras(source)
     check_sh_attenuation(file.path, file.header, settings.sh_attenuation)
     weights = load_network_weights(request.backbone)
-    style = load_styles(request.styles)  # one that cannot be used is told before the work, too
+    style = load_styles(request.styles)  # also reports an unusable style before any work is done
     regions = read_regions(request, file, fit_cameras(cameras, settings))
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
@@ -83,10 +84,10 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
 
 
 def look_for_extremes(source: SceneRequest, style: Path | None) -> list[Finding]:
-    """What is extreme in a scene, its views and its style; nothing is written.
+    """Return the extreme values in a scene, its views and its style. Nothing is written.
 
     Raises:
-        InvalidInputError: scene, cameras or style cannot be used.
+        InvalidInputError: If scene, cameras or style cannot be used.
     """
     check_choice(source)
     image = load_image(style) if style else None
@@ -103,10 +104,10 @@ def render_views(
     out: Path,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
-    """Render every view into a folder as PNG, numbered in the cameras' order; all inputs are checked before.
+    """Render every view into a folder as PNG, numbered in the order of the cameras. All inputs are checked first.
 
     Raises:
-        InvalidInputError: scene, cameras or folder cannot be used.
+        InvalidInputError: If scene, cameras or folder cannot be used.
     """
     check_choice(source)
     check_folder(out)
@@ -124,9 +125,10 @@ def render_views(
 
 
 def view_file_names(cameras: Sequence[Camera]) -> list[str]:
-    """A file name for each view: its number, so that names sort in the cameras' order, then the camera's name.
+    """Return a file name for each view, from its number and its camera's name.
 
-    Folders and characters that file systems may refuse become underscores.
+    The number comes first, so that names sort in the order of the cameras. Folders and characters that file systems may
+    refuse become underscores.
     """
     digits = max(4, len(str(len(cameras) - 1)))
     names = []

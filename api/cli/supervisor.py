@@ -1,4 +1,4 @@
-"""`sgsst serve`: API and dispatcher on one machine, each a process that is started again when it dies."""
+"""`sgsst serve`: API and dispatcher on one machine, in two processes that are restarted when they die."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError
 
-#: A process that lived shorter than this is started again only after a wait, which doubles up to the longest.
+#: A process that dies within the first number of seconds is restarted after a wait, which doubles each time up to the
+#: second number of seconds.
 _SHORT_LIFE, _LONGEST_WAIT = 5.0, 10.0
 _LOOK_SECONDS = 0.2
-#: On top of the time that jobs have for saving their state.
+#: Seconds that processes have to stop, on top of the time that jobs have to save their state.
 _LAST_SECONDS = 15.0
 _BACKLOG = 1024
 
 
 class ServeError(InvalidInputError):
-    """The service cannot be started like this."""
+    """A configuration with which the service cannot start."""
 
     code = "cannot-serve"
 
 
 @dataclass
 class _Child:
-    """A process that is to live as long as the service."""
+    """Child process that is restarted for as long as the service runs."""
 
     name: str
     command: list[str]
@@ -44,7 +45,7 @@ class _Child:
     not_before: float = field(default=0.0)
 
     def start(self) -> None:
-        """Start it; it dies with this process, and Ctrl-C in a terminal is not for it."""
+        """Start the process. It dies with this process, and does not receive Ctrl-C from the terminal."""
         self.process = subprocess.Popen(
             self.command,
             pass_fds=self.descriptors,
@@ -55,7 +56,7 @@ class _Child:
         self.started = time.monotonic()
 
     def restart_if_dead(self, announce: Callable[[str], None]) -> None:
-        """Start it again where it has died."""
+        """Restart the process if it has died, after a wait if its life was short."""
         now = time.monotonic()
         if self.process is not None and self.process.poll() is not None:
             lived = now - self.started
@@ -68,12 +69,13 @@ class _Child:
 
 
 def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
-    """Run API and dispatcher until SIGTERM or Ctrl-C; running jobs save their state then. A second one ends at once.
+    """Run API and dispatcher until SIGTERM or Ctrl-C; running jobs then save their state. A second signal ends at once.
 
-    The listening socket is this process': while the API is started again, connections wait instead of being refused.
+    This process owns the listening socket, so that connections wait during a restart of the API instead of being
+    refused.
 
     Raises:
-        ServeError: the address is taken, or others could use the service and there is no key.
+        ServeError: If the address is in use, or if other machines could use the service and there is no key.
     """
     keep_private(settings)
     store = open_store(settings)

@@ -1,4 +1,4 @@
-"""Values of command-line options that are more than a number or a word."""
+"""Parsers of command-line values that are more than a number or a word."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 @dataclass(frozen=True)
 class Form:
-    """How values of a unit are written on the command line.
+    """Command-line format of the values of a unit.
 
     Attributes:
-        parse: makes the value of its text.
-        metavar: stands for the value in the help.
-        hint: goes on where the help text ends.
+        parse: Parser of the text.
+        metavar: Placeholder of the value in the help.
+        hint: Text that continues the option's help.
     """
 
     parse: Callable[[str], object]
@@ -32,7 +32,7 @@ class Form:
 
 
 def parse_color(text: str) -> tuple[float, float, float]:
-    """RGB in 0..1 from "black", "white" or three numbers 0 to 255: "40,40,48"."""
+    """Return RGB in 0..1 from "black", "white" or three numbers from 0 to 255: "40,40,48"."""
     if text.lower() in _COLORS:
         return _COLORS[text.lower()]
     try:
@@ -45,7 +45,7 @@ def parse_color(text: str) -> tuple[float, float, float]:
 
 
 def parse_bytes(text: str) -> int:
-    """Bytes from "8GB", "512 MB", "6GiB" or a plain number."""
+    """Return bytes from "8GB", "512 MB", "6GiB" or a plain number."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?I?)B?", text.strip().upper())
     if not match or match[2] not in _UNITS or not (size := int(float(match[1]) * _UNITS[match[2]])):
         raise typer.BadParameter(f"{text!r} is not an amount of memory such as 8GB or 512MB.")
@@ -53,7 +53,7 @@ def parse_bytes(text: str) -> int:
 
 
 def parse_strength(text: str) -> float:
-    """A content weight from "light", "balanced", "strong" or a number."""
+    """Return a content weight from "light", "balanced", "strong" or a number."""
     if text.lower() in STRENGTHS:
         return STRENGTHS[text.lower()]
     try:
@@ -64,14 +64,14 @@ def parse_strength(text: str) -> float:
 
 
 def parse_weights(text: str) -> tuple[float, ...]:
-    """Weights of scales from "1,0.5,0,1"."""
+    """Return weights of scales from "1,0.5,0,1"."""
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
         raise typer.BadParameter(f"{text!r} are no numbers with commas between them such as 1,0.5,0,1.") from None
 
 
-#: Units whose values are written in another way than in JSON.
+#: Units whose values are written differently than in JSON.
 FORMS = {
     "RGB, 0 to 1": Form(parse_color, "COLOR", ": black, white, or R,G,B from 0 to 255."),
     "factor or strength": Form(parse_strength, "W", f" {_STRENGTHS}"),

@@ -1,4 +1,4 @@
-"""What the service answers, as its clients see it: jobs, events, and errors."""
+"""Answers of the service as clients see them: jobs, events and errors."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from httpx_sse import ServerSentEvent
 from sgsst_core.errors import InvalidInputError, SgsstError
 
 _ENDED = ("succeeded", "failed", "canceled", "expired")
-#: Statuses that say "not now": locked by another request, damaged on its way, overloaded, starting.
+#: Statuses of temporary failures: locked by another request, damaged in transit, overloaded, starting.
 _PASSING = (423, 460, 502, 503, 504)
 
 
 class ApiError(SgsstError):
-    """The service refused a request, or could not be reached.
+    """A request that the service refused, or a service that cannot be reached.
 
     Attributes:
-        status: HTTP status; 0 where there was no answer.
-        problem: the problem document.
+        status: HTTP status; 0 if there was no answer.
+        problem: Problem document; empty if there is none.
     """
 
     code = "api-error"
@@ -34,14 +34,14 @@ class ApiError(SgsstError):
 
 
 class RequestError(ApiError, InvalidInputError):
-    """The request is at fault: its files, parameters, key or id."""
+    """A request that is itself at fault: its files, parameters, key or id."""
 
     code = "api-request"
 
 
 @dataclass(frozen=True)
 class Job:
-    """A job as the service last showed it; `data` is the whole answer."""
+    """State of a job as the service last sent it; `data` is the whole answer."""
 
     id: str
     status: str
@@ -51,18 +51,18 @@ class Job:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing more will happen to it."""
+        """Whether the job has ended."""
         return self.status in _ENDED
 
     @staticmethod
     def of(data: Mapping[str, Any]) -> Job:
-        """From the service's JSON."""
+        """Return the job from the service's JSON."""
         return Job(data["id"], data["status"], data.get("progress"), data.get("error"), data)
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened to a job: `status`, `progress` or `artifact`."""
+    """Event of a job: `status`, `progress` or `artifact`."""
 
     id: int
     kind: str
@@ -70,15 +70,16 @@ class Event:
 
     @staticmethod
     def of(sent: ServerSentEvent) -> Event:
-        """From the service's stream."""
+        """Return the event from the service's stream."""
         return Event(int(sent.id or 0), sent.event, json.loads(sent.data))
 
 
 def checked(response: httpx.Response) -> httpx.Response:
-    """The response, if it is a good one; its body has been read.
+    """Return the response if it is not an error. Its body must have been read.
 
     Raises:
-        RequestError, ApiError: the service refused the request.
+        RequestError: If the service refused the request as faulty.
+        ApiError: If the service failed.
     """
     if response.status_code < 400:
         return response
@@ -91,15 +92,15 @@ def checked(response: httpx.Response) -> httpx.Response:
 
 
 def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
-    """A refused request as an error: its own fault, or the service's."""
+    """Return the error for a refused request: RequestError if the request is at fault, ApiError if the service is."""
     return (RequestError if status < 500 else ApiError)(message, status, problem)
 
 
 def is_passing(error: Exception) -> bool:
-    """Whether the same request may succeed later: nothing was answered, or that it is not possible now."""
+    """Return whether the same request may succeed later: there was no answer, or it reports a temporary failure."""
     return isinstance(error, httpx.TransportError) or (isinstance(error, ApiError) and error.status in _PASSING)
 
 
 def unreachable(base: str, error: Exception) -> ApiError:
-    """What to say where the service did not answer."""
+    """Return the error for a service that did not answer."""
     return ApiError(f"{base} cannot be reached ({error}). Is `sgsst serve` running? --url names another address.")

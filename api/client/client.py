@@ -1,13 +1,11 @@
-"""A client of the service, for programs: `Client`, and `AsyncClient` with the same methods to await.
-
-from api.client import Client
+"""Clients of the service for programs: `Client`, and `AsyncClient` with the same methods as coroutines.
 
 with Client("http://127.0.0.1:8000") as client:
     job = client.submit("scene.ply", "style.jpg", cameras="cameras.json", preset="preview")
     job = client.wait(job.id)
     client.download(job.id, "stylized.ply")
 
-Both have their methods from `JobMethods`, which says once what each of them does; see `api.client.transport`.
+Both get their methods from `JobMethods`, which implements each method once; see `api.client.transport`.
 """
 
 from __future__ import annotations
@@ -38,16 +36,16 @@ from api.client.transport import (
     Walk,
 )
 
-#: Jobs that are asked for at a time.
+#: Jobs per page of a list.
 _PAGE = 200
 
 
 def no_progress(done: int, total: int) -> None:
-    """Tell nobody."""
+    """Ignore progress."""
 
 
 class JobMethods(Methods):
-    """What the clients can do."""
+    """Methods of both clients."""
 
     @Operation
     def submit(
@@ -62,19 +60,19 @@ class JobMethods(Methods):
         progress: Progress = no_progress,
         **parameters: Any,
     ) -> Steps[Job]:
-        """Queue a job. Large files go up in parts, and go on after a lost connection.
+        """Queue a job. Large files are uploaded in parts, and resume after a lost connection.
 
         Args:
-            scene: file.
-            style: file; several are mixed, by the parameter `style_weights`.
-            cameras: as `sgsst stylize --cameras`; None needs the parameter `orbit`.
-            photos: folder, for the content term.
-            webhook: URL that is told when the job has ended.
-            progress: called with the bytes that are up and those of all large files.
-            parameters: see `JobParameters`; None leaves one out.
+            scene: Scene file.
+            style: Style image. Several are mixed, by the parameter `style_weights`.
+            cameras: Same as `sgsst stylize --cameras`; None requires the parameter `orbit`.
+            photos: Folder of photos for the content term; None for unstylized renders.
+            webhook: URL that is called when the job has ended; None for none.
+            progress: Callback that gets the uploaded bytes and the total bytes of all large files.
+            parameters: Fields of `JobParameters`; None leaves one out.
 
         Raises:
-            RequestError: something cannot be used; the message says what.
+            RequestError: If an input cannot be used; the message says which and why.
         """
         files = Path(scene), _paths(style), _path(cameras), _path(photos)
         return Job.of((yield from uploads.create_job(files, parameters, webhook=webhook, progress=progress)))
@@ -92,28 +90,28 @@ class JobMethods(Methods):
         planning: Progress = no_progress,
         **parameters: Any,
     ) -> Steps[dict[str, Any]]:
-        """What a job would do and need; nothing is queued. Arguments are those of `submit`.
+        """Plan a job without queueing it, and return what it would do and need. Other arguments are those of `submit`.
 
         Args:
-            planning: called with the views that have been looked at and all of them.
+            planning: Callback that gets the number of surveyed views and of all views.
         """
         files = Path(scene), _paths(style), _path(cameras), _path(photos)
         return (yield from uploads.plan_job(files, parameters, progress=progress, planning=planning))
 
     @Operation
     def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> Steps[str]:
-        """Send a file in parts; returns the upload's id, which many jobs may name."""
+        """Upload a file in parts, and return the upload's id. Any number of jobs may use it."""
         path = Path(path)
         return (yield from uploads.upload(path, name or path.name, progress))
 
     @Operation
     def job(self, job_id: str) -> Steps[Job]:
-        """A job as it is now."""
+        """Return the current state of a job."""
         return (yield from _job(job_id))
 
     @Iteration
     def jobs(self, *, status: Sequence[str] = (), limit: int | None = None) -> Walk[Job]:
-        """Jobs of this key, the newest first."""
+        """Yield the jobs of this key, newest first."""
         left = limit
         params: dict[str, Any] = {"status": list(status)}
         while left is None or left > 0:
@@ -128,7 +126,7 @@ class JobMethods(Methods):
 
     @Iteration
     def watch(self, job_id: str, after: int = 0) -> Walk[Event]:
-        """What happens to a job, as it happens, until it has ended; lost connections are taken up again."""
+        """Yield the events of a job as they happen, until it has ended. Lost connections are resumed."""
         yield from self._watch(job_id, after)
 
     def _watch(self, job_id: str, after: int) -> Steps[None]:
@@ -137,7 +135,7 @@ class JobMethods(Methods):
             try:
                 yield Listen(stream)
             except httpx.TransportError as error:
-                # not stamina's business: each event that comes makes the count of failures begin anew
+                # stamina does not fit here: each event resets the count of failures
                 seconds = stream.broken()
                 if stream.failures >= TRIES:
                     raise unreachable(self.url, error) from None
@@ -148,13 +146,13 @@ class JobMethods(Methods):
 
     @Operation
     def wait(self, job_id: str) -> Steps[Job]:
-        """Wait for a job's end, and return it as it is then."""
+        """Wait until a job has ended, and return its final state."""
         yield from self._watch(job_id, 0)
         return (yield from _job(job_id))
 
     @Operation
     def artifacts(self, job_id: str) -> Steps[list[dict[str, Any]]]:
-        """The files that a job has made so far."""
+        """Return the files that a job has made so far."""
         found: list[dict[str, Any]] = (yield Call("GET", f"/v1/jobs/{job_id}/artifacts")).json()["artifacts"]
         return found
 
@@ -167,13 +165,14 @@ class JobMethods(Methods):
         progress: Progress = no_progress,
         form: str | None = None,
     ) -> Steps[Path]:
-        """Download a file of a job; a part that is there goes on, and the whole is checked by its SHA-256.
+        """Download a file of a job, and check its SHA-256. A partial download resumes.
 
         Args:
-            form: of stylized.ply, "compressed.ply" or "spz": the service makes it where it is first asked for.
+            form: Format of stylized.ply: "compressed.ply" or "spz"; None for PLY. The service converts the file on the
+                first request.
 
         Raises:
-            RequestError: there is no such file (yet).
+            RequestError: If there is no such file (yet).
         """
         target = Path(target)
         query = f"?format={form}" if form else ""
@@ -187,12 +186,12 @@ class JobMethods(Methods):
 
     @Operation
     def retry(self, job_id: str) -> Steps[Job]:
-        """Queue a job again that failed or was canceled."""
+        """Queue a failed or canceled job again."""
         return Job.of((yield Call("POST", f"/v1/jobs/{job_id}/retry")).json())
 
     @Operation
     def delete(self, job_id: str) -> Steps[None]:
-        """Remove a job that has ended, with its results."""
+        """Delete a job that has ended, with its results."""
         yield Call("DELETE", f"/v1/jobs/{job_id}")
 
 
@@ -209,13 +208,13 @@ def _path(value: str | Path | None) -> Path | None:
 
 
 class Client(JobMethods, BlockingDriver):
-    """The service over HTTP.
+    """Client of the service over HTTP.
 
     Args:
-        url: of the service; None for the environment's SGSST_URL, else this machine's port 8000.
+        url: Address of the service; None for the environment's SGSST_URL, else port 8000 of this machine.
         key: API key; None for the environment's SGSST_KEY.
     """
 
 
 class AsyncClient(JobMethods, AwaitingDriver):
-    """As `Client`, with methods to await, and `watch` and `jobs` for `async for`."""
+    """Client like `Client`, with coroutines as methods; `watch` and `jobs` are asynchronous iterators."""

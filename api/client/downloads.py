@@ -1,4 +1,4 @@
-"""One download: what is asked for, and what becomes of the answer. Sends nothing itself."""
+"""State of one download: its request headers, and the handling of the answer. Sends nothing itself."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from api.client.answers import ApiError
 
 Progress = Callable[[int, int], None]
 
-#: Bytes that are read from the disk or written to it at a time.
+#: Bytes per read from or write to the disk.
 BLOCK = 1 << 20
 
 
 class Download:
-    """A file on its way to a target: a part that is there goes on, and the whole is checked by its SHA-256.
+    """Download of a file to a target. A partial file is resumed, and the whole is checked by its SHA-256.
 
     Attributes:
-        path: of the file on the service.
+        path: Path of the file on the service.
     """
 
     def __init__(self, path: str, target: Path, progress: Progress) -> None:
@@ -30,21 +30,21 @@ class Download:
         self._stamp = target.with_name(target.name + ".part.etag")
         self._tag = ""
         self._done = self._size = 0
-        #: Of the part's first bytes, so many.
+        #: Hash of the first `_hashed` bytes of the partial file.
         self._digest, self._hashed = hashlib.sha256(), 0
 
     def headers(self) -> dict[str, str]:
-        """Of the request: where to go on."""
+        """Return the headers of the request, which resume the partial file."""
         self._done = self._part.stat().st_size if self._part.exists() else 0
         if not self._done or not self._stamp.exists():
             return {}
         return {"Range": f"bytes={self._done}-", "If-Range": self._stamp.read_text()}
 
     def begin(self, response: httpx.Response) -> bool:
-        """Take the head of a good answer, or of 416, which says that there is nothing behind what is there.
+        """Process the headers of a successful answer, or of a 416: there are no bytes beyond those received.
 
         Returns:
-            Whether its body is to be written.
+            Whether the answer's body must be written.
         """
         self._tag = response.headers.get("etag", "")
         if response.status_code == httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
@@ -58,7 +58,7 @@ class Download:
         return True
 
     def write(self, block: bytes) -> None:
-        """Put a block behind what is there."""
+        """Append a block to the partial file."""
         with self._part.open("ab") as file:
             file.write(block)
         if self._hashed == self._done:
@@ -67,14 +67,14 @@ class Download:
         self._done += len(block)
 
     def report(self) -> None:
-        """Tell how far it is."""
+        """Report the progress."""
         self._progress(self._done, self._size)
 
     def finish(self) -> None:
-        """Check the whole, and give it its name.
+        """Check the whole file, then rename it to its target.
 
         Raises:
-            ApiError: it is not what was sent; it was removed.
+            ApiError: If the file differs from what was sent. It is deleted.
         """
         expected = self._stamp.read_text() if self._stamp.exists() else self._tag
         self._stamp.unlink(missing_ok=True)
@@ -84,7 +84,7 @@ class Download:
         self._part.replace(self._target)
 
     def _sha256(self) -> str:
-        """Of the part that is there; what was not hashed as it came, another program has left."""
+        """Return the SHA-256 of the partial file; bytes left by an earlier program are read and hashed here."""
         with self._part.open("rb") as file:
             file.seek(self._hashed)
             while block := file.read(BLOCK):

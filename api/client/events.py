@@ -1,4 +1,4 @@
-"""The events of one job: where its watcher is, and what becomes of a stream that broke. Connects to nothing itself."""
+"""State of one watcher of a job's events: its position, and its waits after lost connections. Does no I/O itself."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from httpx_sse import ServerSentEvent
 
 from api.client.answers import Event, checked
 
-#: A stream that is silent for longer is dead: the service sends something every 15 s.
+#: Seconds of silence after which a stream is considered dead; the service sends something every 15 s.
 _SILENCE_SECONDS = 60.0
-#: Before the second connection, where the first one broke without an event; each further wait is twice as long.
+#: Seconds to wait after the first connection that breaks without an event; each further wait is twice as long.
 FIRST_WAIT = 1.0
 
 
 class EventStream:
-    """A watcher's place in the events of a job.
+    """Position of a watcher in the events of a job.
 
     Attributes:
-        path: of the stream on the service.
-        failures: connections that broke in a row without an event.
-        over: the service has nothing more to tell, and never will.
+        path: Path of the stream on the service.
+        failures: Number of successive connections that broke without an event.
+        over: Whether the job has ended and all its events were received.
     """
 
     def __init__(self, job_id: str, after: int) -> None:
@@ -32,27 +32,27 @@ class EventStream:
         self._after = after
 
     def options(self) -> dict[str, Any]:
-        """Of the request: where to go on."""
+        """Return the options of the request, which resume after the last event."""
         headers = {"Last-Event-ID": str(self._after)} if self._after else {}
         return {"headers": headers, "timeout": httpx.Timeout(30.0, read=_SILENCE_SECONDS)}
 
     def refuse(self, response: httpx.Response) -> None:
-        """Take an answer without events.
+        """Handle an answer without events, which ends the watch.
 
         Raises:
-            RequestError, ApiError: it is an error.
+            RequestError, ApiError: If the answer is an error.
         """
         checked(response)
         self.over = True
 
     def take(self, sent: ServerSentEvent) -> Iterator[Event]:
-        """What the service has sent, unless it is no event but a word to the connection."""
+        """Yield the event that the service has sent; nothing for messages about the connection."""
         if sent.data:
             event = Event.of(sent)
             self._after, self.failures = event.id, 0
             yield event
 
     def broken(self) -> float:
-        """Note that a connection broke; returns the seconds to wait before the next one."""
+        """Count a broken connection, and return the seconds to wait before the next one."""
         self.failures += 1
         return FIRST_WAIT * 2.0 ** (self.failures - 1)

@@ -1,4 +1,4 @@
-"""The files of a job on the client's side: which are sent, and under which names."""
+"""Selection of a job's files on the client's side, and the names under which they are sent."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
 
 @dataclass(frozen=True)
 class InputFile:
-    """A file to send: the role that it has in the job, where it is, its bytes, and the name that the service sees."""
+    """File to send: its role in the job, its path, its size in bytes, and its name on the service."""
 
     role: str
     path: Path
@@ -22,10 +22,10 @@ class InputFile:
 
 
 def input_files(scene: Path, styles: Sequence[Path], cameras: Path | None, photos: Path | None) -> list[InputFile]:
-    """Everything that a job needs.
+    """Return all files that a job needs.
 
     Raises:
-        RequestError: something is not there.
+        RequestError: If a file is missing.
     """
     found = [("scene", scene, scene.name)]
     found += [("style", path, name) for path, name in zip(styles, different_names(styles), strict=True)]
@@ -38,7 +38,7 @@ def input_files(scene: Path, styles: Sequence[Path], cameras: Path | None, photo
 
 
 def different_names(paths: Sequence[Path]) -> list[str]:
-    """A name for each file: its own, but for those that another one has already."""
+    """Return a unique name for each file: its own, with a number in front if an earlier file has the same name."""
     names: list[str] = []
     for number, path in enumerate(paths, 1):
         taken = {name.lower() for name in names}
@@ -47,10 +47,12 @@ def different_names(paths: Sequence[Path]) -> list[str]:
 
 
 def camera_files(path: Path) -> list[Path]:
-    """The files to send for what `sgsst stylize --cameras` takes: a JSON file, a COLMAP model or a folder with either.
+    """Return the camera files for a path: a JSON file, a COLMAP model or a folder with either.
+
+    It accepts the same paths as `sgsst stylize --cameras`.
 
     Raises:
-        RequestError: there are none.
+        RequestError: If there are none.
     """
     if path.is_file() and path.suffix == ".json":
         companion = path.with_name("dataparser_transforms.json")
@@ -68,10 +70,10 @@ def camera_files(path: Path) -> list[Path]:
 
 
 def photo_files(folder: Path) -> list[tuple[Path, str]]:
-    """All photos below a folder, with the names under which they are sent.
+    """Return all photos below a folder, with the names under which they are sent.
 
     Raises:
-        RequestError: there are none.
+        RequestError: If there are none.
     """
     found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
     if not found:

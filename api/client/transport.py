@@ -1,8 +1,9 @@
-"""The clients' methods, written once: generators that say what they need done, and two drivers that do it.
+"""Transport of the clients: each method is written once as a generator of steps, and two drivers run it.
 
-A method yields steps (`Call`, `Hear`, `Fetch`, `Listen`, `FileWork`, `Wait`); each is done, and the method is sent its
-result or its error. `BlockingDriver` does them in the caller's thread; `AwaitingDriver` awaits them, and leaves files
-to other threads. `Operation` and `Iteration` make a method of either kind out of such a generator.
+A method yields steps (`Call`, `Hear`, `Fetch`, `Listen`, `FileWork`, `Wait`). The driver runs each step, and sends its
+result or its error back to the method. `BlockingDriver` runs steps in the caller's thread. `AwaitingDriver` awaits
+them, and leaves file access to other threads. `Operation` and `Iteration` turn such a generator into a method of either
+kind.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from api.client.downloads import BLOCK, Download
 from api.client.events import EventStream
 
 DEFAULT_URL = "http://127.0.0.1:8000"
-#: Requests that are sent at most until one is answered, with waits of 1, 2, 4 ... seconds between them.
+#: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
 TRIES = 6
 _RETRIES: dict[str, Any] = {
     "attempts": TRIES,
@@ -42,7 +43,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Call:
-    """A request whose whole answer is wanted; sent again where it may succeed later."""
+    """Request whose whole answer is wanted. It is retried if it may succeed later."""
 
     method: str
     path: str
@@ -51,8 +52,9 @@ class Call:
 
 @dataclass(frozen=True)
 class Hear:
-    """A request that may be answered by events: each goes to `take`, and there is no other result. Any other answer is
-    that of a `Call`.
+    """Request that may be answered by a stream of events.
+
+    Each event is passed to `take`, and the step has no result. Any other answer is handled as that of a `Call`.
     """
 
     call: Call
@@ -61,35 +63,35 @@ class Hear:
 
 @dataclass(frozen=True)
 class FileWork:
-    """Work that waits for the disk."""
+    """Blocking file access."""
 
     function: Callable[[], Any]
 
 
 @dataclass(frozen=True)
 class Fetch:
-    """A file to download; asked for again from where it broke off."""
+    """File to download. A broken download is resumed."""
 
     download: Download
 
 
 @dataclass(frozen=True)
 class Wait:
-    """Nothing, for some seconds."""
+    """Pause of some seconds."""
 
     seconds: float
 
 
 @dataclass(frozen=True)
 class Item(Generic[T]):
-    """Something to pass on to who iterates."""
+    """Value to yield to the caller's iteration."""
 
     value: T
 
 
 @dataclass(frozen=True)
 class Listen:
-    """A connection to a stream of events until it ends; what breaks it is raised. Who iterates gets the events."""
+    """Connection to a stream of events until it ends. Connection errors propagate; events are yielded."""
 
     stream: EventStream
 
@@ -100,7 +102,7 @@ Walk = Generator[Step | Item[T], Any, None]
 
 
 class Operation(Generic[P, T]):
-    """A method that returns something, to be called on a `BlockingDriver` and awaited on an `AwaitingDriver`."""
+    """Method with a result: called on a `BlockingDriver`, awaited on an `AwaitingDriver`."""
 
     def __init__(self, steps: Callable[Concatenate[Any, P], Steps[T]]) -> None:
         self.steps = steps
@@ -112,12 +114,12 @@ class Operation(Generic[P, T]):
     def __get__(self, client: AwaitingDriver, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
 
     def __get__(self, client: Any, owner: type) -> Any:
-        """For type checkers: `Methods` puts a function in its place."""
+        """Declare the method's type for type checkers. `Methods` replaces the descriptor by a function."""
         raise NotImplementedError
 
 
 class Iteration(Generic[P, T]):
-    """A method that yields things, for `for` on a `BlockingDriver` and `async for` on an `AwaitingDriver`."""
+    """Method that yields values: for `for` on a `BlockingDriver` and `async for` on an `AwaitingDriver`."""
 
     def __init__(self, steps: Callable[Concatenate[Any, P], Walk[T]]) -> None:
         self.steps = steps
@@ -129,21 +131,21 @@ class Iteration(Generic[P, T]):
     def __get__(self, client: AwaitingDriver, owner: type) -> Callable[P, AsyncIterator[T]]: ...
 
     def __get__(self, client: Any, owner: type) -> Any:
-        """As `Operation`."""
+        """Declare the method's type for type checkers, like `Operation`."""
         raise NotImplementedError
 
 
 class Methods:
-    """Base of a class with operations and iterations; a subclass that is also a driver gets them as its methods.
+    """Base of a class with operations and iterations. A subclass that is also a driver gets them as its methods.
 
     Attributes:
-        url: of the service.
+        url: Address of the service.
     """
 
     url: str
 
     def __init_subclass__(cls) -> None:
-        """Make functions of what the bases have."""
+        """Replace the operations and iterations of the bases by functions."""
         if not issubclass(cls, BlockingDriver | AwaitingDriver):
             return
         for base in cls.__mro__:
@@ -155,7 +157,10 @@ class Methods:
 
 
 def _named(method: Any, steps: Callable[..., Any], answer: str) -> Any:
-    """A method with name, docstring and signature of its steps; it returns what they say between brackets."""
+    """Give a method the name, docstring and signature of its steps, and return it.
+
+    `answer` is the format of the return annotation, filled with the type of the steps' result.
+    """
     functools.update_wrapper(method, steps)
     signature = inspect.signature(steps)
     result = str(signature.return_annotation).partition("[")[2].removesuffix("]")
@@ -173,7 +178,7 @@ def _http_options(url: str | None, key: str | None) -> dict[str, Any]:
 
 
 def _has_file(response: httpx.Response) -> bool:
-    """Whether it is a file, a part of one, or says that the file has no more than what is there."""
+    """Return whether an answer is a file, a part of one, or 416: the file has no more bytes than were received."""
     return not response.is_error or response.status_code == httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE
 
 
@@ -183,10 +188,10 @@ def _has_events(response: httpx.Response) -> bool:
 
 
 class BlockingDriver:
-    """Does steps in the caller's thread.
+    """Driver that runs steps in the caller's thread.
 
     Args:
-        url: of the service; None for the environment's SGSST_URL, else this machine's port 8000.
+        url: Address of the service; None for the environment's SGSST_URL, else port 8000 of this machine.
         key: API key; None for the environment's SGSST_KEY.
     """
 
@@ -209,7 +214,7 @@ class BlockingDriver:
 
     @staticmethod
     def _as_method(steps: Callable[..., Steps[Any]]) -> Callable[..., Any]:
-        """A method that does the steps and returns their result."""
+        """Return a method that runs the steps and returns their result."""
 
         def method(self: BlockingDriver, *args: Any, **options: Any) -> Any:
             return self._run(steps(self, *args, **options))
@@ -218,7 +223,7 @@ class BlockingDriver:
 
     @staticmethod
     def _as_iterator(steps: Callable[..., Walk[Any]]) -> Callable[..., Iterator[Any]]:
-        """A method that does the steps and yields their items."""
+        """Return a method that runs the steps and yields their items."""
 
         def method(self: BlockingDriver, *args: Any, **options: Any) -> Iterator[Any]:
             yield from self._walk(steps(self, *args, **options))
@@ -313,10 +318,10 @@ class BlockingDriver:
 
 
 class AwaitingDriver:
-    """Awaits steps; what reads and writes files does so in threads of its own.
+    """Driver that awaits steps, and reads and writes files in other threads.
 
     Args:
-        url: of the service; None for the environment's SGSST_URL, else this machine's port 8000.
+        url: Address of the service; None for the environment's SGSST_URL, else port 8000 of this machine.
         key: API key; None for the environment's SGSST_KEY.
     """
 
@@ -339,7 +344,7 @@ class AwaitingDriver:
 
     @staticmethod
     def _as_method(steps: Callable[..., Steps[Any]]) -> Callable[..., Any]:
-        """A method that awaits the steps and returns their result."""
+        """Return a coroutine method that awaits the steps and returns their result."""
 
         async def method(self: AwaitingDriver, *args: Any, **options: Any) -> Any:
             return await self._run(steps(self, *args, **options))
@@ -348,7 +353,7 @@ class AwaitingDriver:
 
     @staticmethod
     def _as_iterator(steps: Callable[..., Walk[Any]]) -> Callable[..., AsyncIterator[Any]]:
-        """A method that awaits the steps and yields their items."""
+        """Return an asynchronous iterator method that awaits the steps and yields their items."""
 
         async def method(self: AwaitingDriver, *args: Any, **options: Any) -> AsyncIterator[Any]:
             async for item in self._walk(steps(self, *args, **options)):

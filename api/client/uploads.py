@@ -1,4 +1,4 @@
-"""Sending files: large ones in parts that go on after a lost connection, a job's small ones in its own request."""
+"""Upload of a job's files: large ones in resumable parts, small ones in the job's own request."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from api.client.downloads import Progress
 from api.client.inputs import InputFile, input_files
 from api.client.transport import Call, FileWork, Hear, Steps
 
-#: Files from this size on are uploaded in parts.
+#: Maximum bytes of a part; larger files are uploaded in parts.
 PART_BYTES = 16 << 20
-#: The version of the protocol of uploads, which every request states.
+#: Protocol version of uploads, which every request must state.
 _TUS = {"Tus-Resumable": "1.0.0"}
 
 
 def upload(path: Path, name: str, progress: Progress) -> Steps[str]:
-    """Send a file in parts; returns the upload's id."""
+    """Upload a file in parts, and return the upload's id."""
     size = path.stat().st_size
     created = (yield Call("POST", "/v1/uploads", {"headers": _creation_headers(name, size)})).json()
     where = f"/v1/uploads/{created['id']}"
@@ -53,7 +53,7 @@ def _creation_headers(name: str, size: int) -> dict[str, str]:
 
 
 def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
-    """A part of a file, and the headers to send it with."""
+    """Return a part of a file, and the headers to send it with."""
     with path.open("rb") as file:
         file.seek(offset)
         part = file.read(PART_BYTES)
@@ -74,13 +74,13 @@ Files = tuple[Path, Sequence[Path], Path | None, Path | None]
 def create_job(
     files: Files, parameters: Mapping[str, Any], *, webhook: str | None, progress: Progress
 ) -> Steps[dict[str, Any]]:
-    """Send a job; returns what the service answers.
+    """Submit a job, and return the service's answer.
 
     Args:
-        files: scene, the style's pictures, cameras and photos.
-        parameters: of the job; None leaves one out.
-        webhook: URL that is told when the job has ended.
-        progress: called with the bytes that are up and those of all large files.
+        files: Scene, style images, cameras and photos.
+        parameters: Parameters of the job; None leaves one out.
+        webhook: URL that is called when the job has ended.
+        progress: Callback that gets the uploaded bytes and the total bytes of all large files.
     """
     fields = yield from _send_files(files, parameters, progress)
     if webhook:
@@ -93,10 +93,10 @@ def create_job(
 def plan_job(
     files: Files, parameters: Mapping[str, Any], *, progress: Progress, planning: Progress
 ) -> Steps[dict[str, Any]]:
-    """Plan a job instead of queueing it; arguments are those of `create_job`.
+    """Plan a job without queueing it. Other arguments are those of `create_job`.
 
     Args:
-        planning: called with the views that have been looked at, and all of them.
+        planning: Callback that gets the number of surveyed views and of all views.
     """
     fields = yield from _send_files(files, parameters, progress)
     told: dict[str, Any] = {}
@@ -117,13 +117,13 @@ def plan_job(
     if answer is not None:
         whole: dict[str, Any] = answer.json()
         return whole
-    if not told:  # the service was stopped, or something between it and here cut the answer off
+    if not told:  # the service was stopped, or a proxy cut the answer off
         raise ApiError("The connection ended before the plan had come. Try again.", 502)
     return told
 
 
 def _send_files(files: Files, parameters: Mapping[str, Any], progress: Progress) -> Steps[list[tuple[str, Any]]]:
-    """Upload what is large; returns the fields of the request, which carries the rest."""
+    """Upload the large files, and return the fields of the request, which carries the others."""
     inputs: list[InputFile] = yield FileWork(partial(input_files, *files))
     total = sum(file.size for file in inputs if file.size > PART_BYTES)
     done = 0
@@ -142,5 +142,5 @@ def _send_files(files: Files, parameters: Mapping[str, Any], progress: Progress)
 
 
 def _report_sum(progress: Progress, before: int, total: int, done: int, _size: int) -> None:
-    """Tell of one file as a part of all of them."""
+    """Report the progress of one file as a fraction of all files."""
     progress(before + done, total)

@@ -38,9 +38,9 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from service.weights import check_weights
 
-#: Requests that read the store or the disk side by side.
+#: Number of threads for requests that read the store or the disk.
 _THREADS = 40
-#: Seconds that a request waits for a locked database, and for each answer of its server.
+#: Seconds that a request waits for a locked database, and for each answer of the database server.
 _ANSWER_SECONDS = 8.0
 
 _access = logging.getLogger("api.access")
@@ -52,7 +52,7 @@ the job, and download `stylized.ply`. Errors are problem documents (RFC 9457) wi
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
-    """The app on the settings' store and folders."""
+    """Return the app, with the store and folders of the settings."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -83,7 +83,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
-        # the default has few threads where there are few processors, and most of these wait for the disk
+        # Most of these threads wait for the disk; the default executor has few of them on machines with few processors.
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         context.hub.start()
         context.receipts.start()
@@ -123,13 +123,13 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
 
 class Observed:
-    """Middleware: counts and logs requests by their route, not by their path."""
+    """Middleware that counts and logs requests by route instead of by path."""
 
     def __init__(self, app: ASGIApp, state: Any) -> None:
         self._app, self._state = app, state
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
+        """Serve a request; record its status and the time until its response starts."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

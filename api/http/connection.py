@@ -1,4 +1,4 @@
-"""HTTP connections whose time and memory are bounded; uvicorn's own protocol bounds neither."""
+"""HTTP connections with bounded time and memory; uvicorn's own protocol bounds neither."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from api.http.memory import memory
 from api.http.problems import HeadTooLargeError, MalformedRequestError, TooManyConnectionsError, from_service
 from service.errors import ServiceError
 
-#: Bytes of a request's line and headers, unless so many connections are open that each has less (`api.http.memory`).
+#: Maximum bytes of a request line and headers, if there are few connections; with many, each gets less
+#: (`api.http.memory`).
 MAX_HEAD_BYTES = 1 << 17
-#: Headers of a request: each takes far more memory than its bytes.
+#: Maximum number of headers: each takes far more memory than its bytes.
 MAX_HEADERS = 200
-#: Requests that wait on one connection for the answer to an earlier one.
+#: Maximum number of requests that may wait on one connection for the answer to an earlier one.
 MAX_WAITING = 8
 
 
 class _Stage(Enum):
-    """What the next byte of a connection belongs to."""
+    """Part of a request that the next byte of a connection belongs to."""
 
     BETWEEN = auto()
     HEAD = auto()
@@ -30,17 +31,17 @@ class _Stage(Enum):
 
 
 class Connection(HttpToolsProtocol):
-    """A connection that is closed when its client takes too long or sends too much.
+    """A connection that is closed if its client takes too long or sends too much.
 
-    It reads no more than one piece of a body ahead of the app, and drops trailers.
+    It reads at most one piece of a body ahead of the app, and drops trailers.
 
     Attributes:
-        head_seconds: Time from the connection, or a head's first byte, to the head's end; also from an answer to the
-            end of a body that the app did not read.
-        most: Number of connections of this process at the same time; further ones are answered with 503.
+        head_seconds: Time limit in seconds for a head (request line and headers), from the connection or the head's
+            first byte to its end. Also the limit for the rest of a body that the app did not read, from the answer on.
+        most: Maximum number of simultaneous connections of this process; further ones are answered with 503.
     """
 
-    # an object with more than 30 attributes in its dictionary takes 2 kB more, and the base class has 28
+    # An object with more than 30 attributes in its `__dict__` takes 2 kB more, and the base class has 28.
     __slots__ = ("_error", "_stage", "_steps", "_timer", "_unused_bytes")
 
     head_seconds = 60.0
@@ -54,7 +55,7 @@ class Connection(HttpToolsProtocol):
         self._timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start the time of the first head."""
+        """Start the timer of the first head."""
         super().connection_made(transport)
         memory.connections += 1
         if len(self.connections) > self.most:
@@ -64,15 +65,15 @@ class Connection(HttpToolsProtocol):
         self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop waiting."""
+        """Stop the timer, and stop counting the connection."""
         memory.connections -= 1
         self._stop_timer()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes | memoryview) -> None:
-        """Parse bytes; refuse them if there are too many that neither end a head nor belong to a body.
+        """Parse bytes; refuse the connection if too many arrive without finishing a head or belonging to a body.
 
-        Those are heads, trailers, and extensions of chunks.
+        Such bytes are heads, trailers and chunk extensions.
         """
         steps = self._steps
         super().data_received(data)  # type: ignore[arg-type]
@@ -86,12 +87,12 @@ class Connection(HttpToolsProtocol):
             self._start_timer()
 
     def on_message_begin(self) -> None:
-        """Begin a head."""
+        """Start a head."""
         self._stage = _Stage.HEAD
         super().on_message_begin()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Take a header; drop a trailer."""
+        """Store a header; drop a trailer."""
         if self._stage is _Stage.BODY:
             return
         if len(self.headers) == MAX_HEADERS:
@@ -110,26 +111,26 @@ class Connection(HttpToolsProtocol):
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """Take a piece of a body, and read no further until the app has it."""
+        """Pass on a piece of a body, and pause reading until the app has taken it."""
         self._steps += 1
         super().on_body(body)
         if not self.cycle.response_complete:
             self.flow.pause_reading()
 
     def on_message_complete(self) -> None:
-        """End a request."""
+        """Finish a request."""
         super().on_message_complete()
         self._stage = _Stage.BETWEEN
         self._steps += 1
         self._forget_answered()
 
     def on_response_complete(self) -> None:
-        """End an answer; the rest of a body that the app did not read has to come soon."""
+        """Finish an answer, and limit the time for the rest of a body that the app did not read."""
         super().on_response_complete()
         self._forget_answered()
 
     def _forget_answered(self) -> None:
-        """Free the memory of a request that is answered; wait for its end, or for the next one."""
+        """Free the memory of an answered request, then wait for its end or for the next request."""
         if self.cycle is None or not self.cycle.response_complete or self.transport.is_closing():
             return
         if self._stage is _Stage.BODY:
@@ -139,7 +140,7 @@ class Connection(HttpToolsProtocol):
         self.cycle = None  # type: ignore[assignment]
         if self._stage is _Stage.BETWEEN:
             self.scope = self.headers = None  # type: ignore[assignment]
-            if self._timer is not None:  # it was the body's; uvicorn's own timer ended with the body's first byte
+            if self._timer is not None:  # The timer was the body's. uvicorn's own has stopped.
                 self._start_timer()
 
     def _start_timer(self) -> None:
@@ -159,17 +160,17 @@ class Connection(HttpToolsProtocol):
             self.transport.close()
 
     def _abort(self, error: ServiceError) -> None:
-        """Make the parser stop; `send_400_response` then answers with the error."""
+        """Stop the parser; `send_400_response` then answers with the error."""
         self._error = error
         raise error
 
     def send_400_response(self, msg: str) -> None:
-        """Answer what is not HTTP with a problem document; uvicorn's own answer is plain text."""
+        """Answer malformed HTTP with a problem document; uvicorn's own answer is plain text."""
         wrong = MalformedRequestError(f"{msg} Its first line, a header or a chunk is not as HTTP has it.")
         self._refuse(self._error or wrong)
 
     def _refuse(self, error: ServiceError) -> None:
-        """Answer below the app unless an answer to this request has begun, and close."""
+        """Close the connection; answer with the error unless an answer to this request has already started."""
         begun = self.cycle is not None and self.cycle.response_started
         if not begun or (self.cycle.response_complete and self._stage is not _Stage.BODY):
             answer = from_service(error)
@@ -183,7 +184,7 @@ _piece = memoryview(bytearray(MAX_HEAD_BYTES))
 
 
 class Reader(asyncio.BufferedProtocol):
-    """Reads a connection in pieces no larger than its share of the memory; uvloop itself reads 256 kB at once."""
+    """Adapter that reads a connection in pieces within its memory budget; uvloop itself reads 256 kB at once."""
 
     __slots__ = ("_connection",)
 
@@ -191,7 +192,7 @@ class Reader(asyncio.BufferedProtocol):
         self._connection = Connection(*args, **kwargs)
 
     def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
-        """Return where the next piece goes: one buffer for all connections, for each piece is parsed at once."""
+        """Return the buffer for the next piece. All connections share it, because each piece is parsed at once."""
         return _piece[: memory.share()]
 
     def buffer_updated(self, nbytes: int) -> None:
@@ -199,21 +200,21 @@ class Reader(asyncio.BufferedProtocol):
         self._connection.data_received(_piece[:nbytes])
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """As the connection."""
+        """Pass the event to the connection."""
         self._connection.connection_made(transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """As the connection."""
+        """Pass the event to the connection."""
         self._connection.connection_lost(exc)
 
     def eof_received(self) -> None:
-        """As the connection."""
+        """Pass the event to the connection."""
         self._connection.eof_received()
 
     def pause_writing(self) -> None:
-        """As the connection."""
+        """Pass the event to the connection."""
         self._connection.pause_writing()
 
     def resume_writing(self) -> None:
-        """As the connection."""
+        """Pass the event to the connection."""
         self._connection.resume_writing()

@@ -1,9 +1,11 @@
-"""What routes need: the parts of the service, and who is asking.
+"""Dependencies of the routes: the components of the service, and the caller of a request.
 
-Programs send an API key with each request. A browser shows one once (`POST /v1/session`) and has a cookie from then on,
-which it also sends with pictures, downloads and event streams. A cookie comes along with whatever any page makes the
-browser ask for: SameSite=Strict keeps it from other sites, and what changes something must besides come from a page of
-this very origin, by the browser's own word (`Origin`, `Sec-Fetch-Site`).
+Programs send an API key with each request. A browser sends its key once (`POST /v1/session`) and gets a cookie, which
+it then also sends with images, downloads and event streams.
+
+A browser attaches the cookie to requests from any page. `SameSite=Strict` holds it back from other sites. In addition,
+a request that changes something must come from a page of this origin, according to the browser (`Origin`,
+`Sec-Fetch-Site`).
 """
 
 from __future__ import annotations
@@ -34,37 +36,37 @@ from service.store import Store
 from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import KeyRow
 
-#: Who owns what is created without a key, where no key is needed.
+#: Owner of everything that is created without a key, on services that require none.
 LOCAL_OWNER = "local"
-#: Name of the cookie that holds a session.
+#: Name of the session cookie.
 SESSION_COOKIE = "sgsst_session"
 #: Methods that change nothing.
 _READING = ("GET", "HEAD", "OPTIONS")
-#: A Host header: an IPv6 address in brackets, or a name or IPv4 address, and perhaps a port.
+#: A Host header: an IPv6 address in brackets, or a name or IPv4 address, then optionally a port.
 _HOST = re.compile(r"(?:\[([^\]]*)\]|([^:/?#@\[\]\\]*))(?::[0-9]*)?")
 
 
 class NoKeyError(ServiceError):
-    """No API key, or one that is unknown or revoked."""
+    """A missing, unknown or revoked API key."""
 
     code, status = "unauthorized", 401
 
 
 class ForeignSiteError(ServiceError):
-    """A web page of another site tries to use a service that is open to this machine's programs."""
+    """A request from another site's web page to a service that requires no key."""
 
     code, status = "foreign-site", 403
 
 
 class CrossOriginError(ServiceError):
-    """A request that would change something comes with a session's cookie, and not from a page of this service."""
+    """A request with a session cookie that would change something, but does not come from a page of this service."""
 
     code, status = "cross-origin", 403
 
 
 @dataclass(frozen=True)
 class Context:
-    """The parts of the service, made once a process."""
+    """Components of the service, created once per process."""
 
     settings: ServiceSettings
     store: Store
@@ -83,7 +85,7 @@ class Context:
 
 @dataclass(frozen=True)
 class Caller:
-    """Who is asking: everything that is created belongs to `owner`, and nothing else can be seen."""
+    """Client that sends a request. It owns everything that it creates, and sees nothing else."""
 
     owner: str
     priority: int
@@ -91,7 +93,7 @@ class Caller:
 
 
 async def get_context(request: Request) -> Context:
-    """The app's context; not a plain function, which would run on another thread."""
+    """Return the app's context. It is async because FastAPI runs plain functions in another thread."""
     found: Context = request.app.state.context
     return found
 
@@ -113,14 +115,15 @@ async def get_caller(
     given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
     cookie: Annotated[str | None, Depends(session_cookie)],
 ) -> Caller:
-    """The holder of the request's API key, or of its session's where there is no key; everybody on this machine is the
-    same one where no key is needed.
+    """Return the owner of the request's API key, or of its session if there is no key.
+
+    If the service requires no keys, all callers on this machine are the same one.
 
     Raises:
-        NoKeyError: a key is needed and missing, or it is no good.
-        CrossOriginError: the session is good, but it is no page of this service that asks for a change.
-        ForeignSiteError: no key, and the request comes from a web page that this service did not serve.
-        RateLimitError: requests with this key come too fast.
+        NoKeyError: If a key is required and missing, or the key is not valid.
+        CrossOriginError: If the session is valid, but a change is requested from another page than this service's.
+        ForeignSiteError: If there is no key, and the request comes from a web page that this service did not serve.
+        RateLimitError: If requests with this key arrive too fast.
     """
     if given is not None:
         key = await asyncio.to_thread(context.store.keys.find, given.credentials)
@@ -143,7 +146,7 @@ async def get_caller(
 
 
 def _caller(context: Context, key: KeyRow) -> Caller:
-    """The holder of a key, after counting a request of theirs."""
+    """Count a request against the key's rate, and return the key's owner."""
     quotas = Quotas.of_settings(context.settings).with_own(key.quotas)
     context.rates.take(key.id, quotas.requests_a_second)
     return Caller(key.id, key.priority, quotas)
@@ -153,13 +156,13 @@ CallerDep = Annotated[Caller, Depends(get_caller)]
 
 
 def check_origin(request: Request, *, required: bool = True) -> None:
-    """Prove that a request comes from a page of this service, as far as the browser tells.
+    """Check that a request comes from a page of this service, according to the browser's headers.
 
     Args:
-        required: a request that tells nothing of where it comes from, as programs send it, is refused.
+        required: Whether to refuse requests without such headers, as programs send them.
 
     Raises:
-        CrossOriginError: it comes from elsewhere.
+        CrossOriginError: If the request comes from elsewhere.
     """
     origin, site = request.headers.get("origin"), request.headers.get("sec-fetch-site")
     if origin is not None and _netloc(origin) != request.headers.get("host"):
@@ -174,8 +177,13 @@ def check_origin(request: Request, *, required: bool = True) -> None:
 
 
 def _check_site(request: Request, settings: ServiceSettings) -> None:
-    """Keep web pages out that a browser on this machine shows: neither by their own name nor by a name of theirs that
-    leads to this machine may they use a service that asks for no key.
+    """Refuse requests of other sites' pages to a service that requires no key.
+
+    A page open in a browser on this machine may call the service across origins, or through a DNS name of its own that
+    resolves to this machine. Neither is allowed.
+
+    Raises:
+        ForeignSiteError: If the Host or Origin header is not this service's.
     """
     host = _host_name(request.headers.get("host", ""))
     if settings.on_loopback and not is_loopback(host):
@@ -188,7 +196,7 @@ def _check_site(request: Request, settings: ServiceSettings) -> None:
 def _netloc(origin: str) -> str:
     try:
         return urlsplit(origin).netloc
-    except ValueError:  # such as "http://[" , which no browser sends
+    except ValueError:  # For example "http://[", which no browser sends.
         return ""
 
 
@@ -202,5 +210,5 @@ _ID = re.compile(r"[a-z]{3}_[0-9a-f]{8,36}")
 
 
 def is_id(text: str) -> bool:
-    """Whether it looks like an id; everything else is not worth a look into the store."""
+    """Return whether a text has the format of an id; anything else needs no query of the store."""
     return _ID.fullmatch(text) is not None

@@ -1,6 +1,6 @@
-"""What the OpenAPI document says beside the routes' own types: headers of answers, and what is refused, with examples.
+"""Parts of the OpenAPI document that route types do not cover: headers of answers, and errors with examples.
 
-Examples of bodies stand with their models (`api.http.schemas`, `api.http.submission`, `service.parameters`).
+Examples of bodies are defined with their models (`api.http.schemas`, `api.http.submission`, `service.parameters`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _TEXT: dict[str, Any] = {"type": "string"}
 _COUNT: dict[str, Any] = {"type": "integer", "minimum": 0}
 _DATE = {"type": "string", "pattern": "GMT$"}
 
-#: Headers of answers: what they say, their form, an example.
+#: Headers of answers: description, schema, example.
 _HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
     "Accept-Ranges": ("Parts can be asked for.", {"const": "bytes"}, "bytes"),
     "Cache-Control": ("Answers belong to one key, and change.", _TEXT, "private, no-cache"),
@@ -62,7 +62,7 @@ _HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
 
 
 def headers(*names: str, maybe: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Headers that an answer has always, and those that it may have."""
+    """Return the documentation of the headers that an answer always has (`names`) or may have (`maybe`)."""
     found = {}
     for name in (*names, *maybe):
         description, schema, example = _HEADERS[name]
@@ -75,7 +75,7 @@ def headers(*names: str, maybe: tuple[str, ...] = ()) -> dict[str, Any]:
     return found
 
 
-#: What any request may be refused with, and what one for whose answer a key may be needed.
+#: Errors of every operation, and errors of operations that may require a key.
 _ANYWHERE: tuple[ServiceError, ...] = (
     MalformedRequestError("The request is not HTTP as it should be: its first line, a header or a chunk is wrong."),
     HeadTooLargeError("The request's line and headers have more than 131,072 bytes."),
@@ -98,11 +98,11 @@ _WITH_KEY: tuple[ServiceError, ...] = (
 
 
 def problems(*errors: ServiceError, key: bool = True) -> Responses:
-    """What an operation may refuse with: each error as it is answered, under its status.
+    """Return the documentation of an operation's errors by status, with an example answer for each.
 
     Args:
-        errors: one for each `code` of this operation; those of every operation are added.
-        key: whether a key may be needed.
+        errors: One error for each `code` of this operation. The errors that every operation may raise are added.
+        key: Whether the operation may require a key.
     """
     found: Responses = {}
     for error in (*_ANYWHERE, *(_WITH_KEY if key else ()), *errors):
@@ -124,18 +124,19 @@ def _no_problem_yet(status: int, title: str) -> dict[str, Any]:
 
 
 def invalid(at: str, message: str) -> ServiceError:
-    """A header or parameter of a wrong form, as an example."""
+    """Return an example error for an invalid header or parameter."""
     return RefusedInputError(f"{at}: {message}", "invalid-request", errors=[{"at": at, "message": message}])
 
 
 def links(*operations: str, **parameters: str) -> dict[str, Any]:
-    """Where an answer leads: operations that take these parameters from it."""
+    """Return OpenAPI links from an answer to operations that take these parameters from it."""
     return {name: {"operationId": name, "parameters": parameters} for name in operations}
 
 
 def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> None:
-    """Mend FastAPI's document: it lacks models that no route takes as an argument, drops nulls from examples, and has
-    forms of its own for errors.
+    """Complete FastAPI's OpenAPI document in place.
+
+    It lacks models that no route takes as an argument, drops nulls from examples, and has its own schemas for errors.
     """
     schemas = document["components"]["schemas"]
     for model in models:
@@ -145,14 +146,13 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
     for path in document["paths"].values():
         for method, operation in path.items():
             for parameter in operation.get("parameters", []):
-                if (
-                    parameter["name"] == "Tus-Resumable"
-                ):  # has a default only because tus answers 412 where it is missing
+                # It has a default only because tus answers 412, not 422, if it is missing.
+                if parameter["name"] == "Tus-Resumable":
                     parameter["required"] = True
                     parameter["schema"].pop("default", None)
             answers = operation["responses"]
             if "application/json" in answers.get("422", {}).get("content", {}):
-                del answers["422"]  # FastAPI's own form, where nothing can be wrong with a request's parameters
+                del answers["422"]  # FastAPI's own error schema, on operations whose parameters cannot be invalid
             for answer in answers.values():
                 if method == "head":
                     answer.pop("content", None)

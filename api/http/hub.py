@@ -1,4 +1,4 @@
-"""Job events to any number of watchers: one task looks into the store for all of them."""
+"""Job events for any number of watchers; one task polls the store for all of them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from service.store import Store
 from service.store.states import ENDED
 from service.store.tables import EventRow
 
-#: Seconds between two looks into the store; a watcher learns of an event after half of it on average.
+#: Seconds between polls of the store; a watcher gets an event after half of it on average.
 _POLL_SECONDS = 0.3
-#: Seconds of silence after which a comment is sent, so that proxies do not take the connection for dead.
+#: Seconds of silence before a comment is sent, so that proxies do not drop the connection as idle.
 HEARTBEAT_SECONDS = 15.0
-#: Events of a watched job that are kept for its watchers; who is farther behind reads the store.
+#: Number of events that are buffered per watched job; a watcher that is farther behind reads the store.
 _KEPT = 300
 
 _log = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Item:
-    """An event as it is sent."""
+    """Server-sent event of a job, ready to be sent."""
 
     id: int
     text: bytes
@@ -38,7 +38,7 @@ class Item:
 
 @dataclass
 class _Channel:
-    """The watchers of one job."""
+    """Buffered events and watchers of one job."""
 
     base: int
     last: int
@@ -49,7 +49,7 @@ class _Channel:
 
 
 class Hub:
-    """Looks for events of jobs that are watched, and wakes their watchers."""
+    """Poller of job events that wakes the watchers of each job."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -58,11 +58,11 @@ class Hub:
         self._closing = asyncio.Event()
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start polling."""
         self._task = asyncio.create_task(self._poll())
 
     async def close(self) -> None:
-        """End all streams; watchers come back with the id of their last event."""
+        """End all streams; watchers reconnect with the id of their last event."""
         self._closing.set()
         for channel in self._channels.values():
             channel.changed.set()
@@ -70,7 +70,7 @@ class Hub:
             self._task.cancel()
 
     async def ended(self, job_id: str, after: int) -> bool:
-        """Whether there is nothing to tell after that event, and never will be."""
+        """Return whether the job has ended and has no events after this one."""
         last = (await asyncio.to_thread(self._store.jobs.last_events, [job_id])).get(job_id)
         if last is None or last > after:
             return False
@@ -78,7 +78,7 @@ class Hub:
         return bool(rows) and _to_item(rows[0]).ends
 
     async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
-        """Events of a job after one, as text, until the job has ended."""
+        """Yield the events of a job after the given one, as text, until the job has ended."""
         channel = self._channels.get(job_id)
         if channel is None:
             channel = self._channels.setdefault(job_id, _Channel(0, 0))
@@ -109,7 +109,7 @@ class Hub:
             return [item for item in channel.items if item.id > after]
         try:
             rows = await asyncio.to_thread(self._store.jobs.events, job_id, after)
-        except DatabaseUnavailableError:  # the stream waits, and is woken once the database is back
+        except DatabaseUnavailableError:  # The stream waits until the database is back.
             return []
         return [_to_item(row) for row in rows]
 
@@ -122,7 +122,7 @@ class Hub:
             try:
                 await self._read_new_events()
                 away = False
-            except DatabaseUnavailableError as error:  # watchers wait, and hear of new events when it is back
+            except DatabaseUnavailableError as error:  # Watchers wait until the database is back.
                 if not away:
                     _log.warning("events cannot be read: %s", error)
                 away = True
@@ -157,7 +157,7 @@ def _wake_watchers(channel: _Channel) -> None:
 
 def _to_item(row: EventRow) -> Item:
     data = row.data
-    if row.kind == "progress":  # as the job's own view says it
+    if row.kind == "progress":  # the same format as in the job itself
         data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
     text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
     return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in ENDED)

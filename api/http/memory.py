@@ -1,19 +1,19 @@
-"""Memory for requests: what all connections of a process may hold together of what has come and is not used yet."""
+"""Memory budget for request bytes that have arrived but are not used yet, over all connections of a process."""
 
 from __future__ import annotations
 
 from service.errors import BusyError
 
-#: Bytes for all connections together, and bytes that each may hold at most and at least.
+#: Bytes of all connections together, and maximum and minimum bytes of each.
 _TOTAL, _MOST, _LEAST = 8 << 20, 1 << 17, 1 << 13
 
 
 class RequestMemory:
-    """The memory of one process for heads and bodies of requests.
+    """Memory of one process for the heads and bodies of requests.
 
-    Each connection may hold an equal share: of a head, of a body that nobody has read yet, and of a block that is about
-    to be written. JSON bodies, which have to be whole before they can be read, may have more than that as long as all
-    of them together do not.
+    Each connection may hold an equal share. It covers its head, the part of its body that is not read yet, and the
+    block that is written next. JSON bodies must be complete before they can be parsed, so they may exceed the share as
+    long as all JSON bodies together stay within the total.
 
     Attributes:
         connections: Number of open connections.
@@ -24,18 +24,18 @@ class RequestMemory:
         self._json_bytes = 0
 
     def share(self) -> int:
-        """Return the bytes that one connection may hold: 128 kB, or less among many connections, but at least 8 kB."""
+        """Return the bytes that one connection may hold: 128 kB, less if there are many connections, at least 8 kB."""
         return max(_LEAST, min(_MOST, _TOTAL // max(1, self.connections)))
 
     def take(self, size: int, held: int) -> None:
         """Count bytes of a JSON body.
 
         Args:
-            size: Number of bytes that are added.
-            held: Number of bytes that this body has already.
+            size: Number of bytes to add.
+            held: Number of bytes that this body already has.
 
         Raises:
-            BusyError: All JSON bodies together have too much, and this one more than its share.
+            BusyError: If all JSON bodies together exceed the total, and this one exceeds its share.
         """
         if self._json_bytes + size > _TOTAL and held + size > self.share():
             raise BusyError("Too many large requests are arriving. Try again later.", retry_after=5)
@@ -46,5 +46,5 @@ class RequestMemory:
         self._json_bytes -= size
 
 
-#: The memory of this process.
+#: Memory budget of this process.
 memory = RequestMemory()

@@ -1,4 +1,4 @@
-"""Prometheus metrics: requests of this process, and jobs as the store has them."""
+"""Prometheus metrics: requests of this process, and jobs from the store."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.store.states import AttemptOutcome, JobStatus
 
 
 class _Counter(NamedTuple):
-    """What a counter counts, and the label that it has, with all values: each is shown from the start, as 0."""
+    """Help text of a counter, and its label with all its values. Each value is exported from the start, as 0."""
 
     help: str
     label: str | None = None
@@ -43,10 +43,10 @@ _HISTOGRAMS = {
 
 
 class Metrics:
-    """What `/metrics` shows.
+    """Registry of everything that `/metrics` exports.
 
     Args:
-        folder: the service's, whose disk uploads are received on.
+        folder: Folder of the service, on the disk that receives uploads.
     """
 
     def __init__(self, store: Store, folder: Path) -> None:
@@ -65,12 +65,12 @@ class Metrics:
         self._seconds.labels(method, route).observe(seconds)
 
     def render(self) -> bytes:
-        """The text format."""
+        """Return all metrics in the Prometheus text format."""
         return generate_latest(self._registry)
 
 
 class _StoreCollector(Collector):
-    """Counts that outlive processes, read from the store when asked for."""
+    """Collector of counts that outlive processes; it reads the store at each scrape."""
 
     def __init__(self, store: Store, folder: Path) -> None:
         self._store, self._folder = store, folder
@@ -117,7 +117,7 @@ class _StoreCollector(Collector):
 
 
 def _cumulative(buckets: dict[str, float], number: float) -> list[tuple[str, float]]:
-    """Buckets as Prometheus wants them, each with those below it."""
+    """Return histogram buckets as Prometheus expects them: each includes those below it."""
     below, rows = 0.0, []
     for bound in BUCKETS:
         below += buckets.get(str(bound), 0.0)

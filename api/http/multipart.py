@@ -1,4 +1,4 @@
-"""A job's files in one multipart request: written to disk as they come, in constant memory."""
+"""Files of a job in one multipart request, written to disk as they arrive, in constant memory."""
 
 from __future__ import annotations
 
@@ -27,43 +27,44 @@ from service.settings import ServiceSettings
 from sgsst_core.errors import SceneError
 from sgsst_core.files.scene_headers import read_scene_header
 
-#: Bytes of a text field, which is JSON of parameters or an id.
+#: Maximum bytes of a text field: JSON parameters or an id.
 _MAX_TEXT = 1 << 16
 _TEXT_FIELDS = ("parameters", "webhook")
-#: Of one part, and bytes of each of them: they tell its role and its file's name.
+#: Maximum number of headers of a part, and bytes of each. They hold the file's role and name.
 _MAX_HEADERS, _MAX_HEADER = 8, 4224
-#: Bytes per second at which a body comes at least, once it has come for longer than it may stand still.
+#: Minimum bytes per second of a body, once it takes longer than the time a body may stall.
 _LEAST_RATE = 1000
-#: After a refusal, so much more is read and thrown away: a client that still sends would not see the answer otherwise.
+#: Limits in bytes and seconds for reading and discarding the rest of a refused body. A client that is still sending
+#: would not see the answer otherwise.
 _DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
 
 
 class BadRequestError(ServiceError):
-    """The body is not what its headers say."""
+    """A body that contradicts its headers."""
 
     code, status = "malformed-body", 400
 
 
 class MediaTypeError(ServiceError):
-    """Not a media type, or an encoding, that is read here."""
+    """A media type or content encoding that is not supported."""
 
     code, status = "unsupported-media-type", 415
 
 
 class TooSlowError(ServiceError):
-    """The body has stopped coming."""
+    """A body that has stopped arriving."""
 
     code, status = "too-slow", 408
 
 
 @dataclass
 class Received:
-    """What a request brought.
+    """Contents of a request.
 
     Attributes:
         files: `role`, `name`, `sha256`, `size` of each file.
-        uploads: where an upload was named instead, its place among files and uploads, its role and its id.
-        texts: the text fields.
+        uploads: Uploads that are named in place of files: index among files and uploads, role, id.
+        texts: Text fields by name.
     """
 
     files: list[dict[str, Any]] = field(default_factory=list)
@@ -72,24 +73,24 @@ class Received:
 
 
 async def body_parts(request: Request, settings: ServiceSettings, limit: int, advice: str) -> AsyncIterator[bytes]:
-    """Yield a body in parts as they come.
+    """Yield a body in parts as they arrive.
 
     Args:
-        limit: Number of bytes at most.
-        advice: End of the message for a body that is longer.
+        limit: Maximum number of bytes.
+        advice: End of the error message for a body that is too long.
 
     Raises:
-        MediaTypeError: The body is compressed.
-        TooLargeError: The body is too long; where its length is declared, before anything is read.
-        TooSlowError: The body stands still or hardly moves.
-        BadRequestError: The body was cut off.
+        MediaTypeError: If the body is compressed.
+        TooLargeError: If the body is too long. A declared length is checked before anything is read.
+        TooSlowError: If the body stalls or arrives too slowly.
+        BadRequestError: If the body is cut off.
     """
     declared_bytes(request, limit, advice)
     total = 0
     stream = aiter(request.stream())
     started = time.monotonic()
     while True:
-        # a client that sends a byte now and then does not stand still, but would hold the connection for ever
+        # A client that sends a byte now and then never stalls, but would hold the connection forever.
         allowed = settings.receive_seconds + total / _LEAST_RATE - (time.monotonic() - started)
         try:
             part = await asyncio.wait_for(anext(stream), max(0.0, min(allowed, settings.receive_seconds)))
@@ -98,7 +99,7 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
         except TimeoutError as error:
             raise TooSlowError(
                 f"Nothing has come for {settings.receive_seconds:g} s, or less than {_LEAST_RATE} bytes per second.",
-                headers={"Connection": "close"},  # the rest of the body may never come
+                headers={"Connection": "close"},  # the rest of the body may never arrive
             ) from error
         except ClientDisconnect as error:
             raise BadRequestError("The request was cut off.") from error
@@ -109,10 +110,10 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
 
 
 async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncIterator[bytes]:
-    """Yield a body of files in blocks, each of which is one step to another thread and back.
+    """Yield a body of files in blocks. Each block costs one switch to another thread and back.
 
     Raises:
-        ServiceError: As `body_parts`.
+        ServiceError: Same errors as `body_parts`.
     """
     block = bytearray()
     try:
@@ -124,22 +125,22 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
                 yield full
     except (TooSlowError, BadRequestError):
         if block:
-            yield bytes(block)  # an upload keeps what has come
+            yield bytes(block)  # an upload keeps the bytes that have arrived
         raise
     if block:
         yield bytes(block)
 
 
 def declared_bytes(request: Request, limit: int, advice: str = "Use uploads.") -> int:
-    """Return the length of a body by its headers; 0 if they do not give it.
+    """Return the length of a body from its headers, or 0 if they do not declare it.
 
     Raises:
-        MediaTypeError: The body is compressed.
-        TooLargeError: The body is too long.
+        MediaTypeError: If the body is compressed.
+        TooLargeError: If the body is too long.
     """
     if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
         raise MediaTypeError("Bodies are taken as they are: send it without Content-Encoding.")
-    total = int(request.headers.get("content-length", "0"))  # digits alone: the HTTP parser refuses anything else
+    total = int(request.headers.get("content-length", "0"))  # only digits: the HTTP parser refuses anything else
     if total > limit:
         raise TooLargeError(f"The request has {total:,} bytes; at most {limit:,} are allowed. {advice}", limit=limit)
     return total
@@ -148,11 +149,11 @@ def declared_bytes(request: Request, limit: int, advice: str = "Use uploads.") -
 async def receive(
     request: Request, blobs: Blobs, settings: ServiceSettings, receipt: Receipt, threads: OwnerThreads
 ) -> Received:
-    """Read a multipart request to its end; its files are blobs when this returns, and the receipt holds them.
+    """Read a multipart request to its end. On return, its files are blobs that belong to the receipt.
 
     Raises:
-        QuotaError: the owner would have too many bytes: before the first one is read, if the request declares them.
-        ServiceError: in one of its forms; the receipt's end removes what had arrived.
+        QuotaError: If the owner would have too many bytes. A declared length is checked before the first byte is read.
+        ServiceError: If the request is invalid. The end of the receipt deletes what has arrived.
     """
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
@@ -192,7 +193,7 @@ async def _drain(blocks: AsyncIterator[bytes]) -> None:
 
 
 class _Form:
-    """The parser's callbacks: which part is open, and where its bytes go."""
+    """Callbacks of the multipart parser; they route the bytes of the open part to a file or a text."""
 
     def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings, receipt: Receipt) -> None:
         self.received = Received()
@@ -227,7 +228,7 @@ class _Form:
             raise BadRequestError(f"The multipart boundary cannot be used: {error}.") from error
 
     def feed(self, block: bytes) -> None:
-        """Take a block of the body in, once it is charged."""
+        """Charge a block of the body to the receipt, then parse it."""
         self._receipt.take(len(block))
         try:
             self._parser.write(block)
@@ -235,12 +236,16 @@ class _Form:
             raise BadRequestError(f"The multipart body makes no sense: {error}.") from error
 
     def finish(self) -> None:
-        """Prove that the body was whole."""
+        """Check that the body was complete.
+
+        Raises:
+            BadRequestError: If its last boundary is missing.
+        """
         if not self._done:
             raise BadRequestError("The multipart body ends before its last boundary: it was cut off.")
 
     def discard(self) -> None:
-        """Remove what has arrived of the file that is open."""
+        """Delete the received bytes of the open file."""
         if self._file is not None:
             self._file.discard()
             self._file = None
@@ -311,10 +316,10 @@ class _Form:
 
 
 def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSettings) -> None:
-    """What can be told of a file at once, without its reader: the rest is the inspecting process'.
+    """Check a file as far as possible without its reader; the inspection process does the rest.
 
     Raises:
-        RefusedInputError: it cannot be used.
+        RefusedInputError: If the file cannot be used.
     """
     if not size:
         raise RefusedInputError(f"{name}: is empty. Send the file's content.", f"invalid-{_kind(role)}", input=role)
@@ -348,16 +353,16 @@ def _kind(role: str) -> str:
 
 
 async def read_json(request: Request, settings: ServiceSettings, most: int) -> Any:
-    """Read a body of JSON and return what it holds.
+    """Read and parse a JSON body.
 
     Args:
-        most: Number of bytes at most.
+        most: Maximum number of bytes.
 
     Raises:
-        BadRequestError: The body is not UTF-8.
-        RefusedInputError: The body is not JSON.
-        BusyError: Many large bodies are arriving.
-        ServiceError: As `body_parts`.
+        BadRequestError: If the body is not UTF-8.
+        RefusedInputError: If the body is not JSON.
+        BusyError: If many large bodies are arriving.
+        ServiceError: Same errors as `body_parts`.
     """
     body = bytearray()
     try:
@@ -372,12 +377,12 @@ async def read_json(request: Request, settings: ServiceSettings, most: int) -> A
 
 
 def parse_json(text: str, what: str) -> Any:
-    """Return what the JSON of a field or body holds.
+    """Parse the JSON of a field or body.
 
     Raises:
-        RefusedInputError: The text is not JSON.
+        RefusedInputError: If the text is not JSON.
     """
-    gc.disable()  # it would look at all of a megabyte of lists time and again while they are made: 0.2 s, not 0.04 s
+    gc.disable()  # Otherwise garbage collections while a megabyte of lists is parsed take it from 0.04 s to 0.2 s.
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:

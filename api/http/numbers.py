@@ -9,16 +9,16 @@ from pydantic import BeforeValidator
 
 
 def _digits(text: object) -> object:
-    """Return a text of decimal digits as it is.
+    """Check that a text has decimal digits only, and return it.
 
     Raises:
-        ValueError: The text has anything else: a sign, spaces, underscores, or digits of another script, all of which
-            `int` accepts and other servers in front of this one may read as another number.
+        ValueError: If the text has anything else: a sign, spaces, underscores, or digits of another script. `int`
+            accepts all of these, and other servers in front of this one may read them as another number.
     """
     if isinstance(text, str) and not re.fullmatch("[0-9]+", text):
         raise ValueError("Input should be decimal digits")
     return text
 
 
-#: A whole number that is written in decimal digits and nothing else.
+#: A whole number, written in decimal digits only.
 Digits = Annotated[int, BeforeValidator(_digits)]

@@ -1,4 +1,4 @@
-"""The answer to a dry run: the plan, or events on the way to it for who accepts them."""
+"""Answers to dry runs: the plan as JSON, or progress events followed by the plan."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from api.http.schemas import PlanView
 from service.errors import ServiceError
 
 _EVENTS = "text/event-stream"
-#: For the log alone, as other servers have it.
+#: Status for the log only, as nginx has it: the client has closed the connection.
 _NOBODY_LISTENS = 499
 _EVENT = {
     "type": "object",
@@ -28,7 +28,7 @@ _EVENT = {
     },
 }
 _PLANNING = {"step": 5, "total": 24, "fraction": 0.208, "eta_s": 31.5}
-#: For the OpenAPI document.
+#: Documentation of the answer for the OpenAPI document.
 DRY_RUN: dict[str, Any] = {
     "model": PlanView,
     "description": "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: "
@@ -46,21 +46,21 @@ _log = logging.getLogger(__name__)
 
 
 class Planning(Protocol):
-    """Plans, and tells how far it is."""
+    """Function that makes a plan and reports its progress."""
 
     def __call__(self, show: Any) -> Coroutine[Any, Any, dict[str, Any]]:
-        """What was found; `show` is called with each `planning`."""
+        """Return the plan; call `show` with the data of each `planning` event."""
 
 
 async def answer_plan(request: Request, plan: Planning, workers: int | None) -> Response:
-    """The plan as JSON once it is there; or at once a stream of events, where the request accepts that.
+    """Return the plan as JSON once it is made, or immediately a stream of events if the request accepts one.
 
-    Who closes the connection ends the planning.
+    If the client closes the connection, planning stops.
     """
     if _EVENTS in request.headers.get("accept", ""):
         sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         told: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
-        # started here: what the plan holds is let go of at its end, even if nobody ever asks for the first event
+        # Started here so that the plan releases its resources even if nobody reads the first event.
         task = asyncio.create_task(plan(told.put_nowait))
         task.add_done_callback(lambda _: told.put_nowait(None))
         return StreamingResponse(_events(task, told, workers), 200, sent, _EVENTS)
@@ -76,7 +76,7 @@ async def answer_plan(request: Request, plan: Planning, workers: int | None) -> 
 
 
 async def _left(request: Request) -> None:
-    """Return when the client of a request whose body has been read has closed its connection."""
+    """Return once the client has closed its connection; the body of the request must have been read."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
@@ -88,7 +88,7 @@ def _view(found: Mapping[str, Any], workers: int | None) -> dict[str, Any]:
 async def _events(
     task: asyncio.Task[dict[str, Any]], told: asyncio.Queue[dict[str, Any] | None], workers: int | None
 ) -> AsyncIterator[bytes]:
-    """Yield the events of a plan until it is done; the end of the iteration ends the planning."""
+    """Yield the events of a plan until it is done; ending the iteration stops the planning."""
     try:
         while True:
             try:

@@ -1,4 +1,4 @@
-"""Errors as HTTP has them: RFC 9457 problem documents with a stable `code`."""
+"""Errors as RFC 9457 problem documents with a stable `code`."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from sgsst_core.errors import InvalidInputError
 from sgsst_core.options import renamed_hint
 
 MEDIA_TYPE = "application/problem+json"
-#: 460 is the tus protocol's own.
+#: Names of statuses that HTTPStatus lacks; 460 is the tus protocol's own.
 _TITLES = {460: "Checksum Mismatch"}
 METHODS = ("GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS")
-#: Letters of an input value that a problem repeats.
+#: Maximum number of characters of an input that a problem document repeats.
 _SHOWN = 100
 
 _log = logging.getLogger(__name__)
 
 
 class Problem(BaseModel):
-    """RFC 9457. Programs read `code` and `status`; people read `detail`, which says what to do."""
+    """RFC 9457 problem document. Programs read `code` and `status`; people read `detail`, which says what to do."""
 
     model_config = ConfigDict(
         extra="allow",
@@ -54,19 +54,19 @@ class Problem(BaseModel):
 
 
 class MalformedRequestError(ServiceError):
-    """Bytes that are no HTTP request; said by `api.http.connection`, below the app."""
+    """Bytes that are not an HTTP request. Raised by `api.http.connection`, below the app."""
 
     code, status = "malformed-request", 400
 
 
 class HeadTooLargeError(ServiceError):
-    """A request's line and headers without end; said by `api.http.connection`, below the app."""
+    """A request line and headers that are too long. Raised by `api.http.connection`, below the app."""
 
     code, status = "head-too-large", 431
 
 
 class TooManyConnectionsError(ServiceError):
-    """As many connections as this process takes; said by `api.http.connection`, below the app."""
+    """More connections than this process accepts. Raised by `api.http.connection`, below the app."""
 
     code, status = "too-many-connections", 503
 
@@ -83,14 +83,14 @@ class InternalError(ServiceError):
 def problem(
     status: int, code: str, detail: str, headers: dict[str, str] | None = None, **extra: object
 ) -> JSONResponse:
-    """A problem document as a response."""
+    """Return a problem document as a response."""
     title = _TITLES.get(status) or HTTPStatus(status).phrase
     body = Problem(title=title, status=status, code=code, detail=detail, **extra)
     return JSONResponse(body.model_dump(mode="json"), status, headers, media_type=MEDIA_TYPE)
 
 
 def add_handlers(app: FastAPI) -> None:
-    """Turn every error of the app into a problem document."""
+    """Register handlers that convert every error of the app to a problem document."""
     app.add_exception_handler(ServiceError, _service_error)
     app.add_exception_handler(InvalidInputError, _invalid_input)
     app.add_exception_handler(RequestValidationError, _invalid_request)
@@ -101,7 +101,7 @@ def add_handlers(app: FastAPI) -> None:
 
 
 def from_service(error: ServiceError) -> JSONResponse:
-    """The problem document of an error of the service."""
+    """Return the problem document of a service error."""
     extra = dict(error.extra)
     headers: dict[str, str] = dict(extra.pop("headers", {}))  # type: ignore[call-overload]
     if "retry_after" in extra or error.status in (429, 503, 507):
@@ -139,12 +139,12 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
     code = {404: "not-found", 405: "method-not-allowed"}.get(error.status_code, "http-error")
     headers = dict(error.headers or {})
     if error.status_code == 405:
-        headers["Allow"] = ", ".join(_allowed(request))  # the router names those of the first route alone
+        headers["Allow"] = ", ".join(_allowed(request))  # the router lists only the methods of the first route
     return problem(error.status_code, code, str(error.detail), headers)
 
 
 def _allowed(request: Request) -> list[str]:
-    """The methods that some route of this path has."""
+    """Return the methods that the request's path supports, over all routes."""
     routes = request.app.router.routes
     scopes = {method: {**request.scope, "method": method} for method in METHODS}
     return [method for method in METHODS if any(route.matches(scopes[method])[0] is Match.FULL for route in routes)]

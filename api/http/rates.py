@@ -1,4 +1,4 @@
-"""How many requests a second a holder of a key may send to this process."""
+"""Rate limit of requests per API key, in this process."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Callable
 
 from service.errors import RateLimitError
 
-#: Seconds' worth of requests that may come at once.
+#: Seconds' worth of requests that may arrive at once.
 _BURST_SECONDS = 10.0
-#: Owners that are remembered; who was forgotten has sent nothing for long, or begins with a full measure again.
+#: Maximum number of remembered owners. A forgotten owner starts with a full allowance again.
 _REMEMBERED = 10_000
 
 
 class Rates:
-    """A measure of requests for each owner, which each request takes one from and time fills again."""
+    """Token bucket of requests for each owner."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -25,11 +25,11 @@ class Rates:
         """Count a request.
 
         Args:
-            owner: who sends it.
-            a_second: that the owner may send on average; None for no bound.
+            owner: Owner of the request's key.
+            a_second: Requests per second that the owner may send on average; None for no limit.
 
         Raises:
-            RateLimitError: it comes too soon.
+            RateLimitError: If the owner has used up its allowance.
         """
         if a_second is None:
             return
@@ -40,7 +40,7 @@ class Rates:
         allowed = left >= 1
         self._left[owner] = (left - 1 if allowed else left), now
         if len(self._left) > _REMEMBERED:
-            del self._left[next(iter(self._left))]  # who was heard of longest ago
+            del self._left[next(iter(self._left))]  # the owner that has been silent for longest
         if not allowed:
             raise RateLimitError(
                 f"This key may send {a_second:g} requests a second on average. Wait, and ask less often: jobs tell of "

@@ -1,4 +1,4 @@
-"""Health checks that answer within a second, whatever hangs."""
+"""Health checks that answer within a second, even if a check hangs."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import asyncio
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
-#: Seconds that all checks together may take.
+#: Time limit in seconds for all checks together.
 _SECONDS = 0.8
 
 Check = Callable[[], object]
 
 
 class Readiness:
-    """Checks on threads of their own, which requests cannot occupy.
+    """Health checks, run in threads of their own that requests cannot occupy.
 
-    A check that hangs is not started again before it has ended: however often it is asked for, it takes one thread.
+    A check that hangs is not started again until it has returned, so it never takes more than one thread.
 
     Args:
-        checks: Functions by name; each returns something, or raises.
+        checks: Check functions by name; each returns a value or raises.
     """
 
     def __init__(self, checks: Mapping[str, Check]) -> None:
@@ -27,7 +27,7 @@ class Readiness:
         self._running: dict[str, asyncio.Future[object]] = {}
 
     async def run(self) -> dict[str, object]:
-        """Return what each check has returned or raised; `TimeoutError` for one that has not ended in time."""
+        """Return the result or exception of each check; `TimeoutError` for a check that has not returned in time."""
         running = {name: self._start(name) for name in self._checks}
         await asyncio.wait(running.values(), timeout=_SECONDS)
         return {name: _outcome(future) for name, future in running.items()}
@@ -40,7 +40,7 @@ class Readiness:
         return running
 
     def close(self) -> None:
-        """Wait for no check any longer."""
+        """Cancel waiting checks, without waiting for those that run."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
 

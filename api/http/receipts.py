@@ -1,4 +1,7 @@
-"""What requests bring themselves, charged to their owner from the first byte until it is a job's, or gone."""
+"""Quota charges for the bytes of running requests.
+
+The owner is charged from the first byte until a job takes the files over, or until they are deleted.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,14 @@ from service.files.blobs import Blobs
 from service.store.inputs import GRACE_SECONDS, Inputs
 from service.store.quotas import Quotas
 
-#: Seconds between two renewals; receipts of a process that has died expire with its half files.
+#: Seconds between two renewals. If a process dies, its receipts and partial files expire.
 _RENEWAL_SECONDS = GRACE_SECONDS / 6
 
 _log = logging.getLogger(__name__)
 
 
 class Receipts:
-    """The receipts of this process, which renews them until their requests have ended."""
+    """Receipts of this process. A task renews them until their requests have ended."""
 
     def __init__(self, inputs: Inputs, blobs: Blobs) -> None:
         self.inputs, self.blobs = inputs, blobs
@@ -27,11 +30,11 @@ class Receipts:
         self._renewing: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Start to renew."""
+        """Start the renewing task."""
         self._renewing = asyncio.create_task(self._renew())
 
     def close(self) -> None:
-        """Stop renewing."""
+        """Stop the renewing task."""
         if self._renewing is not None:
             self._renewing.cancel()
 
@@ -45,18 +48,18 @@ class Receipts:
             if self.active:
                 try:
                     await asyncio.to_thread(self.inputs.renew_receipts, list(self.active))
-                except DatabaseUnavailableError:  # they last for several renewals
+                except DatabaseUnavailableError:  # receipts last for several renewals
                     _log.warning("receipts could not be renewed; this is tried again")
 
 
 class Receipt:
-    """The charge for one request, and the hold on the files that it brings.
+    """Charge of one request, which also protects its files from deletion.
 
-    At the end of the `async with` block, files that no job has taken over are deleted, unless others use them.
+    At the end of the `async with` block, files that no job has taken over are deleted unless others use them.
 
     Attributes:
         owner: Owner of the request.
-        id: Id in the store; None as long as nothing is charged.
+        id: Id in the store; None until something is charged.
     """
 
     def __init__(self, receipts: Receipts, owner: str, quotas: Quotas) -> None:
@@ -65,20 +68,20 @@ class Receipt:
         self._charged = self._received = 0
 
     def charge(self, declared: int) -> None:
-        """Charge the bytes that a request declares; 0 for one that does not.
+        """Charge the bytes that a request declares; 0 if it declares none.
 
         Raises:
-            QuotaError: there would be too many.
+            QuotaError: If the owner would exceed the quota.
         """
         self.id = self._receipts.inputs.open_receipt(self.owner, declared, self._quotas)
         self._receipts.active.add(self.id)
         self._charged = declared
 
     def take(self, size: int) -> None:
-        """Count bytes that have come, and charge those that were not declared.
+        """Count received bytes, and charge those that were not declared.
 
         Raises:
-            QuotaError: there would be too many.
+            QuotaError: If the owner would exceed the quota.
         """
         self._received += size
         more = self._received - self._charged
@@ -87,13 +90,13 @@ class Receipt:
             self._charged = self._received
 
     def hand_over(self) -> None:
-        """Note that a job has taken the files over, and with them the charge."""
+        """Record that a job has taken over the files and their charge."""
         if self.id is not None:
             self._receipts.active.discard(self.id)
             self.id = None
 
     def end(self) -> None:
-        """Delete what the request has brought, unless others use it, and stop charging for it."""
+        """Release the charge, and delete the request's files unless others use them."""
         receipt = self.id
         if receipt is not None:
             self.hand_over()

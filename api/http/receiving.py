@@ -1,4 +1,4 @@
-"""The bytes of an upload in parts: written behind what is there, by one request at a time, and saved as they come."""
+"""Bytes of resumable uploads: appended by one request at a time, and saved as they arrive."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from api.http.multipart import BadRequestError, body_blocks
 from service.errors import ServiceError, TooLargeError
 from service.store.tables import UploadRow
 
-#: Of digests that a part may be announced with.
+#: Digest algorithms of `Upload-Checksum`.
 ALGORITHMS = ("sha256", "sha1", "md5")
-#: Bytes after which an upload's state is saved, so that a crash costs no more than these.
+#: Bytes after which an upload's state is saved; a crash loses at most these.
 _SAVE_BYTES = 64 << 20
 
 
 class ChecksumError(ServiceError):
-    """What arrived is not what was sent."""
+    """Received bytes that differ from the bytes that were sent."""
 
     code, status = "checksum-mismatch", 460
 
 
 async def append_body(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
-    """Write the request's body behind what is there; returns when the upload expires now."""
+    """Append the request's body to the upload, and return the upload's new expiry time."""
     writer = await asyncio.to_thread(_Writer, context, row, wanted)
     try:
         try:
@@ -34,7 +34,7 @@ async def append_body(request: Request, context: Context, row: UploadRow, wanted
                 await context.threads.run(row.owner, writer.write, block)
         except ServiceError:
             if wanted is None:
-                await context.threads.run(row.owner, writer.save)  # what has come is good
+                await context.threads.run(row.owner, writer.save)  # the received bytes are valid
             raise
         return await context.threads.run(row.owner, writer.finish)
     finally:
@@ -42,7 +42,7 @@ async def append_body(request: Request, context: Context, row: UploadRow, wanted
 
 
 class _Writer:
-    """Checks what comes, and has it saved now and then."""
+    """Writer that checks received bytes and saves them at intervals."""
 
     def __init__(self, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> None:
         self._context, self._row, self._wanted = context, row, wanted
@@ -65,12 +65,12 @@ class _Writer:
             self.save()
 
     def save(self) -> float:
-        """Make what has come durable, then tell the store."""
+        """Make the received bytes durable, then update the store."""
         self._saved = self._offset
         return self._part.save()
 
     def finish(self) -> float:
-        """The request has ended: check it, save it, and where that was the last part make the file a blob."""
+        """Verify and save the bytes of the request; if the upload is complete, make it a blob."""
         if self._digest is not None and self._wanted is not None and self._digest.digest() != self._wanted[1]:
             self._part.discard()
             raise ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again.")
@@ -85,15 +85,15 @@ class _Writer:
 
 
 def parse_checksum(header: str) -> tuple[str, bytes]:
-    """Algorithm and digest of an Upload-Checksum.
+    """Return the algorithm and the digest of an `Upload-Checksum` header.
 
     Raises:
-        BadRequestError: it is none.
+        BadRequestError: If the header is malformed.
     """
     name, _, value = header.partition(" ")
     if name not in ALGORITHMS:
         raise BadRequestError(f"Upload-Checksum: {name[:20]!r} is none of {', '.join(ALGORITHMS)}.")
     try:
         return name, base64.b64decode(value, validate=True)
-    except ValueError as error:  # also for letters that are not ASCII
+    except ValueError as error:  # raised for non-ASCII characters too
         raise BadRequestError("Upload-Checksum: the digest is not base64.") from error

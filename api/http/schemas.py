@@ -1,4 +1,4 @@
-"""What the API answers with."""
+"""Models of the API's answers."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
 if TYPE_CHECKING:
     StatusName = str
     OutcomeName = str
-else:  # named where they stand in the OpenAPI document, which makes a schema of its own of every enumeration
+else:  # inlined in the OpenAPI document; enumerations would get schemas of their own
     StatusName = Literal[tuple(map(str, JobStatus))]
     OutcomeName = Literal[tuple(map(str, AttemptOutcome))]
 
-#: Points of a job's course that are sent at most.
+#: Maximum number of points of a loss history.
 MOST_POINTS = 512
-#: Of the examples, which tell of one job.
+#: Values of the examples, which all describe one job.
 JOB_ID = "job_1a1fe701a104f943e9d4d8cce5b818c"
 UPLOAD_ID = "upl_1a1fe701a104f943e9d4d8cce5b818c"
 SHA256 = "3158b524aebf9351a4de9039a6b9b799cfc0452d9cec424a9f867085d0a9a7b5"
@@ -32,19 +32,19 @@ _CREATED, _STARTED, _NOW = "2026-11-21T14:06:02.057842Z", "2026-11-21T14:06:05.5
 
 
 def _with_example(**example: Any) -> ConfigDict:
-    """An example for the OpenAPI document."""
+    """Return a model configuration with an example for the OpenAPI document."""
     return ConfigDict(json_schema_extra={"examples": [example]})
 
 
 def _example_of(model: type[BaseModel]) -> dict[str, Any]:
-    """The example of a model, as a part of another's."""
+    """Return the example of a model, for use in another example."""
     extra = model.model_config["json_schema_extra"]
     assert isinstance(extra, dict)
     return extra["examples"][0]  # type: ignore[index, return-value]
 
 
 class ErrorView(BaseModel):
-    """Why a job or an attempt failed."""
+    """Reason why a job or an attempt failed."""
 
     model_config = ConfigDict(
         extra="allow",
@@ -58,7 +58,7 @@ class ErrorView(BaseModel):
 
 
 class ProgressView(BaseModel):
-    """How far a job is."""
+    """Progress of a job."""
 
     model_config = _with_example(
         stage="sos",
@@ -91,7 +91,7 @@ class ProgressView(BaseModel):
 
 
 class ProgressPoint(BaseModel):
-    """How far a job was at a moment."""
+    """Progress of a job at one moment."""
 
     model_config = _with_example(
         attempt=1,
@@ -115,7 +115,7 @@ class ProgressPoint(BaseModel):
 
 
 class ProgressHistory(BaseModel):
-    """The course of a job's loss, the oldest point first."""
+    """Loss history of a job, oldest point first."""
 
     model_config = _with_example(points=[_example_of(ProgressPoint)])
 
@@ -151,7 +151,7 @@ class AttemptView(BaseModel):
 
 
 class Links(BaseModel):
-    """Where to go on."""
+    """Addresses of a job's resources."""
 
     model_config = _with_example(
         self=f"/v1/jobs/{JOB_ID}",
@@ -223,7 +223,7 @@ class JobDetail(JobView):
 
 
 class JobPage(BaseModel):
-    """A page of jobs, the newest first."""
+    """A page of jobs, newest first."""
 
     model_config = _with_example(jobs=[_example_of(JobView)], next_cursor=JOB_ID)
 
@@ -260,7 +260,7 @@ class ArtifactList(BaseModel):
 
 
 class InputFileView(InputView):
-    """A file that a job was created from, and where its bytes are."""
+    """A file that a job was created from, and the address of its content."""
 
     model_config = _with_example(**_example_of(InputView), url=f"/v1/jobs/{JOB_ID}/inputs/scene")
 
@@ -268,7 +268,7 @@ class InputFileView(InputView):
 
 
 class InputList(BaseModel):
-    """The files that a job was created from, in the order in which they came."""
+    """The files that a job was created from, in the order in which they were sent."""
 
     model_config = _with_example(inputs=[_example_of(InputFileView)])
 
@@ -276,7 +276,7 @@ class InputList(BaseModel):
 
 
 class UploadView(BaseModel):
-    """A file that arrives in parts."""
+    """A file that is uploaded in parts."""
 
     model_config = _with_example(
         id=UPLOAD_ID,
@@ -298,7 +298,7 @@ class UploadView(BaseModel):
 
 
 class PlanView(BaseModel):
-    """What a job would do; nothing was queued."""
+    """Plan of a job that was not queued."""
 
     model_config = _with_example(
         gaussians=616,
@@ -342,7 +342,7 @@ class PlanView(BaseModel):
 
 
 class SignIn(BaseModel):
-    """An API key that a browser shows."""
+    """An API key that a browser sends to sign in."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -354,7 +354,7 @@ class SignIn(BaseModel):
 
 
 class SessionView(BaseModel):
-    """Who is asking, as far as a browser needs to know."""
+    """Session state for the browser."""
 
     model_config = _with_example(keys_needed=True, signed_in=True)
 
@@ -363,7 +363,7 @@ class SessionView(BaseModel):
 
 
 class Health(BaseModel):
-    """Whether the service can do its work."""
+    """Health of the service."""
 
     model_config = _with_example(
         status="ok", checks={"database": "ok", "artifacts": "ok", "disk": "ok", "dispatchers": "1"}
@@ -379,7 +379,7 @@ ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, Upload
 
 
 def utc(seconds: float) -> datetime:
-    """A moment, given in seconds since the epoch."""
+    """Return a time in seconds since the epoch as a UTC datetime."""
     return datetime.fromtimestamp(seconds, UTC)
 
 
@@ -388,12 +388,12 @@ def _utc_or_none(seconds: float | None) -> datetime | None:
 
 
 def job_view(job: JobRow, queue_position: int | None, preview: str | None) -> JobView:
-    """A job as the API shows it; `preview` is the name of its newest picture."""
+    """Return a job as the API shows it; `preview` is the name of its newest image."""
     return JobView(**_job_fields(job, queue_position, preview))
 
 
 def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRow], preview: str | None) -> JobDetail:
-    """A job with its attempts."""
+    """Return a job with its attempts."""
     shown = [
         AttemptView(
             number=row.number,
@@ -436,7 +436,7 @@ def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) ->
 
 
 def input_views(job: JobRow) -> list[InputFileView]:
-    """The files that a job was created from."""
+    """Return the files that a job was created from."""
     found, places = [], Counter[str]()
     for entry in job.inputs:
         role, place = entry["role"], places[entry["role"]]
@@ -447,14 +447,14 @@ def input_views(job: JobRow) -> list[InputFileView]:
 
 
 def progress_history(points: list[Point]) -> ProgressHistory:
-    """The course of a job's loss as the API shows it."""
+    """Return the loss history of a job as the API shows it."""
     return ProgressHistory(
         points=[ProgressPoint(**{**asdict(point), "updated_at": utc(point.updated_at)}) for point in points]
     )
 
 
 def poll_seconds(job: JobRow) -> int | None:
-    """After how many seconds it makes sense to ask again; None for a job that has ended."""
+    """Return the seconds after which to poll a job again; None if it has ended."""
     if job.status not in UNFINISHED:
         return None
     left = (job.progress or {}).get("eta_s")
@@ -462,7 +462,7 @@ def poll_seconds(job: JobRow) -> int | None:
 
 
 def artifact_view(row: ArtifactRow) -> ArtifactView:
-    """A result as the API shows it."""
+    """Return a result as the API shows it."""
     return ArtifactView(
         name=row.name,
         size=row.size,
@@ -474,7 +474,7 @@ def artifact_view(row: ArtifactRow) -> ArtifactView:
 
 
 def upload_view(row: UploadRow) -> UploadView:
-    """An upload as the API shows it."""
+    """Return an upload as the API shows it."""
     return UploadView(
         id=row.id,
         filename=row.filename,

@@ -1,4 +1,4 @@
-"""Files as answers: whole or in ranges, with an ETag that is the SHA-256 of their content."""
+"""Files as HTTP responses: whole or in ranges, with the SHA-256 of the content as the ETag."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from api.http.documentation import Responses, headers
 from api.http.schemas import SHA256
 from service.errors import NotFoundError, ServiceError
 
-#: Files of more bytes are checked two at a time, so that neither small files nor other requests wait for them.
+#: Size in bytes above which a file is large, and the limit of two concurrent checks of large files. Small files and
+#: other requests do not wait for them.
 _LARGE_BYTES, _LARGE_CHECKS = 64 << 20, anyio.CapacityLimiter(2)
-#: Letters of a name that is suggested for a file.
+#: Maximum number of characters of a suggested file name.
 _MAX_NAME = 120
 
 IfNoneMatch = Annotated[
@@ -41,7 +42,7 @@ class RangeError(ServiceError):
     code, status = "range-not-satisfiable", 416
 
 
-#: Of every answer that has a file, and as an example of a refused range.
+#: Headers of every answer with a file, and examples of errors.
 _SENT = ("ETag", "Accept-Ranges", "Cache-Control", "Content-Disposition", "X-Content-Type-Options")
 JUST_REMOVED = NotFoundError("The file has just been removed.")
 NO_SUCH_RANGE = RangeError("The file has 42301 bytes.", headers={"Content-Range": "bytes */42301"})
@@ -49,16 +50,16 @@ NO_SUCH_RANGE = RangeError("The file has 42301 bytes.", headers={"Content-Range"
 
 @dataclass(frozen=True)
 class SentFile:
-    """A file that is asked for.
+    """File to send.
 
     Attributes:
-        sha256, size: of its content.
-        name: under which a browser saves it.
-        kind: media type.
-        inline: a browser may show it in place.
+        sha256, size: SHA-256 and size in bytes of the content.
+        name: Suggested name for saving the file.
+        kind: Media type.
+        inline: Whether a browser may show the file inline.
         policy: Content-Security-Policy; None for none.
-        check: proves that the stored file has this content; quick where that has just been done.
-        read: its bytes from one up to another, in pieces.
+        check: Check that the stored file has this content. Fast if it was checked recently.
+        read: Function that yields the bytes from one offset up to another, in pieces.
     """
 
     sha256: str
@@ -72,11 +73,11 @@ class SentFile:
 
 
 def file_answers(begins: dict[str, Any], *, always_policy: bool = False) -> Responses:
-    """What the OpenAPI document says of answers with a file.
+    """Return the OpenAPI documentation of responses with a file.
 
     Args:
-        begins: how files of each media type begin, as examples.
-        always_policy: every file has a Content-Security-Policy.
+        begins: Start of a file's content for each media type, as examples.
+        always_policy: Whether every file has a Content-Security-Policy.
     """
     content = {
         kind: {"schema": {} if "json" in kind else {"type": "string", "format": "binary"}, "example": begin}
@@ -102,12 +103,12 @@ def file_answers(begins: dict[str, Any], *, always_policy: bool = False) -> Resp
 async def send_file(
     request: Request, file: SentFile, range_: str | None, if_range: str | None, if_none_match: str | None
 ) -> Response:
-    """Answer with a file, or with a part of it.
+    """Return the response with a file or a range of it.
 
     Raises:
-        RangeError: the range lies behind the end.
-        NotFoundError: the file has just been removed.
-        LostFileError, DamagedFileError: it is not what its row says; nothing of it is sent.
+        RangeError: If the range starts after the end of the file.
+        NotFoundError: If the file has just been deleted.
+        LostFileError, DamagedFileError: If the stored file does not match its row. Nothing of it is sent.
     """
     tag = f'"{file.sha256}"'
     sent = _headers(file, tag)
@@ -123,12 +124,12 @@ async def send_file(
         return Response(status_code=status, headers=sent, media_type=file.kind)
     await anyio.to_thread.run_sync(file.check, limiter=_LARGE_CHECKS if file.size > _LARGE_BYTES else None)
     body = file.read(start, stop)
-    first = await asyncio.to_thread(_first, body)  # what fails now can still be answered
+    first = await asyncio.to_thread(_first, body)  # an error at this point can still be answered
     return StreamingResponse(chain(first, body), status, sent, file.kind)
 
 
 def _first(body: Iterator[bytes]) -> list[bytes]:
-    """The first piece of a body, where it has one."""
+    """Return the first piece of a body, or nothing if it is empty."""
     try:
         return [piece for piece in (next(body, None),) if piece is not None]
     except FileNotFoundError as error:
@@ -149,8 +150,10 @@ def _headers(file: SentFile, tag: str) -> dict[str, str]:
 
 
 def disposition(name: str, *, inline: bool) -> str:
-    """Content-Disposition with a name that needs no care: plain letters, and where it has others, these beside, as
-    RFC 6266 and RFC 8187 have it. Folders are left out.
+    """Return a Content-Disposition header with a safe file name.
+
+    `filename` has ASCII letters, digits and a few signs; other names follow in `filename*` (RFC 6266, RFC 8187).
+    Folders are removed.
     """
     last = re.sub(r"[\x00-\x1f\x7f-\x9f\"*:<>?|\u202a-\u202e\u2066-\u2069]+", "_", re.split(r"[/\\]", name)[-1])
     last = last[-_MAX_NAME:].strip(" .")
@@ -162,10 +165,10 @@ def disposition(name: str, *, inline: bool) -> str:
 
 
 def _parse_range(text: str, size: int) -> tuple[int, int] | None:
-    """First byte and the one behind the last; None where the header asks for several ranges or makes no sense.
+    """Return the first byte and the one after the last; None if the header is malformed or has several ranges.
 
     Raises:
-        RangeError: the range lies behind the end.
+        RangeError: If the range starts after the end of the file.
     """
     match = re.fullmatch(r"bytes=([0-9]{0,18})-([0-9]{0,18})", text.strip())
     if match is None or match[0] == "bytes=-":

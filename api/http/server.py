@@ -16,12 +16,12 @@ from service.logs import set_up
 from service.private import keep_private
 from service.settings import ServiceSettings
 
-#: Seconds that open requests have to end at a shutdown.
+#: Seconds that open requests have to finish at a shutdown.
 _GRACE = 10
 
 
 def main() -> None:
-    """Serve until SIGTERM, on a socket that the parent process holds open, or on the settings' address."""
+    """Serve until SIGTERM, on the socket of the parent process or on the address of the settings."""
     if os.environ.get("SGSST_DIE_WITH_PARENT"):
         from worker.processes import die_with_parent
 
@@ -29,8 +29,8 @@ def main() -> None:
     settings = ServiceSettings()
     set_up(settings.log_format)
     keep_private(settings)
-    # as a socket, of which the family is known: uvicorn takes a bare descriptor for a Unix socket's and leaves Nagle's
-    # algorithm on, by which every answer waits 40 ms for the client's acknowledgment of its head
+    # A socket object has a known family. uvicorn takes a bare descriptor for a Unix socket and leaves Nagle's algorithm
+    # on, so that every answer waits 40 ms for the client's acknowledgment of its head.
     listeners = [socket.socket(fileno=int(sys.argv[2]))] if sys.argv[1:2] == ["--fd"] else None
     Connection.head_seconds = settings.receive_seconds
     Connection.most = min(settings.max_connections, _affordable_connections())
@@ -58,10 +58,10 @@ def main() -> None:
 def _affordable_connections() -> int:
     """Raise the limit of open files as far as the system allows; return how many connections it is enough for.
 
-    A quarter is kept for files, the database and what is being refused, so that further connections can be answered.
+    A quarter is reserved for files, the database, and connections that are being refused.
     """
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with contextlib.suppress(ValueError, OSError):  # macOS has a limit that getrlimit does not report
+    with contextlib.suppress(ValueError, OSError):  # the limit on macOS is not the one that getrlimit reports
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return sys.maxsize if soft == resource.RLIM_INFINITY else max(1, soft - soft // 4)

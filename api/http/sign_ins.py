@@ -1,4 +1,4 @@
-"""How often somebody may try to sign in with a key that is no good."""
+"""Limit of failed sign-ins per address."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from collections.abc import Callable
 
 from service.errors import ServiceError
 
-#: Tries that fail, within so many seconds, from one address.
+#: Maximum number of failed attempts from one address, and the seconds within which they count.
 MOST_FAILURES, WITHIN_SECONDS = 10, 60.0
-#: Addresses that are remembered; of more, the one that failed longest ago is forgotten.
+#: Maximum number of remembered addresses; beyond it, the one whose last failure is oldest is forgotten.
 _MOST_ADDRESSES = 10_000
 
 
 class TooManyTriesError(ServiceError):
-    """Too many keys that are no good."""
+    """Too many sign-ins with invalid keys."""
 
     code, status = "too-many-tries", 429
 
 
 class SignIns:
-    """Counts failures by address, in this process alone: keys are not to be guessed (256 bits), and a row in the store
-    for each try would be an attack of its own.
+    """Counter of failed sign-ins by address, in the memory of this process.
+
+    It is not in the store: keys of 256 bits cannot be guessed, and a row for each attempt would itself be an attack.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -30,7 +31,7 @@ class SignIns:
         self._failures: OrderedDict[str, deque[float]] = OrderedDict()
 
     def check(self, address: str) -> None:
-        """Raise TooManyTriesError where an address has failed too often of late."""
+        """Raise TooManyTriesError if an address has failed too often recently."""
         found = self._failures.get(address)
         if found is not None and len(found) == MOST_FAILURES:
             left = found[0] + WITHIN_SECONDS - self._clock()
@@ -39,7 +40,7 @@ class SignIns:
                 raise TooManyTriesError(message, retry_after=int(left) + 1)
 
     def failed(self, address: str) -> None:
-        """Note a try that failed."""
+        """Record a failed attempt."""
         self._failures.setdefault(address, deque(maxlen=MOST_FAILURES)).append(self._clock())
         self._failures.move_to_end(address)
         if len(self._failures) > _MOST_ADDRESSES:

@@ -1,8 +1,8 @@
-"""The page at `/`, the API's documentation at `/docs`, and what both load: the files of `api/static`.
+"""Static files of `api/static`: the page at `/` and the API's documentation at `/docs`.
 
-They are read and compressed once, and served from memory. One digest over all of them stands in their address,
-`/static/DIGEST/NAME`: browsers keep them for ever, and modules, which import each other by relative paths, are always
-of one version.
+They are read and compressed once, and served from memory. Their address, `/static/DIGEST/NAME`, has one digest over all
+files, so that browsers can cache them forever. JavaScript modules import each other by relative paths, so all of them
+are of the same version.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from fastapi import FastAPI, Request, Response
 from service.errors import NotFoundError
 
 FOLDER = Path(__file__).parents[1] / "static"
-#: In pages, stands for the address of the files.
+#: Placeholder in pages for the address of the files.
 _PLACE = b"{{static}}"
 _DIGEST_LETTERS = 16
-#: Smaller files are one packet in any case.
+#: Minimum bytes of a file that is compressed: a smaller one fits in one packet anyway.
 _LEAST_PACKED = 1000
 _TEXTS = (".css", ".html", ".js", ".json", ".map", ".md", ".svg", ".txt")
 _KINDS = {
@@ -36,7 +36,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-#: Swagger UI's style sheet has its icons in it.
+#: Swagger UI's style sheet has inline icons.
 DOCS_POLICY = POLICY.replace("img-src 'self' blob:", "img-src 'self' data:")
 _PAGES = {"/": ("index.html", POLICY), "/docs": ("docs.html", DOCS_POLICY)}
 _FOR_EVER = "public, max-age=31536000, immutable"
@@ -44,13 +44,13 @@ _FOR_EVER = "public, max-age=31536000, immutable"
 
 @dataclass(frozen=True)
 class StaticFile:
-    """A file as it is sent.
+    """A file to be served.
 
     Attributes:
-        body: its bytes.
-        packed: the same by gzip; None where that is no gain.
-        digest: SHA-256 of the bytes.
-        kind: media type.
+        body: Content.
+        packed: Content with gzip compression; None if that saves nothing.
+        digest: SHA-256 of the content.
+        kind: Media type.
     """
 
     body: bytes
@@ -61,12 +61,12 @@ class StaticFile:
 
 @dataclass(frozen=True)
 class StaticFiles:
-    """All files.
+    """All static files.
 
     Attributes:
-        digest: of all names and bytes, as it stands in addresses.
-        files: by name, below `/static/DIGEST`.
-        pages: by name, with the files' address filled in.
+        digest: Digest of all names and contents, as used in addresses.
+        files: Files by name below `/static/DIGEST`.
+        pages: Pages by name, with the address of the files filled in.
     """
 
     digest: str
@@ -76,7 +76,7 @@ class StaticFiles:
 
 @cache
 def static_files(folder: Path = FOLDER) -> StaticFiles:
-    """What is in the folder now."""
+    """Read and compress the files of a folder."""
     contents = {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -100,7 +100,7 @@ def _file(name: str, body: bytes) -> StaticFile:
 
 
 def add_static(app: FastAPI) -> None:
-    """Serve all of it. None of it needs a key: it is the same for everybody."""
+    """Add routes for all static files. They require no key, because they are the same for everybody."""
     found = static_files()
 
     async def get_page(request: Request) -> Response:
@@ -138,5 +138,5 @@ def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Re
 
 
 def _takes_gzip(accepted: str) -> bool:
-    """Whether an Accept-Encoding has gzip, and not with `q=0`."""
+    """Return whether an Accept-Encoding header accepts gzip; `q=0` refuses it."""
     return re.search(r"\bgzip\b(?!\s*;\s*q=0(\.0*)?\s*(,|$))", accepted) is not None

@@ -1,4 +1,4 @@
-"""What `POST /v1/jobs` takes, and what it refuses: for the OpenAPI document, which cannot see it in the route."""
+"""OpenAPI documentation of the body and errors of `POST /v1/jobs`, which FastAPI cannot derive from the route."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from service.parameters import JobParameters
 
 
 class JobFromUploads(BaseModel):
-    """A job whose files have been uploaded before (`POST /v1/uploads`)."""
+    """A job from files that are already uploaded (`POST /v1/uploads`)."""
 
     model_config = ConfigDict(
         extra="forbid",

@@ -1,4 +1,4 @@
-"""Threads that write what requests bring: a few for each owner, so that one cannot keep all of them busy."""
+"""Threads that write the bodies of requests, limited per owner so that one owner cannot occupy all of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 from weakref import WeakValueDictionary
 
-#: Threads of one owner at the same time. Files are made durable in them, which takes as long as the disk does.
+#: Maximum number of simultaneous threads of one owner. They wait for the disk to make files durable.
 _OF_AN_OWNER = 2
 
 Arguments = ParamSpec("Arguments")
@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 
 
 class OwnerThreads:
-    """The threads of the event loop's executor, of which each owner has a few."""
+    """Access to the threads of the event loop's executor, a few at a time for each owner."""
 
     def __init__(self) -> None:
         self._free: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
@@ -23,7 +23,7 @@ class OwnerThreads:
     async def run(
         self, owner: str, function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Result:
-        """Call a function in a thread, once fewer than a few of the owner's run; return its result."""
+        """Call a function in a thread as soon as the owner has a free one, and return its result."""
         free = self._free.get(owner)
         if free is None:
             free = self._free[owner] = asyncio.Semaphore(_OF_AN_OWNER)

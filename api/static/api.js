@@ -2,11 +2,11 @@
 /** Requests to the service. */
 import { words } from "./words.js";
 
-/** A refusal, in the service's words. */
+/** Error answer of the service, with its message. */
 export class Problem extends Error {
   /**
    * @param {number} status
-   * @param {any} body of the answer
+   * @param {any} body body of the answer
    */
   constructor(status, body) {
     super(typeof body?.detail === "string" ? body.detail : words.api.status(status));
@@ -20,20 +20,20 @@ export class Problem extends Error {
   }
 }
 
-/** The service cannot be reached. */
+/** Error of a service that cannot be reached. */
 export class Unreachable extends Error {
   constructor() {
     super(words.api.unreachable);
   }
 }
 
-/** Called when a key is needed. @type {() => void} */
+/** Callback for answers that require a key. @type {() => void} */
 let onSignIn = () => {};
 /** @param {() => void} act */
 export const whenKeyIsNeeded = (act) => void (onSignIn = act);
 
 /**
- * An answer that is no refusal.
+ * Send a request, and return its answer if it is not an error.
  *
  * @param {string} method
  * @param {string} path
@@ -64,7 +64,7 @@ export async function ask(method, path, { body, json, headers = {}, signal } = {
  */
 export const get = async (path, signal) => (await ask("GET", path, { signal })).json();
 
-/** Events of an answer that is a stream of them. @param {Response} answer @returns {AsyncGenerator<{event: string, data: any}>} */
+/** Yield the events of an answer that is an event stream. @param {Response} answer @returns {AsyncGenerator<{event: string, data: any}>} */
 export async function* eventsOf(answer) {
   const reader = /** @type {ReadableStream<Uint8Array>} */ (answer.body).pipeThrough(/** @type {any} */ (new TextDecoderStream())).getReader();
   let kept = "";
@@ -82,8 +82,8 @@ export async function* eventsOf(answer) {
   }
 }
 
-/** Of a job. @param {string} id @param {string} name */
+/** Return the path of a job's artifact. @param {string} id @param {string} name */
 export const artifactPath = (id, name) => `/v1/jobs/${encodeURIComponent(id)}/artifacts/${name.split("/").map(encodeURIComponent).join("/")}`;
 
-/** A random key, also where the page has no secure context. */
+/** Return a random key; works in insecure contexts too, where `crypto.randomUUID` is missing. */
 export const randomKey = () => Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");

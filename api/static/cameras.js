@@ -1,5 +1,5 @@
 // @ts-check
-/** Cameras of a job, as files have them, and the ring around an object; drawn as small frames. */
+/** Cameras of a job: read from files, or on a ring around an object; and the lines that draw them as small frames. */
 import { cross, difference, dot, sum, times, unit } from "./viewer/vectors.js";
 import { words } from "./words.js";
 
@@ -10,7 +10,7 @@ import { words } from "./words.js";
  */
 
 /**
- * What the page can read of camera files; the service reads more, and has the last word.
+ * Read the cameras of camera files. The service supports more formats, and its reading is the one that counts.
  *
  * @param {{name: string, blob: Blob}[]} files
  * @returns {Promise<JobCamera[]>}
@@ -94,7 +94,8 @@ function checked(camera) {
 }
 
 /**
- * About the ring that the service chooses for `orbit`: it knows the subject better.
+ * Return an approximate preview of the cameras of `orbit`. The service computes the actual ring from a better estimate
+ * of the subject.
  *
  * @param {{center: Vector, radius: number, low: Vector, high: Vector}} middle
  * @param {{count: number, up: Vector, elevation: number, radius?: number}} ring elevation in degrees
@@ -114,10 +115,10 @@ export function ringCameras(middle, { count, up, elevation, radius }) {
 }
 
 /**
- * Small frames as pairs of points.
+ * Return the lines of small camera frames, as pairs of points.
  *
  * @param {JobCamera[]} cameras
- * @param {number} size of a frame, world units
+ * @param {number} size size of a frame, world units
  */
 export function cameraLines(cameras, size) {
   const points = new Float32Array(cameras.length * 8 * 2 * 3);
@@ -140,7 +141,7 @@ export function cameraLines(cameras, size) {
 }
 
 /**
- * How large frames are drawn that stand about a scene.
+ * Return the size for the frames of cameras around a scene, in world units.
  *
  * @param {JobCamera[]} cameras
  * @param {{center: Vector, radius: number} | null} middle
@@ -151,7 +152,7 @@ export function frameSize(cameras, middle) {
   return 0.08 * (away[away.length >> 1] || 1);
 }
 
-/** The direction that the cameras take for up. @param {JobCamera[]} cameras @returns {Vector} */
+/** Return the mean up direction of cameras. @param {JobCamera[]} cameras @returns {Vector} */
 export function upOf(cameras) {
   const total = cameras.map(({ axes }) => times(axes[1], -1)).reduce(sum, [0, 0, 0]);
   return dot(total, total) > 1e-6 ? unit(total) : [0, -1, 0];

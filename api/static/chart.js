@@ -1,5 +1,5 @@
 // @ts-check
-/** Loss against seconds, on logarithmic axes. */
+/** Chart of the loss over time, on logarithmic axes. */
 import { h, put, svg } from "./dom.js";
 import { rough, words } from "./words.js";
 
@@ -8,7 +8,7 @@ import { rough, words } from "./words.js";
 const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 12, BOTTOM = 34;
 
 /**
- * Values of a logarithmic axis: 1, 2 and 5 of each decade where there are few decades.
+ * Return the values to label on a logarithmic axis; the fewer decades, the more values in each.
  *
  * @param {number} low
  * @param {number} high

@@ -1,5 +1,5 @@
 // @ts-check
-/** Two runs of one scene on the sides of the wipe. */
+/** View that compares two runs of one scene, on both sides of the wipe. */
 import { get } from "./api.js";
 import { h, put } from "./dom.js";
 import { ResultStage } from "./result_stage.js";

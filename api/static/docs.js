@@ -9,5 +9,5 @@ SwaggerUIBundle({
   deepLinking: true,
   presets: [SwaggerUIBundle.presets.apis],
   layout: "BaseLayout",
-  validatorUrl: null, // else the document would be sent to a validator on the internet
+  validatorUrl: null, // otherwise the document would be sent to a validator on the internet
 });

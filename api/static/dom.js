@@ -1,16 +1,16 @@
 // @ts-check
-/** Elements, made without any text being read as markup. */
+/** Creation of DOM elements; text is never parsed as markup. */
 
 /** @typedef {Node | string | number | null | undefined | false} Child */
 
 const SVG = "http://www.w3.org/2000/svg";
 
 /**
- * An element: `h("p.note", {id: "x", onclick}, "text", child)`. Properties that the element has are set, functions of
- * `on...` listen, all others become attributes.
+ * Create an element: `h("p.note", {id: "x", onclick}, "text", child)`. Properties of the element are set, `on...`
+ * functions become event listeners, and all others become attributes.
  *
  * @template {keyof HTMLElementTagNameMap} K
- * @param {K | string} name with classes behind dots
+ * @param {K | string} name tag, with classes after dots
  * @param {Record<string, any> | Child | Child[]} [properties]
  * @param {...(Child | Child[])} children
  * @returns {any}
@@ -26,7 +26,7 @@ export function h(name, properties, ...children) {
 }
 
 /**
- * The same for SVG, whose properties are all attributes.
+ * Create an SVG element; all properties become attributes.
  *
  * @param {string} name
  * @param {Record<string, any>} [properties]
@@ -57,7 +57,7 @@ function fill(made, properties, children, set) {
 }
 
 /**
- * Put children in the place of those that are there.
+ * Replace the children of an element.
  *
  * @param {Element} element
  * @param {...(Child | Child[])} children
@@ -69,10 +69,10 @@ export function put(element, ...children) {
 }
 
 let last = 0;
-/** An id that no other element has. */
+/** Return an id that no other element has. */
 export const newId = () => `i${++last}`;
 
-/** Paths of 20 x 20 pictures, drawn with lines. */
+/** Paths of icons of 20 x 20 units, drawn as lines. */
 const ICONS = {
   home: "M4 9.5 10 4l6 5.5M6 8.5V16h8V8.5",
   picture: "M3 6h3l1.5-2h5L14 6h3v10H3zM10 8.2a2.8 2.8 0 1 0 0 5.6 2.8 2.8 0 0 0 0-5.6",
@@ -88,7 +88,7 @@ const ICONS = {
 export const icon = (name) =>
   svg("svg.icon", { viewBox: "0 0 20 20", "aria-hidden": "true", focusable: "false" }, svg("path", { d: ICONS[name] }));
 
-/** Say something to who cannot see it. @param {string} text */
+/** Announce a text to users of screen readers. @param {string} text */
 export function announce(text) {
   const region = document.querySelector("#said");
   if (region) region.textContent = text;

@@ -1,5 +1,5 @@
 // @ts-check
-/** One job: how far it is, how the loss falls, what was decided; and when it is done, before and after in 3D. */
+/** View of one job: progress, loss and plan while it runs, and the result in 3D afterwards. */
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { LossChart } from "./chart.js";
 import { announce, h, icon, put } from "./dom.js";
@@ -9,7 +9,7 @@ import { size, time, words } from "./words.js";
 
 const say = words.job;
 const UNFINISHED = new Set(["queued", "starting", "running", "canceling"]), RETRIED = new Set(["failed", "canceled"]);
-/** Milliseconds after which a lost stream is begun anew by hand. */
+/** Milliseconds after which a lost stream is reopened by the page. */
 const AGAIN = 3000;
 
 /** @param {string} status */
@@ -73,7 +73,7 @@ export class JobView {
     }
   }
 
-  /** Events as they come. The browser comes back by itself, and says which one was its last. */
+  /** Watch the events of the job. The browser reconnects by itself, and sends the id of the last event. */
   watch() {
     if (this.leaving.signal.aborted) return;
     const source = (this.source = new EventSource(`/v1/jobs/${this.id}/events`));
@@ -89,7 +89,7 @@ export class JobView {
     source.addEventListener("status", (event) => this.onStatus(JSON.parse(event.data)));
   }
 
-  /** A stream that the server refused is not begun by the browser again. */
+  /** Reopen a stream that the server has refused; the browser does not retry those. */
   async watchAgain() {
     try {
       await this.refresh();
@@ -111,7 +111,7 @@ export class JobView {
   onProgress(progress) {
     this.chart.add([progress]);
     const known = this.job.progress?.updated_at;
-    if (known && progress.updated_at < known) return; // told again after a reload
+    if (known && progress.updated_at < known) return; // already shown before a reload
     this.job.progress = progress;
     this.updateState();
   }
@@ -201,7 +201,7 @@ export class JobView {
     put(this.error, h("p", error instanceof Error ? error.message : String(error)));
   }
 
-  /** @param {string} name of a preview */
+  /** @param {string} name name of a preview */
   showPreview(name) {
     if (this.result || (this.preview && name <= this.preview)) return;
     this.preview = name;
@@ -235,7 +235,7 @@ export class JobView {
       this.plan.hidden = false;
       put(this.plan, h("h2", words.plan.decided), decisions(plan.decisions ?? []));
     } catch {
-      // the plan is an extra
+      // the job is shown without its plan
     }
   }
 
@@ -255,7 +255,7 @@ export class JobView {
       h("details.fold", h("summary", say.settings), h("dl.facts", told.map(([name, value]) => fact(name.replaceAll("_", " "), typeof value === "object" ? JSON.stringify(value) : String(value))))));
   }
 
-  /** @param {Set<string>} names of artifacts */
+  /** @param {Set<string>} names names of artifacts */
   showResult(names) {
     this.result = new ResultStage([this.job], { signal: this.leaving.signal });
     const stage = h("div", this.result.element), sheet = h("figure.sheet", { hidden: true });
@@ -270,7 +270,7 @@ export class JobView {
     put(this.show, h("div.row.tabs", picker, this.compareLink()), tabs.map(([, body]) => body));
   }
 
-  /** Other finished runs of the same scene. */
+  /** Create a link to compare this job with other finished runs of the same scene. */
   compareLink() {
     const chooser = h("select", { "aria-label": say.compareWith, hidden: true, onchange: () => chooser.value && (location.hash = `#/compare/${this.id}/${chooser.value}`) });
     const scene = this.job.inputs.find((/** @type {any} */ input) => input.role === "scene")?.sha256;
@@ -291,7 +291,7 @@ export class JobView {
 }
 
 /**
- * A button that asks once more.
+ * Create a button that asks for confirmation.
  *
  * @param {string} name
  * @param {() => Promise<void>} act

@@ -1,5 +1,5 @@
 // @ts-check
-/** All jobs: pictures, names, what became of them. */
+/** View of all jobs: their images, names and states. */
 import { artifactPath, ask, get } from "./api.js";
 import { announce, h, put } from "./dom.js";
 import { badge, deleteButton } from "./job.js";
@@ -8,7 +8,7 @@ import { percent, time, words } from "./words.js";
 
 const say = words.jobs;
 const UNFINISHED = ["queued", "starting", "running", "canceling"];
-/** Milliseconds between two looks while something runs, and else. */
+/** Milliseconds between polls while a job runs, and otherwise. */
 const OFTEN = 3000, SELDOM = 20000;
 const PAGE = 60;
 
@@ -44,7 +44,7 @@ export class JobsView {
       const known = new Map(this.jobs.map((job) => [job.id, job]));
       for (const job of found.jobs) known.set(job.id, job);
       const newest = new Set(found.jobs.map((/** @type {any} */ job) => job.id)), last = found.jobs.at(-1)?.id ?? "";
-      // what should be on this page and is not was deleted
+      // a job that should be on this page of the list, but is not, was deleted
       this.jobs = [...known.values()].filter((job) => more || newest.has(job.id) || (found.next_cursor && job.id < last)).sort((a, b) => (a.id < b.id ? 1 : -1));
       if (more || !this.cursor) this.cursor = found.next_cursor;
       this.problem.hidden = true;
@@ -78,7 +78,7 @@ export class JobsView {
     this.compare.disabled = this.chosen.size !== 2;
   }
 
-  /** A card is made anew only when its job has changed. @param {any} job */
+  /** Return the card of a job; it is rebuilt only if the job has changed. @param {any} job */
   card(job) {
     const told = JSON.stringify([job.status, job.preview, job.progress?.fraction, job.queue_position, job.name]), known = this.cards.get(job.id);
     if (known?.told === told || known?.element.contains(document.activeElement)) return known.element;

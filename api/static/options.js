@@ -1,14 +1,14 @@
 // @ts-check
-/** Inputs for a job's parameters, made of what the API's own document says of them. */
+/** Inputs for a job's parameters, generated from the API's OpenAPI document. */
 import { h, newId } from "./dom.js";
 import { words } from "./words.js";
 
 /**
  * @typedef {{name: string, title: string, help: string, element: HTMLElement, value: () => any, set: (value: any) => void, wrong: (text: string) => void}} Control
- *   `value` is undefined where it is left to the preset
+ *   `value` is undefined if the preset decides
  */
 
-/** @param {any} schema @returns {any[]} what it may be, but for null */
+/** @param {any} schema @returns {any[]} alternatives of a type, without null */
 const variants = (schema) => (schema.anyOf ?? [schema]).filter((/** @type {any} */ each) => each.type !== "null");
 /** @param {any} schema */
 const choices = (schema) => (schema.const !== undefined ? [schema.const] : (schema.enum ?? []));
@@ -22,7 +22,7 @@ export const titleOf = (name) => {
 
 /**
  * @param {string} name
- * @param {any} schema of the parameter
+ * @param {any} schema schema of the parameter
  * @param {{title?: string, hint?: boolean}} [how]
  * @returns {Control}
  */
@@ -83,7 +83,7 @@ function inputFor(kinds, fallback, id) {
 }
 
 /**
- * A holder whose id and descriptions are its input's.
+ * Make the id and the description of a wrapper those of its input.
  *
  * @param {any} holder
  * @param {HTMLInputElement} input

@@ -1,5 +1,5 @@
 // @ts-check
-/** The page: its frame, its views by address, and who is signed in. */
+/** The page: its frame, the view for each address, and the session. */
 import { ask, get, whenKeyIsNeeded } from "./api.js";
 import { CompareView } from "./compare.js";
 import { announce, h, icon, put } from "./dom.js";

@@ -1,11 +1,11 @@
 // @ts-check
-/** What a plan says: figures, and what is left out and why. */
+/** Presentation of a plan: predicted cost, what is skipped, and why. */
 import { h } from "./dom.js";
 import { count, seconds, size, words } from "./words.js";
 
 const say = words.plan;
 
-/** @param {any} view the answer to a dry run */
+/** @param {any} view answer to a dry run */
 export function costCard(view) {
   const figure = (/** @type {string} */ name, /** @type {string} */ value, note = "") => h("div", h("dt", name), h("dd", value, note && h("small", note)));
   return h("section.card.cost", { "aria-label": say.title }, h("h2", say.title),

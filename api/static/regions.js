@@ -1,5 +1,5 @@
 // @ts-check
-/** Regions of a scene: each with a painting of its own, or left as it is. */
+/** Regions of a scene, each with its own style or frozen. */
 import { h, icon, newId, put } from "./dom.js";
 import { words } from "./words.js";
 
@@ -39,7 +39,7 @@ export class RegionList {
     name.focus();
   }
 
-  /** @param {string[]} names of the style files */
+  /** @param {string[]} names names of the style files */
   setStyles(names) {
     this.styles = names;
     this.rows.forEach((row) => row.setStyles(names));

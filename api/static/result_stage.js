@@ -1,5 +1,5 @@
 // @ts-check
-/** Runs of one scene in 3D: the original and each run's colors, two of them on the sides of the wipe. */
+/** Results of one scene in 3D: the original and the colors of each run, two of them on the sides of the wipe. */
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { h, put } from "./dom.js";
@@ -12,7 +12,7 @@ const say = words.viewer;
 
 export class ResultStage {
   /**
-   * @param {any[]} jobs finished runs; the scene is the first one's
+   * @param {any[]} jobs finished runs; the scene is that of the first one
    * @param {{signal: AbortSignal}} how
    */
   constructor(jobs, { signal }) {
@@ -23,7 +23,7 @@ export class ResultStage {
     this.right = this.chooser(say.right);
     this.pickers = h("div.row.sides", { hidden: jobs.length < 2 }, this.left.element, this.right.element);
     this.element = h("div.result-stage", this.pickers, this.stage.element);
-    /** What can stand on a side. @type {Map<string, {name: string, side: Side}>} */
+    /** Choices for each side of the wipe. @type {Map<string, {name: string, side: Side}>} */
     this.choices = new Map();
     if (this.stage.viewer) {
       this.stage.viewer.onReload = () => this.load();
@@ -40,7 +40,7 @@ export class ResultStage {
   async load() {
     const { viewer } = this.stage, [first] = this.jobs;
     if (!viewer) return;
-    for (const { side } of this.choices.values()) side.scene.worker.terminate(); // of a device that went away
+    for (const { side } of this.choices.values()) side.scene.worker.terminate(); // workers of a lost GPU context
     this.choices.clear();
     this.original = undefined;
     viewer.background = first.parameters.background ?? [0, 0, 0];
@@ -61,7 +61,7 @@ export class ResultStage {
       const blobs = await Promise.all(files.map(async (/** @type {any} */ file) => ({ name: file.name, blob: await (await ask("GET", `${here}/${file.role}`, { signal: this.signal })).blob() })));
       this.stage.setCameras(await readCameras(blobs), { stand: true });
     } catch {
-      // without cameras there is the free view
+      // without cameras, the view is free
     }
   }
 
@@ -77,12 +77,12 @@ export class ResultStage {
       this.original = scene;
       this.choices.set("original", { name: say.original, side: { scene, colors: "own" } });
     } catch {
-      scene.end(); // a form that cannot be shown: what came out of it is shown alone
+      scene.end(); // this format cannot be shown in a browser: only the result is
       viewer.sides = null;
     }
   }
 
-  /** The camera stands rightly once the scene's middle is known. */
+  /** Move to the current camera again once the scene's center is known, since its target depends on that. */
   standFirst() {
     const { viewer, stood } = this.stage;
     if (viewer && stood >= 0 && !viewer.touched) this.stage.stand(stood, false);
@@ -138,6 +138,6 @@ export class ResultStage {
   }
 }
 
-/** @param {any} job @returns {string} digest of its scene */
+/** @param {any} job @returns {string} digest of the job's scene */
 export const sceneOf = (job) => job.inputs.find((/** @type {any} */ input) => input.role === "scene")?.sha256 ?? job.id;
 

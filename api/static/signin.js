@@ -1,5 +1,7 @@
 // @ts-check
-/** Where a key is entered. The page never keeps it: the service answers with a cookie that scripts cannot read. */
+/**
+ * View for entering an API key. The page never stores it: the service answers with a cookie that scripts cannot read.
+ */
 import { ask, Problem } from "./api.js";
 import { h, newId } from "./dom.js";
 import { words } from "./words.js";

@@ -1,5 +1,5 @@
 // @ts-check
-/** Places for files: chosen, dropped, shown by name, taken out again. */
+/** Slots for a job's files, which can be chosen or dropped, are listed by name, and can be removed. */
 import { h, icon, newId, put } from "./dom.js";
 import { showWrong } from "./options.js";
 import { size, words } from "./words.js";
@@ -88,7 +88,7 @@ export class Slot {
 const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp)$/i, SCENE = /\.(ply|spz|splat)$/i, CAMERAS = /\.(json|bin|txt)$/i;
 
 /**
- * Which slot dropped files belong to. One or two pictures are paintings; more are photos.
+ * Sort dropped files into slots. Up to four images are styles; more are photos.
  *
  * @param {File[]} files
  * @returns {{scene: File[], style: File[], cameras: File[], photos: File[], unknown: File[]}}
@@ -102,7 +102,7 @@ export function sorted(files) {
   };
 }
 
-/** Files of a drop, those in folders too. @param {DataTransfer} data @returns {Promise<File[]>} */
+/** Return the files of a drop, including those in folders. @param {DataTransfer} data @returns {Promise<File[]>} */
 export async function droppedFiles(data) {
   const entries = [...data.items].map((item) => item.webkitGetAsEntry?.()).filter((entry) => entry);
   if (!entries.some((entry) => entry?.isDirectory)) return [...data.files];

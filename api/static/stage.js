@@ -1,5 +1,5 @@
 // @ts-check
-/** The 3D view with everything that belongs to it: wipe, cameras, pictures, messages. */
+/** 3D view with its controls: wipe, cameras, screenshots and messages. */
 import { announce, h, icon, newId, put } from "./dom.js";
 import { cameraLines, frameSize, upOf } from "./cameras.js";
 import { Controls } from "./viewer/controls.js";
@@ -63,7 +63,7 @@ export class Stage {
       h("div.buttons", button("home", say.home, () => this.home()), button("picture", say.screenshot, () => this.save()), button("full", say.full, () => this.full()), help));
   }
 
-  /** The viewer has news. */
+  /** Update the stage after a change in the viewer. */
   told() {
     const { viewer } = this;
     if (!viewer) return;
@@ -99,7 +99,7 @@ export class Stage {
     else this.viewer.wipe(0);
   }
 
-  /** @param {number} share of the width that shows the left side */
+  /** @param {number} share fraction of the width that shows the left side */
   setWipe(share) {
     this.share = share;
     this.viewer?.wipe(share);
@@ -110,7 +110,7 @@ export class Stage {
     this.rightName.classList.toggle("gone", share > 0.92);
   }
 
-  /** @param {number} x of the pointer in the window */
+  /** @param {number} x x of the pointer in the window */
   wipeTo(x) {
     const { left, width } = this.canvas.getBoundingClientRect();
     this.setWipe(Math.max(0, Math.min(1, (x - left) / width)));
@@ -124,7 +124,7 @@ export class Stage {
 
   /**
    * @param {JobCamera[]} cameras
-   * @param {{frames?: boolean, stand?: boolean}} [how] draw them in the scene, go to the first
+   * @param {{frames?: boolean, stand?: boolean}} [how] `frames`: draw them in the scene; `stand`: move to the first one
    */
   setCameras(cameras, { frames = false, stand = false } = {}) {
     this.cameras = cameras;
@@ -148,8 +148,8 @@ export class Stage {
   }
 
   /**
-   * @param {number} index of a camera; others come after the last one
-   * @param {boolean} [aloud]
+   * @param {number} index index of a camera; wraps around
+   * @param {boolean} [aloud] announce the camera to screen readers
    */
   stand(index, aloud = true) {
     const { viewer, cameras } = this;

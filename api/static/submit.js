@@ -1,5 +1,5 @@
 // @ts-check
-/** A new job: files, what it looks like, what it would cost, and off it goes. */
+/** View for a new job: its files, a preview, its predicted cost, and submission. */
 import { ask, eventsOf, get, Problem, randomKey } from "./api.js";
 import { readCameras, ringCameras } from "./cameras.js";
 import { announce, h, icon, newId, put } from "./dom.js";
@@ -14,12 +14,12 @@ import { percent, words } from "./words.js";
 /** @typedef {import("./options.js").Control} Control */
 
 const say = words.submit;
-/** Options that stand in the open, and those that have a place of their own. */
+/** Options that are always visible, and those with an input elsewhere on the page. */
 const MAIN = ["resolution", "views", "content_weight", "max_seconds"], PLACED = new Set(["preset", "orbit", "up", "elevation", "radius", "style_weights", "regions", ...MAIN]);
 const DRAFT = "sgsst.draft";
 const UPS = /** @type {Record<string, number[]>} */ ({ x: [1, 0, 0], "-x": [-1, 0, 0], y: [0, 1, 0], "-y": [0, -1, 0], z: [0, 0, 1], "-z": [0, 0, -1] });
 
-/** Uploads that go on while other views are shown would need a place to be seen: a view that ends stops its own. */
+/** View of a new job. When it ends, its uploads stop: other views have no place to show them. */
 export class SubmitView {
   constructor() {
     this.title = say.title;
@@ -152,7 +152,7 @@ export class SubmitView {
     try {
       sessionStorage.setItem(DRAFT, JSON.stringify({ values, preset: this.preset, orbiting: this.orbiting }));
     } catch {
-      // a private window may keep nothing
+      // private windows may have no storage
     }
   }
 
@@ -274,7 +274,7 @@ export class SubmitView {
     return [ringCameras(middle, { count: number || 24, up, elevation: this.controls.get("elevation")?.value() ?? 10, radius: this.controls.get("radius")?.value() }), told];
   }
 
-  /** What was planned is of other files. */
+  /** Discard the displayed plan, which was made for other files or parameters. */
   refresh() {
     if (this.result && !this.busy) put(this.result);
     this.clearWrong();
@@ -304,7 +304,7 @@ export class SubmitView {
     return values;
   }
 
-  /** What can be told without the service. */
+  /** Mark the slots of missing inputs, as far as the page can check them. Return whether there are any. */
   missing() {
     const { scene, style, cameras } = this.slots;
     /** @type {[Slot, string, boolean][]} */
@@ -315,7 +315,7 @@ export class SubmitView {
     return wrong.length > 0;
   }
 
-  /** @param {boolean} dry ask only what it would cost */
+  /** @param {boolean} dry whether to plan only */
   async act(dry) {
     if (this.busy) return;
     this.clearWrong();
@@ -343,7 +343,7 @@ export class SubmitView {
     if (busy) put(this.result);
   }
 
-  /** Upload what the service has not; the body of `POST /v1/jobs`. */
+  /** Upload the files that the service lacks, and return the body of `POST /v1/jobs`. */
   async send() {
     const { scene, style, cameras, photos } = this.slots, files = this.orbiting ? [] : [cameras.files, photos.files];
     const all = [scene.files, style.files, ...files].flat();
@@ -420,7 +420,7 @@ export class SubmitView {
     location.hash = `#/jobs/${job.id}`;
   }
 
-  /** Say it beside what it is about. @param {unknown} error */
+  /** Show an error beside the input that caused it. @param {unknown} error */
   refuse(error) {
     const text = error instanceof Error ? error.message : String(error);
     if (error instanceof Problem) {

@@ -1,12 +1,14 @@
 // @ts-check
-/** Files sent in parts (tus 1.0): what has arrived is not sent again, after a pause, a lost connection or a reload. */
+/**
+ * Uploads in parts (tus 1.0). Parts that have arrived are not sent again after a pause, a lost connection or a reload.
+ */
 import { ask, Problem, Unreachable } from "./api.js";
 import { words } from "./words.js";
 
 const TUS = { "Tus-Resumable": "1.0.0" };
 const KEPT = "sgsst.uploads", MOST_KEPT = 60;
 const SMALLEST = 1 << 20, LARGEST = 1 << 26;
-/** A part should take about so many milliseconds. */
+/** Target duration of a part in milliseconds. */
 const PART = 1500;
 const SAMPLES = 64, SAMPLE = 4096;
 
@@ -33,20 +35,20 @@ function keep(print, upload) {
   try {
     localStorage.setItem(KEPT, JSON.stringify(Object.fromEntries(Object.entries(all).slice(-MOST_KEPT))));
   } catch {
-    // without a place to keep it, a reload begins anew
+    // without storage, an upload restarts after a reload
   }
 }
 
-/** What was begun and not finished. @returns {Kept[]} */
+/** Return uploads that were started and not finished. @returns {Kept[]} */
 export const unfinished = () => Object.values(kept()).filter(({ sent, size }) => sent > 0 && sent < size);
 
-/** Forget what was begun. */
+/** Forget all unfinished uploads. */
 export const forgetUnfinished = () => {
   for (const [print, { sent, size }] of Object.entries(kept())) if (sent < size) keep(print, null);
 };
 
 /**
- * By what a file is known again: name, size, when it was changed, and samples of what is in it.
+ * Return a fingerprint of a file, from its name, its size, its modification time and samples of its content.
  *
  * @param {File} file
  */
@@ -68,7 +70,7 @@ export async function fingerprint(file) {
 export class Upload {
   /**
    * @param {File} file
-   * @param {() => void} told the state has changed
+   * @param {() => void} told called after each change of the state
    */
   constructor(file, told) {
     this.file = file;
@@ -77,7 +79,7 @@ export class Upload {
     /** @type {State} */
     this.state = "waiting";
     this.id = "";
-    /** Nothing had to be sent: the service has it. */
+    /** Whether the service already had the file, so that nothing was sent. */
     this.known = false;
     this.part = SMALLEST;
     /** @type {AbortController | null} */
@@ -105,7 +107,7 @@ export class Upload {
     this.goOn?.();
   }
 
-  /** Give it up; what has arrived stays for a later attempt. */
+  /** Stop the upload; parts that have arrived remain for a later attempt. */
   stop() {
     this.over = true;
     this.sending?.abort();
@@ -113,7 +115,7 @@ export class Upload {
   }
 
   /**
-   * Send what is missing.
+   * Send the missing parts.
    *
    * @returns {Promise<string>} the upload's id
    */
@@ -164,7 +166,7 @@ export class Upload {
     while (this.state === "paused" && !this.over) await new Promise((done) => (this.goOn = () => done(null)));
   }
 
-  /** Where to go on; begins an upload where there is none. */
+  /** Find the offset from which to resume, or create an upload if there is none. */
   async findOffset() {
     const { file } = this;
     if (this.id) {
@@ -205,10 +207,10 @@ export class Upload {
 }
 
 /**
- * Send files, some side by side.
+ * Send files, some of them concurrently.
  *
  * @param {Upload[]} uploads
- * @returns {Promise<string[]>} ids, in their order
+ * @returns {Promise<string[]>} ids, in the order of `uploads`
  */
 export async function sendAll(uploads, together = 3) {
   const ids = /** @type {string[]} */ (new Array(uploads.length)), waiting = uploads.map((_, i) => i);

@@ -1,5 +1,5 @@
 // @ts-check
-/** Every word of the page that is not the service's own. */
+/** All texts of the page that do not come from the service. */
 
 const number = new Intl.NumberFormat("en");
 const one = new Intl.NumberFormat("en", { maximumFractionDigits: 1 });

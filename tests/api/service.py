@@ -1,4 +1,4 @@
-"""The service as a user starts it, for tests: real processes, a folder of their own, any free port."""
+"""The service as a user starts it, for tests: real processes, a folder of its own, and any free port."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from api.http.app import create_app
 from service.settings import ServiceSettings
 
 ROOT = Path(__file__).resolve().parents[2]
-#: How long a test waits for anything before it fails; none of them measures how long it took.
+#: Seconds that a test waits for anything before it fails. No test measures time.
 PATIENCE = 180.0
-#: Short times, so that tests see in seconds what takes minutes otherwise.
+#: Short intervals, so that tests see within seconds what otherwise takes minutes.
 SETTINGS = {
     "SGSST_MIN_FREE_BYTES": "0",
     "SGSST_LEASE_SECONDS": "20",
@@ -51,7 +51,7 @@ class Service:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> Service:
-        """Start it, and wait until it is ready."""
+        """Start the service, and wait until it is ready."""
         self.environment["SGSST_PORT"] = self.environment.get("SGSST_PORT") or str(_free_port())
         self.url = f"http://127.0.0.1:{self.environment['SGSST_PORT']}"
         with self.log.open("ab") as log:
@@ -62,11 +62,11 @@ class Service:
         return self
 
     def said(self) -> str:
-        """The end of its log."""
+        """Return the end of the service's log."""
         return self.log.read_text(errors="replace")[-3000:]
 
     def ready(self) -> bool:
-        """Whether it answers."""
+        """Return whether the service is ready."""
         assert self._process is not None
         assert self._process.poll() is None, f"the service has ended:\n{self.said()}"
         try:
@@ -75,12 +75,12 @@ class Service:
             return False
 
     def client(self, key: str | None = None) -> httpx.Client:
-        """To talk to it."""
+        """Return an HTTP client of the service."""
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         return httpx.Client(base_url=self.url, headers=headers, timeout=60)
 
     def processes(self, module: str) -> list[psutil.Process]:
-        """Those below it that run a module, or have such a title."""
+        """Return the service's processes that run a module or have its name as title."""
         assert self._process is not None
         try:
             family = [psutil.Process(self._process.pid), *psutil.Process(self._process.pid).children(recursive=True)]
@@ -97,16 +97,16 @@ class Service:
         return found
 
     def process(self, module: str) -> psutil.Process | None:
-        """The first one of `processes`."""
+        """Return the first of `processes`."""
         return next(iter(self.processes(module)), None)
 
     def kill(self, module: str) -> None:
-        """SIGKILL a process below it."""
+        """Kill a process of the service with SIGKILL."""
         process = wait_for(lambda: self.process(module), f"a process {module}", self.said)
         process.send_signal(signal.SIGKILL)
 
     def survivors(self) -> list[psutil.Process]:
-        """Whatever lives of it and of all that it has started, in whatever session."""
+        """Return all processes that the service has started and that are still alive, in any session."""
         found = []
         for process in psutil.process_iter():
             try:
@@ -118,7 +118,7 @@ class Service:
         return found
 
     def stop(self, number: int = signal.SIGTERM) -> None:
-        """End it as a user or the system would."""
+        """Stop the service as a user or the system would."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(number)
             self._process.wait(PATIENCE)
@@ -131,7 +131,7 @@ class Service:
 
 
 def undisturbed(files: Mapping[str, Path], parameters: Mapping[str, Any], folder: Path) -> Path:
-    """What `sgsst stylize` makes of the files on one rank: its PLY."""
+    """Stylize the files with `sgsst stylize` on one rank, and return the PLY."""
     out = folder / "stylized.ply"
     command = [sys.executable, "-m", "api.cli", "stylize", str(files["scene"]), "--style", str(files["style"])]
     command += ["--cameras", str(files["cameras"]), "--out", str(out)]
@@ -151,7 +151,7 @@ def _document() -> dict[str, Any]:
 
 
 def check_documented(answer: httpx.Response) -> None:
-    """Fail where the OpenAPI document does not have a problem's status and code for the operation that answered it."""
+    """Fail unless the OpenAPI document has a problem's status and code for the operation that answered it."""
     path, method = answer.request.url.path, answer.request.method.lower()
     for template, operations in _document()["paths"].items():
         pattern = re.sub(r"\{[a-z_]+\}", "[^/]+", template.replace("{name}", "(?s:.+)"))
@@ -167,7 +167,7 @@ def check_documented(answer: httpx.Response) -> None:
 def wait_for(
     condition: Callable[[], Any], what: str, said: Callable[[], str] = lambda: "", *, every: float = 0.1
 ) -> Any:
-    """The first true value of a condition; a test whose patience is over fails."""
+    """Return the first true value of a condition; fail after PATIENCE seconds."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         found = condition()

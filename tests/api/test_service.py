@@ -1,4 +1,4 @@
-"""The service from end to end: the processes of `sgsst serve`, real jobs over HTTP, and processes that are killed."""
+"""End-to-end tests of the service: processes of `sgsst serve`, real jobs over HTTP, and killed processes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sgsst_core.files.scene_headers import PACKED_FORMS
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall, write_files
 
-#: Long enough to be killed in, and short enough for a test.
+#: Enough steps to be killed during a job, and few enough for a test.
 STEPS = 600
 PARAMETERS = {"preset": "standard", "steps_sos": STEPS, "backbone": "vgg16", "early_stop": False, "seed": 3}
 
@@ -48,7 +48,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> I
 
 @pytest.fixture(scope="module")
 def expected(files: dict[str, Path], service: Service, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """What `sgsst stylize` makes of the same files and settings."""
+    """Return the result of `sgsst stylize` for the same files and settings."""
     out = tmp_path_factory.mktemp("cli") / "stylized.ply"
     command = [sys.executable, "-m", "api.cli", "stylize", str(files["scene"]), "--style", str(files["style"])]
     command += ["--cameras", str(files["cameras"]), "--steps-sos", str(STEPS), "--no-early-stop", "--seed", "3"]
@@ -59,7 +59,7 @@ def expected(files: dict[str, Path], service: Service, tmp_path_factory: pytest.
 
 @pytest.fixture(scope="module")
 def short_job(files: dict[str, Path], service: Service) -> str:
-    """A job that has ended, of few steps, sent by the asynchronous client: for tests that only look."""
+    """Submit a job of few steps by the asynchronous client, and return it finished. It is for tests that only read."""
 
     async def sent() -> Job:
         async with AsyncClient(service.url) as client:
@@ -105,7 +105,7 @@ def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int
 
 
 def events(client: httpx.Client, job_id: str, after: int = 0) -> list[tuple[int, str, dict[str, Any]]]:
-    """The whole stream until the service ends it."""
+    """Return all events until the service ends the stream."""
     headers = {"Last-Event-ID": str(after)} if after else {}
     found = []
     with client.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as stream:
@@ -124,7 +124,7 @@ def result(client: httpx.Client, job_id: str) -> bytes:
 
 
 def check_colors(client: httpx.Client, job_id: str, scene: Path) -> None:
-    """The stylized colors alone are those of the PLY, as float16."""
+    """Check that the colors alone are those of the PLY, as float16."""
     found = np.frombuffer(client.get(f"/v1/jobs/{job_id}/artifacts/colors.f16").content, "<f2").reshape(-1, 3)
     stylized = PlyData.read(io.BytesIO(result(client, job_id)))["vertex"]
     exact = np.stack([stylized[f"f_dc_{channel}"] for channel in range(3)], 1).astype(np.float64)
@@ -133,7 +133,7 @@ def check_colors(client: httpx.Client, job_id: str, scene: Path) -> None:
 
 
 def check_course(client: httpx.Client, job_id: str, steps: list[int]) -> None:
-    """The whole run is told after its end, from the first step that was reported to the last."""
+    """Check the history of the whole run, from the first reported step to the last."""
     points = client.get(f"/v1/jobs/{job_id}/progress").json()["points"]
     assert {point["step"] for point in points} <= set(steps)
     assert points[0]["step"] == next(step for step in steps if step > 0)
@@ -147,7 +147,7 @@ def check_course(client: httpx.Client, job_id: str, steps: list[int]) -> None:
 def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Path], expected: bytes) -> None:
     with service.client() as client:
         job_id = submit(client, files, name="my wall")
-        seen = events(client, job_id)  # comes back when the job has ended
+        seen = events(client, job_id)  # returns when the job has ended
         kinds = [(kind, data.get("status") or data.get("name")) for _, kind, data in seen]
         statuses = [what for kind, what in kinds if kind == "status"]
         assert statuses == ["queued", "starting", "running", "succeeded"]
@@ -156,7 +156,7 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
         last_step = max(number for number, (kind, _) in enumerate(kinds) if kind == "progress")
         assert kinds.index(("artifact", "log.txt")) < last_step, "the log can be read while the job runs"
         told = [data for _, kind, data in seen if kind == "progress"]
-        steps = [data["step"] for data in told if data["stage"] != "planning"]  # those of planning are views
+        steps = [data["step"] for data in told if data["stage"] != "planning"]  # steps of planning are views
         assert all(0 <= data["step"] <= data["total"] == 3 for data in told if data["stage"] == "planning")
         assert all(datetime.fromisoformat(data["updated_at"]).tzinfo for _, kind, data in seen if kind == "progress")
         assert steps == sorted(steps)
@@ -221,7 +221,7 @@ def test_the_ply_in_ranges(service: Service, files: dict[str, Path], short_job: 
 @pytest.mark.slow
 def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
     scene, gaussians = tmp_path / "wall.ply", wall(sh_degree=1)
-    gaussians.means[:, 2] += torch.linspace(0, 0.3, 616)  # at one depth, their order would make the picture
+    gaussians.means[:, 2] += torch.linspace(0, 0.3, 616)  # at equal depths, the image would depend on their order
     write_packed(scene, gaussians, "spz")
     with service.client() as client:
         job_id = submit(client, files | {"scene": scene}, steps_sos=5)
@@ -323,7 +323,7 @@ def test_killed_processes_cost_time_and_nothing_else(service: Service, files: di
         job_process, api = service.process("service.scheduling.attempt_process"), service.process("api.http.server")
         assert job_process is not None
         assert api is not None
-        assert job_process.nice() > api.nice()  # requests do not wait for a job that has all cores
+        assert job_process.nice() > api.nice()  # requests do not wait for a job that uses all cores
         service.kill("service.scheduling.attempt_process")
         wait_for_step(service, client, job_id, 15, attempt=2)
         service.kill("api.http.server")
@@ -451,7 +451,7 @@ def test_the_client_and_its_commands(service: Service, files: dict[str, Path], e
 
 
 def test_a_deleted_job_takes_its_files_along(service: Service, short_job: str) -> None:
-    """The last that looks at it."""
+    """Runs last of the tests that use this job."""
     with service.client() as client:
         where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
         assert client.get(where).status_code == 200

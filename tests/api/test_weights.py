@@ -1,4 +1,4 @@
-"""Damaged weights of the feature network, from a bit on the disk to the service's answers."""
+"""Tests of damaged weights of the feature network, from a bit on the disk to the service's answers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Unready(Service):
     """A service that is waited for until it answers, ready or not."""
 
     def ready(self) -> bool:
-        """Whether it answers."""
+        """Return whether the service answers."""
         try:
             return httpx.get(f"{self.url}/livez", timeout=5).status_code == 200
         except httpx.TransportError:
@@ -33,7 +33,7 @@ def cache(tiny_cache: Path, tmp_path: Path) -> Path:
 
 
 def flip_a_bit(path: Path) -> None:
-    """Flip one bit of a file as a disk does: its size and times stay."""
+    """Flip one bit of a file as a disk does: its size and times stay the same."""
     status = path.stat()
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
@@ -42,7 +42,7 @@ def flip_a_bit(path: Path) -> None:
 
 
 def test_no_job_is_accepted_or_started_on_damaged_weights(cache: Path, tmp_path: Path) -> None:
-    """A job waits when the service starts on damaged weights; once they are mended it runs, without a restart."""
+    """A job waits if the service starts with damaged weights. Once they are repaired, it runs without a restart."""
     scene, cameras, style = write_files(tmp_path, wall())
     paths = {"scene": scene, "cameras": cameras, "style": style}
     files = {role: (path.name, path.read_bytes()) for role, path in paths.items()}

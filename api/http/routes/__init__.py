@@ -1,1 +1,1 @@
-"""The routes, one module a resource."""
+"""Routes of the API, one module per resource."""

@@ -38,12 +38,12 @@ from service.files.artifacts import media_type
 from service.files.names import RESULT
 from service.store.tables import ArtifactRow, JobRow
 
-#: Of a result.
+#: File formats of a result.
 Form = Literal["ply", "compressed.ply", "spz"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
 
-#: What a browser may show in place; a page of results may run its own script, and nothing else of this site's.
+#: Media types that a browser may show inline. A page of results may run its own script, and nothing else of this site.
 _INLINE = ("image/", "text/html", "application/json", "text/plain")
 _SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
@@ -67,13 +67,13 @@ _NO_JOB = NotFoundError(f"There is no job {JOB_ID}.")
     operation_id="list_artifacts",
 )
 def list_artifacts(job_id: JobId, context: ContextDep, caller: CallerDep) -> ArtifactList:
-    """All files that a job has made so far; a running job has its plan and previews."""
+    """List all files that a job has made so far. A running job has its plan and previews."""
     find(context, caller, job_id)
     rows = context.store.jobs.artifacts(job_id)
     return ArtifactList(artifacts=[artifact_view(row) for row in rows if not row.name.startswith(".")])
 
 
-#: The media types of results (`service.files.artifacts`), and how each begins.
+#: Media types of results (`service.files.artifacts`), and how the content of each starts.
 _CONTENT = {
     "application/octet-stream": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
     "application/json": {"version": 1, "decisions": []},
@@ -131,7 +131,7 @@ async def get_artifact(
         ),
     ] = None,
 ) -> Response:
-    """Download a file, whole or in ranges, to be resumed with `Range` and `If-Range`."""
+    """Download a file, whole or in ranges. Resume with `Range` and `If-Range`."""
     job = await asyncio.to_thread(find, context, caller, job_id)
     row = await _find_artifact(context, job, name, form)
     kind = media_type(row.name)
@@ -149,7 +149,7 @@ async def get_artifact(
 
 
 async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | None) -> ArtifactRow:
-    """A published file, or another form of the result."""
+    """Return the row of a published file, or of the result in another format."""
     if form is not None and form != "ply":
         if name != RESULT:
             raise RefusedInputError(f"Only {RESULT} has other forms. Leave 'format' out.", "invalid-request")
@@ -161,11 +161,11 @@ async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | 
 
 
 def _check(context: Context, row: ArtifactRow) -> None:
-    """Prove that a result is what its row says.
+    """Check that a stored result matches its row.
 
     Raises:
-        LostFileError, DamagedFileError: It is not.
-        NotFoundError: Another file has just taken its name, or its job was removed.
+        LostFileError, DamagedFileError: If the file is missing or damaged.
+        NotFoundError: If another file has just taken its name, or its job was deleted.
     """
     try:
         context.artifacts.check(row.location, row.sha256)
@@ -177,6 +177,6 @@ def _check(context: Context, row: ArtifactRow) -> None:
 
 
 def _file_name(job_name: str, name: str) -> str:
-    """Under which a result is saved: the job's name tells results of several jobs apart."""
+    """Return the file name for saving a result. It includes the job's name, to distinguish results of several jobs."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", job_name).strip("._")[:60]
     return f"{plain}-{PurePosixPath(name).name}" if plain else PurePosixPath(name).name

@@ -1,4 +1,4 @@
-"""`/v1/jobs/{id}/events`: what happens to a job, as server-sent events."""
+"""`/v1/jobs/{id}/events`: events of a job, as server-sent events."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.errors import NotFoundError
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
-#: Of each event of the stream, as OpenAPI 3.1 has it for want of a form for streams.
+#: Schema of one event: OpenAPI 3.1 has no way to describe a stream.
 _EVENT = {
     "type": "object",
     "required": ["id", "event", "data"],
@@ -78,7 +78,7 @@ async def watch_job(
         Header(alias="Last-Event-ID", ge=0, lt=2**62, description="Go on after this event.", examples=[42]),
     ] = None,
 ) -> Response:
-    """Watch a job. A stream that was cut off goes on with `Last-Event-ID`; browsers' `EventSource` sends it."""
+    """Watch a job. Resume an interrupted stream with `Last-Event-ID`, which browsers' `EventSource` sends by itself."""
     await asyncio.to_thread(find, context, caller, job_id)
     if last_event_id and await context.hub.ended(job_id, last_event_id):
         return Response(status_code=204)

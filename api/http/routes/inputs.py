@@ -32,7 +32,7 @@ from service.store.tables import BlobRow
 
 router = APIRouter(prefix="/v1/jobs", tags=["inputs"])
 
-#: What inputs are sent as, by the endings of their names: pictures can be shown in a page, everything else is bytes.
+#: Media types of inputs by file extension. Images can be shown in a page; everything else is sent as bytes.
 _KINDS = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
@@ -40,7 +40,7 @@ _KINDS = {
     ".webp": "image/webp",
     ".json": "application/json",
 }
-#: They are a user's files: nothing in them may run.
+#: Inputs are files of users: nothing in them may run.
 _POLICY = "sandbox; default-src 'none'"
 
 _NO_JOB = NotFoundError(f"There is no job {JOB_ID}.")
@@ -77,7 +77,7 @@ _ANSWERS: Responses = {
     operation_id="list_inputs",
 )
 def list_inputs(job_id: JobId, context: ContextDep, caller: CallerDep) -> InputList:
-    """The files that a job was created from."""
+    """List the files that a job was created from."""
     return InputList(inputs=input_views(find(context, caller, job_id)))
 
 
@@ -116,11 +116,11 @@ async def get_input(
 
 
 def _check(context: Context, row: BlobRow) -> None:
-    """Prove that an input is what its row says.
+    """Check that a stored input matches its row.
 
     Raises:
-        LostFileError, DamagedFileError: It is not.
-        NotFoundError: It has just been removed, with its job.
+        LostFileError, DamagedFileError: If the file is missing or damaged.
+        NotFoundError: If the file has just been deleted with its job.
     """
     try:
         context.blobs.objects.check_once(f"{BLOBS}/{row.location}", row.sha256)
@@ -131,10 +131,10 @@ def _check(context: Context, row: BlobRow) -> None:
 
 
 def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tuple[dict[str, Any], BlobRow]:
-    """A job's entry for a file, and the file.
+    """Return the job's entry for a file, and the row of its blob.
 
     Raises:
-        NotFoundError: there is none, or no more: an expired job has let go of its inputs.
+        NotFoundError: If the job has no such input, or has expired and released its inputs.
     """
     job = find(context, caller, job_id)
     match = re.fullmatch(r"([a-z]{1,10})(?::(\d{1,6}))?", role, re.ASCII)

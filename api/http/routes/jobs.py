@@ -1,4 +1,4 @@
-"""`/v1/jobs`."""
+"""`/v1/jobs`: create, list, show, cancel, retry and delete jobs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from service.store.tables import BlobRow, JobRow, UploadRow
 from service.weights import check_weights
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
-#: Bytes of a JSON body, which only names uploads.
+#: Maximum bytes of a JSON body, which only names uploads.
 _MAX_JSON = 1 << 20
 
 IdempotencyHeader = Annotated[
@@ -69,7 +69,7 @@ JobId = Annotated[str, Path(description="Of a job.", examples=[JOB_ID])]
 #: Headers of an answer that shows a job.
 _SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
 _NOT_THERE = NotFoundError(f"There is no job {JOB_ID}.")
-#: What can be done with a job.
+#: Operations that follow on a job.
 _FOLLOWING_OPERATIONS = (
     "get_job",
     "cancel_job",
@@ -107,7 +107,7 @@ async def create_job(
         bool, Query(description="Check everything and plan, but queue nothing.", examples=[True])
     ] = False,
 ) -> Response:
-    """Queue a job. Every file is read and checked before the answer: what cannot be used is refused with 422."""
+    """Queue a job. All files are read and checked before the answer; unusable ones are refused with 422."""
     async with AsyncExitStack() as stack:
         receipt = await stack.enter_async_context(context.receipts.of(caller.owner, caller.quotas))
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -117,7 +117,7 @@ async def create_job(
             await context.inspector.inspect("validate", caller.owner, wanted.inputs, wanted.rows, wanted.parameters)
         if not dry_run:
             return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key, receipt)
-        stack.pop_all()  # the plan needs the files longer than this function runs
+        stack.pop_all()  # planning needs the files for longer than this function runs
 
     async def plan(show: Show) -> dict[str, Any]:
         async with receipt:
@@ -129,12 +129,12 @@ async def create_job(
 
 @dataclass(frozen=True)
 class _JobRequest:
-    """A job that somebody wants.
+    """Job that a client has requested.
 
     Attributes:
         inputs: `role`, `name`, `sha256`, `size` of each file.
-        rows: the files by digest.
-        checked: the same files have been inspected before, and can be used.
+        rows: Blobs by SHA-256.
+        checked: Whether the same files have already passed inspection.
     """
 
     inputs: list[dict[str, Any]]
@@ -148,7 +148,7 @@ Parts = tuple[Received, JobParameters, str | None]
 
 
 def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
-    """Find the files of a job, and prove what can be proved without the inspecting process."""
+    """Find the files of a job, and make all checks that need no inspection process."""
     received, parameters, webhook = parts
     check_weights()
     inputs, rows = _resolve_inputs(context, caller, received)
@@ -167,7 +167,7 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
 def _queue_job(
     context: Context, caller: Caller, wanted: _JobRequest, idempotency_key: str | None, receipt: Receipt
 ) -> Response:
-    """Queue a job that has been checked, and answer."""
+    """Queue a checked job, and return the answer."""
     parameters, webhook = wanted.parameters, wanted.webhook
     idempotency = _idempotency(idempotency_key, wanted.inputs, parameters, webhook)
     values = parameters.model_dump(mode="json", exclude_unset=True)
@@ -214,8 +214,9 @@ async def _from_json(request: Request, context: Context) -> Parts:
 def _resolve_inputs(
     context: Context, caller: Caller, received: Received
 ) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
-    """All files of a job, those that came with it and those that were uploaded before, and their rows by digest.
-    They stay for now.
+    """Return the entries of all files of a job, and their blobs by digest.
+
+    They are the files of the request and of earlier uploads. The store does not delete the blobs for now.
     """
     inputs = list(received.files)
     ids = [upload_id for _, _, upload_id in received.uploads if is_id(upload_id)]
@@ -233,15 +234,15 @@ def _resolve_inputs(
     rows = context.store.inputs.hold(sorted({*digests, *(entry["sha256"] for entry in inputs)}))
     for number, ((place, role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
         name = clean_name(role, uploads[upload_id].filename, number)
-        # in the order in which they came: that of styles is that of their weights
+        # Keep the order of the request: style weights follow the order of the styles.
         inputs.insert(place, {"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
     return inputs, rows
 
 
 def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
-    """SHA-256 of an upload, which must be finished."""
+    """Return the SHA-256 of an upload, which must be complete."""
     sha256 = upload.sha256
-    if sha256 is None and upload.offset == upload.length:  # the service died before it could tell
+    if sha256 is None and upload.offset == upload.length:  # the service died before it recorded the end
         sha256 = context.blobs.finish_upload(upload, context.settings.upload_hours * 3600)
     if sha256 is None:
         raise RefusedInputError(
@@ -257,7 +258,7 @@ def _idempotency(
 ) -> Idempotency | None:
     if key is None:
         return None
-    told = parameters.model_dump(mode="json", exclude_defaults=True)  # the same once there are more parameters
+    told = parameters.model_dump(mode="json", exclude_defaults=True)  # unchanged if a later version adds parameters
     text = json.dumps([list(inputs), told, webhook], sort_keys=True)
     return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())
 
@@ -283,7 +284,7 @@ def list_jobs(
     ] = None,
     limit: Annotated[Digits, Query(ge=1, le=200, description="Jobs on a page.", examples=[20])] = 50,
 ) -> JobPage:
-    """Jobs of this key, the newest first."""
+    """List the jobs of this key, newest first."""
     jobs = context.store.jobs
     found = jobs.page(caller.owner, status=status or (), before=cursor, limit=limit + 1)
     shown = found[:limit]
@@ -308,7 +309,7 @@ def get_job(
     caller: CallerDep,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """A job. `Retry-After` says when it makes sense to ask again; `If-None-Match` saves the body."""
+    """Get a job. `Retry-After` says when to poll again; `If-None-Match` avoids sending an unchanged body."""
     check_id(job_id)
     return _job_response(context, caller, job_id, if_none_match)
 
@@ -320,7 +321,7 @@ def get_job(
     operation_id="get_progress",
 )
 def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
-    """The course of a job's loss from its first step on, while it runs and after its end."""
+    """Get the loss history of a job from its first step on, while it runs and after its end."""
     return progress_history(context.store.jobs.course(find(context, caller, job_id), MOST_POINTS))
 
 
@@ -337,7 +338,7 @@ def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> Progr
     operation_id="cancel_job",
 )
 def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
-    """Cancel a job: at once where it waits, within seconds where it runs (`canceling` until then)."""
+    """Cancel a job. A waiting job is canceled at once, a running one within seconds (`canceling` until then)."""
     check_id(job_id)
     context.store.jobs.cancel(job_id, caller.owner)
     return _job_response(context, caller, job_id)
@@ -379,7 +380,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
     operation_id="retry_job",
 )
 def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
-    """Queue a job again that failed or was canceled. It goes on from its last checkpoint."""
+    """Queue a failed or canceled job again. It resumes from its last checkpoint."""
     stored_parameters(find(context, caller, job_id).parameters)
     check_weights()
     context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key, quotas=caller.quotas)
@@ -401,7 +402,7 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
     operation_id="delete_job",
 )
 def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
-    """Remove a job that has ended, with its results."""
+    """Delete a job that has ended, with its results."""
     find(context, caller, job_id)
     unused = context.store.jobs.delete(job_id, caller.owner)
     context.artifacts.remove_job(job_id)
@@ -409,17 +410,17 @@ def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
 
 
 def find(context: Context, caller: Caller, job_id: str) -> JobRow:
-    """The caller's job of that id.
+    """Return the caller's job with this id.
 
     Raises:
-        NotFoundError: there is none, or it is another's.
+        NotFoundError: If there is no such job, or it belongs to another caller.
     """
     check_id(job_id)
     return context.store.jobs.get(job_id, caller.owner)
 
 
 def check_id(job_id: str) -> None:
-    """Raise NotFoundError for what cannot be a job's id."""
+    """Raise NotFoundError if a text cannot be a job's id."""
     if not is_id(job_id):
         raise NotFoundError(f"There is no job {job_id[:60]}.")
 

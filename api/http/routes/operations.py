@@ -1,4 +1,4 @@
-"""`/livez`, `/readyz`, `/metrics`: for those who run the service."""
+"""`/livez`, `/readyz`, `/metrics`: for operators."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ router = APIRouter(tags=["operations"])
 
 @router.get("/livez", response_model=Health, responses=problems(key=False), operation_id="livez")
 async def livez() -> Health:
-    """Whether the process answers: if not, restart it."""
+    """Check that the process answers. If it does not, restart it."""
     return Health(status="ok", checks={})
 
 
@@ -40,12 +40,14 @@ async def livez() -> Health:
     },
 )
 async def readyz(context: ContextDep) -> Response:
-    """Whether jobs can be taken in: the database answers, results can be stored, the disk has room, no weights of the
-    feature networks are damaged.
+    """Check that jobs can be accepted.
 
-    Without a dispatcher they still can be, and wait in the queue: the answer is 200, its status `waiting` and its check
-    `dispatchers` "none". Otherwise this check tells how many are alive. The answer comes within a second; what has not
-    answered by then counts as away (`TimeoutError`).
+    The database must answer, results must be storable, the disk must have free space, and the weights of the feature
+    networks must be intact.
+
+    Without a dispatcher, jobs are accepted and wait in the queue: the answer is 200 with status `waiting`, and its
+    check `dispatchers` is "none". Otherwise that check is the number of dispatchers that are alive. The answer comes
+    within a second; a check that has not returned by then has failed (`TimeoutError`).
     """
     found = await context.readiness.run()
     checks = {
@@ -71,5 +73,5 @@ async def readyz(context: ContextDep) -> Response:
     operation_id="metrics",
 )
 def metrics(context: ContextDep) -> Response:
-    """Prometheus metrics."""
+    """Get Prometheus metrics."""
     return Response(context.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")

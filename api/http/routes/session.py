@@ -1,4 +1,4 @@
-"""`/v1/session`: a browser shows an API key once, and has a cookie from then on."""
+"""`/v1/session`: a browser sends an API key once, and gets a cookie."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from service.errors import TooLargeError
 
 router = APIRouter(prefix="/v1/session", tags=["session"])
 
-#: Bytes of a body, which only holds a key.
+#: Maximum bytes of a body, which holds only a key.
 _MAX_BODY = 4096
 _ELSEWHERE = CrossOriginError("Pages of 'https://example.com' may not use the sessions of this service.")
 
@@ -54,8 +54,10 @@ _ELSEWHERE = CrossOriginError("Pages of 'https://example.com' may not use the se
     },
 )
 async def sign_in(request: Request, context: ContextDep) -> Response:
-    """Show an API key once, and have a cookie from then on: it is HttpOnly, and sent by this site's pages alone. A
-    session ends after some days (`SGSST_SESSION_DAYS`), with `DELETE`, or with its key.
+    """Sign in: exchange an API key for a session cookie.
+
+    The cookie is HttpOnly, and browsers send it only from pages of this site. A session ends after some days
+    (`SGSST_SESSION_DAYS`), with `DELETE`, or when its key is revoked.
     """
     check_origin(request, required=False)
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
@@ -75,7 +77,7 @@ async def sign_in(request: Request, context: ContextDep) -> Response:
 
 @router.get("", response_model=SessionView, operation_id="get_session", responses=problems(key=False))
 async def get_session(request: Request, context: ContextDep, response: Response) -> SessionView:
-    """Whether a key is needed, and whether this browser has shown one."""
+    """Get whether a key is required, and whether this browser has a session."""
     response.headers["Cache-Control"] = "no-store"
     cookie = request.cookies.get(SESSION_COOKIE)
     key = await asyncio.to_thread(context.store.sessions.find, cookie) if cookie else None
@@ -93,23 +95,23 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     },
 )
 async def sign_out(request: Request, context: ContextDep) -> Response:
-    """End the session, here and in the browser; without one, nothing happens."""
+    """End the session and delete its cookie. Without a session, nothing happens."""
     check_origin(request, required=SESSION_COOKIE in request.cookies)
     await _end(request, context)
     return _answer(request, "", 0)
 
 
 async def _end(request: Request, context: Context) -> None:
-    """End the session of the request's cookie, where there is one."""
+    """End the session of the request's cookie, if there is one."""
     cookie = request.cookies.get(SESSION_COOKIE)
     if cookie:
         await asyncio.to_thread(context.store.sessions.end, cookie)
 
 
 def _answer(request: Request, text: str, seconds: int) -> Response:
-    """204 with the cookie.
+    """Return 204 with the cookie.
 
-    Where a proxy has ended TLS, the request itself came without: the browser's `Origin` tells how it sees this site.
+    Behind a proxy that terminates TLS, the request itself arrives by HTTP; `Origin` has the browser's scheme.
     """
     secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
     response = Response(status_code=204, headers={"Cache-Control": "no-store"})

@@ -1,4 +1,4 @@
-"""`/v1/uploads`: files in parts, resumable, by the tus protocol 1.0 (https://tus.io/protocols/resumable-upload)."""
+"""`/v1/uploads`: resumable uploads in parts, by the tus protocol 1.0 (https://tus.io/protocols/resumable-upload)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _HEADERS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 
 
 class WrongVersionError(ServiceError):
-    """Another version of the protocol."""
+    """An unsupported version of the tus protocol."""
 
     code, status = "unsupported-tus-version", 412
 
@@ -65,10 +65,10 @@ _NOT_THERE = NotFoundError(f"There is no upload {UPLOAD_ID}, or it has expired."
 
 
 def check_version(tus: Tus = "") -> None:
-    """Refuse a request that does not state the protocol's version, which tus asks of all methods but OPTIONS.
+    """Refuse a request without the protocol's version, which tus requires of all methods but OPTIONS.
 
     Raises:
-        WrongVersionError: The version is missing, or another one.
+        WrongVersionError: If the version is missing or not supported.
     """
     if tus != VERSION:
         raise _wrong_version(tus)
@@ -83,7 +83,7 @@ _SPEAKS_TUS = [Depends(check_version)]
 
 
 def _following_operations(**parameters: str) -> dict[str, Any]:
-    """Where to go on with an upload."""
+    """Return OpenAPI links to the operations that follow on an upload."""
     found = links("get_upload", "head_upload", "delete_upload", **parameters)
     return found | links("append_upload", **parameters, **{"Upload-Offset": "0"})
 
@@ -103,7 +103,7 @@ def _following_operations(**parameters: str) -> dict[str, Any]:
     operation_id="describe_uploads",
 )
 def describe_uploads(context: ContextDep) -> Response:
-    """What of the protocol is spoken."""
+    """Describe the supported protocol version and extensions."""
     sent = {
         "Tus-Resumable": VERSION,
         "Tus-Version": VERSION,
@@ -159,7 +159,7 @@ def create_upload(
     ] = "",
     idempotency_key: IdempotencyHeader = None,
 ) -> Response:
-    """Begin an upload; its bytes are sent with PATCH to the `Location` of the answer."""
+    """Start an upload. Send its bytes with PATCH to the `Location` of the answer."""
     limit = context.settings.max_upload_bytes
     if length > limit:
         raise TooLargeError(f"The file has {length:,} bytes; {limit:,} may be.", limit=limit)
@@ -171,7 +171,7 @@ def create_upload(
     row = context.store.inputs.create_upload(
         caller.owner, length, name, metadata, seconds, idempotency_key, caller.quotas
     )
-    if row.sha256 is None:  # a repeated request may name an upload that has been finished since
+    if row.sha256 is None:  # a repeated request may name an upload that is already complete
         context.blobs.begin_upload(row.id)
     sent = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
     return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")
@@ -179,7 +179,7 @@ def create_upload(
 
 @router.get("/{upload_id}", response_model=UploadView, responses=problems(_NOT_THERE), operation_id="get_upload")
 def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> UploadView:
-    """How far an upload is, as JSON."""
+    """Get the state of an upload as JSON."""
     return upload_view(_find_upload(context, caller.owner, upload_id))
 
 
@@ -204,7 +204,7 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
     response_class=Response,
 )
 def head_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
-    """How far an upload is: `Upload-Offset` says where to go on."""
+    """Get the state of an upload as headers. `Upload-Offset` is where to resume."""
     row = _find_upload(context, caller.owner, upload_id)
     sent = {
         **_HEADERS,
@@ -273,7 +273,7 @@ async def append_upload(
         ),
     ] = None,
 ) -> Response:
-    """Send the next part. What has arrived when a connection breaks is kept, unless a checksum was announced."""
+    """Send the next part. If the connection breaks, received bytes are kept unless a checksum was announced."""
     if request.headers.get("content-type", "").lower() != "application/offset+octet-stream":
         raise MediaTypeError("The Content-Type must be application/offset+octet-stream.")
     wanted = parse_checksum(checksum) if checksum else None
@@ -282,7 +282,7 @@ async def append_upload(
         raise ConflictError(f"The upload is complete with {row.length} bytes.", offset=row.length)
     check_offset(row, offset)
     expires = row.expires_at
-    if row.sha256 is None and row.offset == row.length:  # the service died before it could tell
+    if row.sha256 is None and row.offset == row.length:  # the service died before it recorded the end
         await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
     elif row.sha256 is None:
         expires = await append_body(request, context, row, wanted)
@@ -307,7 +307,7 @@ async def append_upload(
     operation_id="delete_upload",
 )
 def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
-    """Give an upload up, or let go of a finished one; jobs that use it keep their file."""
+    """Cancel an upload, or delete a finished one. Jobs that use it keep their file."""
     _find_upload(context, caller.owner, upload_id)
     unused = context.store.inputs.delete_upload(upload_id, caller.owner)
     context.blobs.forget_upload(upload_id)
@@ -322,13 +322,13 @@ def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
 
 
 def _file_name(metadata: str) -> str:
-    """The value of `filename` among `key base64, key base64`."""
+    """Return the value of `filename` from the pairs `key base64, key base64`."""
     for pair in metadata.split(","):
         key, _, value = pair.strip().partition(" ")
         if key in ("filename", "name"):
             try:
                 return base64.b64decode(value, validate=True).decode()
-            except ValueError as error:  # also for letters that are not ASCII
+            except ValueError as error:  # raised for non-ASCII characters too
                 raise BadRequestError(f"Upload-Metadata: {key!r} is not base64 of UTF-8.") from error
     return ""
 

@@ -1,20 +1,20 @@
 // @ts-check
-/** Bytes of a stream, taken as they are asked for. */
+/** Reader that takes bytes from a stream on demand. */
 import { words } from "../words.js";
 
-/** A file that cannot be shown; the message is for people. */
+/** Error of a file that cannot be shown; its message is shown to the user. */
 export class SceneError extends Error {}
 
 export class ByteReader {
   /** @param {ReadableStream<Uint8Array>} stream */
   constructor(stream) {
     this.reader = stream.getReader();
-    /** What has come and was not taken. @type {Uint8Array} */
+    /** Bytes that have arrived and are not taken yet. @type {Uint8Array} */
     this.rest = new Uint8Array(0);
   }
 
   /**
-   * The next bytes, which stay where they are; fewer where the stream ends.
+   * Return the next bytes without taking them; fewer at the end of the stream.
    *
    * @param {number} count
    * @returns {Promise<Uint8Array>}
@@ -32,11 +32,11 @@ export class ByteReader {
   }
 
   /**
-   * The next bytes, at the beginning of a buffer of their own.
+   * Take the next bytes, in a buffer of their own.
    *
    * @param {number} count
    * @returns {Promise<Uint8Array<ArrayBuffer>>}
-   * @throws {SceneError} the stream ends before
+   * @throws {SceneError} if the stream ends before
    */
   async take(count) {
     const found = new Uint8Array(count);
@@ -55,7 +55,7 @@ export class ByteReader {
   }
 
   /**
-   * What has not been taken, through another stream.
+   * Return a reader of the remaining bytes, piped through another stream.
    *
    * @param {ReadableWritablePair<Uint8Array, any>} through
    * @returns {ByteReader}
@@ -74,7 +74,7 @@ export class ByteReader {
     return new ByteReader(all.pipeThrough(through));
   }
 
-  /** Nothing more is needed. */
+  /** Cancel the stream. */
   end() {
     this.reader.cancel().catch(() => {});
   }

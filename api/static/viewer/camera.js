@@ -1,16 +1,16 @@
 // @ts-check
-/** Where the viewer looks from, and how that is changed. */
+/** Position and orientation of the viewer's camera, and its movements. */
 import { cross, difference, dot, rotated, sum, times, unit } from "./vectors.js";
 
 /** @typedef {import("./vectors.js").Vector} Vector */
 /** @typedef {import("../cameras.js").JobCamera} JobCamera */
 
-/** Focal length of a free view, in heights: 50 degrees. */
+/** Focal length of a free view as a multiple of its height: 50 degrees. */
 const FOCAL = 1.07;
 
 export class ViewCamera {
   constructor() {
-    /** Right, down, forward. @type {Vector[]} */
+    /** Right, down and forward axes. @type {Vector[]} */
     this.axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
     /** @type {Vector} */
     this.eye = [0, 0, -3];
@@ -18,18 +18,21 @@ export class ViewCamera {
     this.target = [0, 0, 0];
     /** @type {Vector} */
     this.up = [0, -1, 0];
-    /** A unit of movement, world units. */
+    /** Step of a movement in world units. */
     this.size = 1;
-    /** In heights of the frame, and the frame's shape (width over height); no shape: the canvas. */
+    /**
+     * Focal lengths as multiples of the frame's height, and the frame's aspect ratio; 0 for the aspect ratio of the
+     * canvas.
+     */
     this.focal = [FOCAL, FOCAL];
     this.shape = 0;
     this.near = 0.2;
-    /** Of the last change. */
+    /** Number of the last change. */
     this.number = 0;
   }
 
   /**
-   * Look at a scene as a whole.
+   * Look at a whole scene.
    *
    * @param {{center: Vector, radius: number}} middle
    * @param {Vector} up
@@ -56,7 +59,7 @@ export class ViewCamera {
   }
 
   /**
-   * Stand where a camera of the job stood.
+   * Move to a camera of the job.
    *
    * @param {JobCamera} camera
    * @param {{center: Vector, radius: number} | null} middle
@@ -73,7 +76,7 @@ export class ViewCamera {
   }
 
   /**
-   * Pixels of a canvas for slopes of 1; a job's camera shows its whole frame.
+   * Return the focal lengths in pixels of a canvas. A job's camera shows its whole frame.
    *
    * @param {number} width
    * @param {number} height
@@ -84,25 +87,25 @@ export class ViewCamera {
   }
 
   /**
-   * @param {number} aside radians to the right, as a hand moves the scene
+   * @param {number} aside radians to the right, as if dragging the scene
    * @param {number} over radians; positive looks further down
-   * @param {boolean} about the target; else about the eye
+   * @param {boolean} about whether to rotate about the target; otherwise about the eye
    */
   turn(aside, over, about) {
     const up = this.up, [right, , forward] = this.axes;
     const slant = Math.asin(Math.max(-1, Math.min(1, dot(forward, up))));
-    const most = Math.max(1.5, Math.abs(slant)); // never over the pole
+    const most = Math.max(1.5, Math.abs(slant)); // not beyond the pole
     const tilt = Math.max(-most, Math.min(most, slant - over)) - slant;
     const turned = (/** @type {Vector} */ v) => rotated(rotated(v, right, tilt), up, -aside);
     this.axes = this.axes.map(turned);
     if (about) this.eye = sum(this.target, turned(difference(this.eye, this.target)));
     else this.target = sum(this.eye, turned(difference(this.target, this.eye)));
-    const f = unit(this.axes[2]), r = unit(difference(this.axes[0], times(f, dot(this.axes[0], f)))); // no rounding piles up
+    const f = unit(this.axes[2]), r = unit(difference(this.axes[0], times(f, dot(this.axes[0], f)))); // against accumulated rounding
     this.axes = [r, cross(f, r), f];
     this.number++;
   }
 
-  /** @param {number} factor of the distance to the target */
+  /** @param {number} factor factor of the distance to the target */
   approach(factor) {
     const away = difference(this.eye, this.target);
     if (Math.hypot(...away) * factor < 1e-3 * this.size || Math.hypot(...away) * factor > 1e3 * this.size) return;
@@ -113,7 +116,7 @@ export class ViewCamera {
   /**
    * Move eye and target.
    *
-   * @param {number[]} by along right, down and forward, world units
+   * @param {number[]} by movement along right, down and forward, world units
    */
   move(by) {
     const step = this.axes.map((axis, i) => times(axis, by[i])).reduce(sum);

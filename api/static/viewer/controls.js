@@ -1,22 +1,22 @@
 // @ts-check
-/** Hands on the view: mouse, touch, pen, wheel and keys. */
+/** Controls of the viewer: mouse, touch, pen, wheel and keys. */
 
 /** @typedef {import("./viewer.js").Viewer} Viewer */
 
 /** @type {Record<string, [number, number]>} */
 const TURNS = { ArrowLeft: [-0.08, 0], ArrowRight: [0.08, 0], ArrowUp: [0, -0.08], ArrowDown: [0, 0.08] };
-/** Along right, down and forward. @type {Record<string, number[]>} */
+/** Steps along right, down and forward. @type {Record<string, number[]>} */
 const STEPS = { a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0], w: [0, 0, 1], s: [0, 0, -1] };
 
 export class Controls {
   /**
    * @param {Viewer} viewer
-   * @param {{toggle?: () => void, camera?: (by: number) => void, home?: () => void}} keys what other keys do
+   * @param {{toggle?: () => void, camera?: (by: number) => void, home?: () => void}} keys actions of other keys
    */
   constructor(viewer, keys = {}) {
     this.viewer = viewer;
     this.keys = keys;
-    /** Turn about the scene, else about the eye. */
+    /** Whether to rotate about the scene; otherwise about the eye. */
     this.orbit = true;
     /** @type {Map<number, {x: number, y: number}>} */
     this.hands = new Map();
@@ -50,7 +50,7 @@ export class Controls {
   }
 
   /**
-   * Two fingers: their distance approaches, their middle shifts.
+   * Handle two fingers: their distance zooms, their midpoint pans.
    *
    * @param {{x: number, y: number}} before
    * @param {{x: number, y: number}} now

@@ -1,5 +1,5 @@
 // @ts-check
-/** Which Gaussians a view may show, the farthest first. */
+/** Gaussians that may be visible in a view, sorted from the farthest to the nearest. */
 
 /**
  * @typedef {{axes: number[][], eye: number[], tan: number[], near: number}} Pose
@@ -7,17 +7,19 @@
  */
 
 const DIGIT = 11, BUCKETS = 1 << DIGIT, MOST = 2 * DIGIT;
-/** How much wider than the view what is kept is: it is drawn while a new order is computed, too. */
+/** Factor by which the culling frustum is wider than the view: the order is also drawn while a new one is computed. */
 const WIDER = 1.3;
 
 /**
- * Sorted by the bits of their float32 depth, which order as positive floats do; the spread of depths is cut to 22 bits (a
- * millionth of the depth), which two passes of counting sort. Equal depths are in the order of the file, which is nearest
- * first, as in `sgsst render`.
+ * Return the indices of the Gaussians that may be visible, farthest first.
+ *
+ * The sort keys are the bits of the float32 depths, which order as positive floats do. Their range is reduced to 22
+ * bits (a millionth of the depth), which two passes of counting sort cover. Of equal depths, the first one in the file
+ * counts as nearest, as in `sgsst render`.
  *
  * @param {Float32Array} centers [n * 3]
- * @param {Float32Array} reach [n], see `Packed`; negative for what shows nowhere
- * @param {number} count of Gaussians, at most n
+ * @param {Float32Array} reach [n], see `Packed`; negative for Gaussians that are never visible
+ * @param {number} count number of Gaussians, at most n
  * @param {Pose} pose
  * @returns {Uint32Array}
  */
@@ -33,7 +35,7 @@ export function depthOrder(centers, reach, count, { axes, eye, tan, near }) {
     const x = centers[3 * i] - ex, y = centers[3 * i + 1] - ey, z = centers[3 * i + 2] - ez;
     const depth = fx * x + fy * y + fz * z;
     if (depth < near) continue;
-    const room = far + 0.02 * depth; // a dilated Gaussian covers a pixel and more, however far it is
+    const room = far + 0.02 * depth; // a dilated Gaussian covers at least a pixel at any distance
     if (Math.abs(rx * x + ry * y + rz * z) > across * depth + slantX * room) continue;
     if (Math.abs(dx * x + dy * y + dz * z) > down * depth + slantY * room) continue;
     found[visible] = i;
@@ -44,7 +46,7 @@ export function depthOrder(centers, reach, count, { axes, eye, tan, near }) {
 
 /**
  * @param {Uint32Array} found
- * @param {Uint32Array} bits of their depths
+ * @param {Uint32Array} bits bits of their depths
  * @param {number} count
  */
 function sorted(found, bits, count) {
@@ -57,7 +59,7 @@ function sorted(found, bits, count) {
   while (count && (high - low) / 2 ** shift >= 1 << MOST) shift++;
   const first = new Uint32Array(BUCKETS + 1), second = new Uint32Array(BUCKETS + 1);
   for (let i = 0; i < count; i++) {
-    const key = (bits[i] = (high - bits[i]) >>> shift); // the farthest first
+    const key = (bits[i] = (high - bits[i]) >>> shift); // farthest first
     first[(key & (BUCKETS - 1)) + 1]++;
     second[(key >>> DIGIT) + 1]++;
   }
@@ -66,7 +68,7 @@ function sorted(found, bits, count) {
     second[b + 1] += second[b];
   }
   const between = new Uint32Array(count), order = new Uint32Array(count);
-  for (let i = count - 1; i >= 0; i--) between[first[bits[i] & (BUCKETS - 1)]++] = i; // of equal ones the last first
+  for (let i = count - 1; i >= 0; i--) between[first[bits[i] & (BUCKETS - 1)]++] = i; // of equal depths, the last one first
   for (let i = 0; i < count; i++) order[second[bits[between[i]] >>> DIGIT]++] = found[between[i]];
   return order;
 }

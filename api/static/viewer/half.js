@@ -1,5 +1,8 @@
 // @ts-check
-/** Floats as halves (IEEE 754 binary16), rounded to nearest; what is too large becomes the largest one. */
+/**
+ * Conversion of floats to half precision (IEEE 754 binary16), rounded to nearest and clamped to the largest finite
+ * value.
+ */
 
 const BASE = new Uint16Array(512), SHIFT = new Uint8Array(512), HIDDEN = new Uint32Array(512), ROUND = new Uint32Array(512);
 
@@ -12,7 +15,7 @@ for (let key = 0; key < 512; key++) {
     BASE[key] = sign | ((exponent + 15) << 10);
     SHIFT[key] = 13;
     ROUND[key] = 0x1000;
-  } else if (exponent >= -25) { // a subnormal half counts 2^-24
+  } else if (exponent >= -25) { // a subnormal half counts in units of 2^-24
     SHIFT[key] = -exponent - 1;
     HIDDEN[key] = 0x800000;
     ROUND[key] = 1 << (-exponent - 2);
@@ -20,7 +23,7 @@ for (let key = 0; key < 512; key++) {
 }
 
 /**
- * @param {number} bits of a float32
+ * @param {number} bits bits of a float32
  * @returns {number} bits of a half
  */
 export function halfOf(bits) {

@@ -1,9 +1,9 @@
 // @ts-check
 /**
- * Packed scenes: PlayCanvas' compressed PLY, Niantic's SPZ (versions 1 to 3) and antimatter15's .splat.
+ * Readers of compressed scenes: PlayCanvas' compressed PLY, Niantic's SPZ (versions 1 to 3) and antimatter15's .splat.
  *
  * Layouts are those of github.com/playcanvas/splat-transform, github.com/nianticlabs/spz and
- * github.com/antimatter15/splat. All become rows of a PLY's values.
+ * github.com/antimatter15/splat. All are converted to rows of PLY values.
  */
 import { SceneError } from "./byte_reader.js";
 import { BATCH } from "./packing.js";
@@ -16,7 +16,10 @@ import { words } from "../words.js";
 const SH_C0 = 0.28209479177387814;
 const NAMES = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
 const OPACITY = 3, SCALES = 4, ROTATION = 7, COLOR = 11, HARMONICS = NAMES.length;
-/** Logits of opacities of so many 255ths; none and full are a quarter of a step from it. */
+/**
+ * Logits of opacities in steps of 1/255. Opacities of exactly 0 and 1 have no finite logit; they are read as 0.25/255
+ * and 1 - 0.25/255.
+ */
 const LOGITS = Float32Array.from({ length: 256 }, (_, i) => {
   const share = Math.min(Math.max(i / 255, 0.25 / 255), 1 - 0.25 / 255);
   return Math.log(share / (1 - share));
@@ -24,11 +27,11 @@ const LOGITS = Float32Array.from({ length: 256 }, (_, i) => {
 const OTHERS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];
 
 /**
- * A scene whose rows are made by a function.
+ * Return a scene whose rows are decoded by a function.
  *
  * @param {number} count
  * @param {number} degree
- * @param {(begin: number, rows: Float32Array, width: number, count: number) => void | Promise<void>} unpack fills so many rows
+ * @param {(begin: number, rows: Float32Array, width: number, count: number) => void | Promise<void>} unpack fills `count` rows
  * @returns {SceneFile}
  */
 function unpacked(count, degree, unpack) {
@@ -45,13 +48,13 @@ function unpacked(count, degree, unpack) {
 }
 
 /**
- * A unit quaternion of which the largest part is left out.
+ * Write a unit quaternion that is stored without its largest component.
  *
  * @param {Float32Array} row
- * @param {number} o where the quaternion begins
- * @param {number} largest its index
- * @param {number[]} three the others
- * @param {number} [turn] places that the parts are moved on
+ * @param {number} o offset of the quaternion
+ * @param {number} largest index of the largest component
+ * @param {number[]} three the other components
+ * @param {number} [turn] cyclic shift of the components
  */
 function setRotation(row, o, largest, three, turn = 0) {
   const [a, b, c] = three;
@@ -61,14 +64,14 @@ function setRotation(row, o, largest, three, turn = 0) {
 
 // --- compressed PLY --------------------------------------------------------------------------------------------------
 
-/** Gaussians that share their bounds. */
+/** Number of Gaussians that share their bounds. */
 const CHUNK = 256;
 const BOUNDS = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
-/** What a byte of spherical harmonics stands for. */
+/** Values of the bytes of spherical harmonics. */
 const STEPS = Float32Array.from({ length: 256 }, (_, i) => (i === 0 ? -4 : i === 255 ? 4 : (i + 0.5) / 32 - 4));
 
 /**
- * @param {ByteReader} reader behind the header
+ * @param {ByteReader} reader reader behind the header
  * @param {import("./ply.js").Header} header
  * @returns {SceneFile}
  */
@@ -91,7 +94,8 @@ export function compressedPly(reader, { elements }) {
 }
 
 /**
- * Bounds of all chunks, low and high of each of 9 values (colors are in 0..1 where the file has none), and all rows.
+ * Read the bounds of all chunks and all rows. The bounds are the low and high of each of 9 values; colors are in 0..1
+ * if the file has no bounds for them.
  *
  * @param {ByteReader} reader
  * @param {import("./ply.js").Element} chunk
@@ -110,10 +114,10 @@ async function chunksAndRows(reader, chunk, vertex) {
 
 /**
  * @param {{bounds: Float32Array, rows: Uint32Array}} read
- * @param {number} i which Gaussian
- * @param {number[]} order of the four packed values
+ * @param {number} i index of the Gaussian
+ * @param {number[]} order order of the four packed values
  * @param {Float32Array} into
- * @param {number} o where its row begins
+ * @param {number} o offset of its row
  */
 function unpackRow({ bounds, rows }, i, order, into, o) {
   const [position, rotation, scale, color] = order.map((place) => rows[4 * i + place]), b = 18 * Math.floor(i / CHUNK);
@@ -130,7 +134,9 @@ function unpackRow({ bounds, rows }, i, order, into, o) {
 
 // --- SPZ -------------------------------------------------------------------------------------------------------------
 
-/** Half a turn about x: SPZ has y up and z backwards. Of harmonics, coefficient by coefficient of degree 1 to 3. */
+/**
+ * Signs of the harmonics' coefficients of degree 1 to 3 under a half rotation about x: SPZ has y up and z backwards.
+ */
 const TURNED = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
 
 /**
@@ -164,11 +170,11 @@ export async function spz(zipped) {
 
 /**
  * @param {Uint8Array<ArrayBuffer>[]} sections positions, opacities, colors, scales, rotations
- * @param {number} i which Gaussian
+ * @param {number} i index of the Gaussian
  * @param {number} version
- * @param {number} unit of a position
+ * @param {number} unit unit of positions
  * @param {Float32Array} into
- * @param {number} o where its row begins
+ * @param {number} o offset of its row
  */
 function unpackSpz([positions, opacities, colors, scales, rotations], i, version, unit, into, o) {
   for (let axis = 0; axis < 3; axis++) {
@@ -190,7 +196,7 @@ function unpackSpz([positions, opacities, colors, scales, rotations], i, version
   into[o + ROTATION + 3] *= -1;
 }
 
-/** @param {number} half bits */
+/** @param {number} half bits of a half */
 function fromHalf(half) {
   const sign = half & 0x8000 ? -1 : 1, exponent = (half >> 10) & 31, fraction = half & 1023;
   if (exponent === 31) return fraction ? NaN : sign * Infinity;
@@ -199,14 +205,15 @@ function fromHalf(half) {
 
 // --- .splat ----------------------------------------------------------------------------------------------------------
 
-/** Bytes of a Gaussian: place and size (float32), color and opacity, rotation (bytes). */
+/** Bytes of a Gaussian: position and scale (float32), color and opacity, rotation (bytes). */
 const RECORD = 32;
 
 /**
- * Whether records fit, since there is no header: nearly all have a place, a size that is not absurd, and a rotation.
+ * Return whether bytes look like records of a .splat file, which has no header: nearly all have a finite position, a
+ * plausible scale and a rotation.
  *
  * @param {Uint8Array} start
- * @param {number} size of the file
+ * @param {number} size size of the file in bytes
  */
 export function isSplat(start, size) {
   const count = Math.floor(start.length / RECORD), view = new DataView(start.buffer, start.byteOffset, start.length);
@@ -221,7 +228,7 @@ export function isSplat(start, size) {
 
 /**
  * @param {ByteReader} reader
- * @param {number} size of the file
+ * @param {number} size size of the file in bytes
  * @returns {SceneFile}
  */
 export function splat(reader, size) {

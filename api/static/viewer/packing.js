@@ -1,15 +1,15 @@
 // @ts-check
 /**
- * Gaussians as the textures hold them.
+ * Conversion of Gaussians to the layout of the textures.
  *
- * Geometry, 2 texels of 4 uint32: x, y, z as float32, then opacity (low half, of 65535) and the first scale; the
- * quaternion as four signed 16-bit fractions, the other two scales, nothing. Scales are natural logarithms in steps of
- * 32 / 65535 from -20 (0.025 % each). Colors: three halves. Harmonics: 8 halves in each texel, coefficient by
- * coefficient.
+ * Geometry has 2 texels of 4 uint32. The first has x, y, z as float32, then opacity (low half, in units of 1/65535) and
+ * the first scale. The second has the quaternion as four signed 16-bit fractions, the other two scales, and an unused
+ * value. Scales are natural logarithms from -20 in steps of 32 / 65535 (a precision of 0.025 %). Colors are three
+ * halves. Harmonics are 8 halves per texel, coefficient by coefficient.
  */
 import { halfOf } from "./half.js";
 
-/** Gaussians of a batch: whole rows of every texture. */
+/** Number of Gaussians in a batch: fills whole rows of every texture. */
 export const BATCH = 1 << 16;
 export const SCALE_LOW = -20, SCALE_RANGE = 32;
 
@@ -24,9 +24,9 @@ export const harmonicTexels = (degree) => Math.ceil((((degree + 1) ** 2 - 1) * 3
 /**
  * @param {Float32Array} values rows of `width` values
  * @param {number} width
- * @param {Record<string, number>} at place of each value in a row
- * @param {number} stored degree of the file
- * @param {number} degree that is kept
+ * @param {Record<string, number>} at index of each value in a row
+ * @param {number} stored degree in the file
+ * @param {number} degree degree to keep
  * @returns {Packed}
  */
 export function pack(values, width, at, stored, degree) {
@@ -64,7 +64,7 @@ function packGeometry({ geometry, centers, reach }, values, width, at, count) {
     const px = values[o + x], py = values[o + y], pz = values[o + z];
     let alpha = 65535 / (1 + Math.exp(-values[o + opacity]));
     const sum = px + py + pz + s0 + s1 + s2 + length;
-    if (!(sum - sum === 0) || !(length > 0) || !(alpha >= 0)) alpha = 0; // a value that is no number shows nothing
+    if (!(sum - sum === 0) || !(length > 0) || !(alpha >= 0)) alpha = 0; // Gaussians with NaN or infinite values are invisible
     floats[g] = px; floats[g + 1] = py; floats[g + 2] = pz;
     geometry[g + 3] = Math.round(alpha) | (scale(s0) << 16);
     geometry[g + 4] = part(a / length) | (part(b / length) << 16);

@@ -1,5 +1,5 @@
 // @ts-check
-/** PLY: its header, and Gaussians as the code of 3D Gaussian Splatting writes them. */
+/** Readers of PLY headers, and of Gaussians as the reference code of 3D Gaussian Splatting writes them. */
 import { SceneError } from "./byte_reader.js";
 import { BATCH } from "./packing.js";
 import { words } from "../words.js";
@@ -7,7 +7,7 @@ import { words } from "../words.js";
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 /**
- * @typedef {{offset: number, type: string}} Column where a value stands in a row, bytes
+ * @typedef {{offset: number, type: string}} Column `offset`: bytes from the start of a row
  * @typedef {{name: string, count: number, stride: number, columns: Record<string, Column>}} Element `stride`: bytes of a row
  * @typedef {{begin: number, elements: Element[]}} Header `begin`: bytes of the header
  */
@@ -17,13 +17,13 @@ const SIZES = /** @type {Record<string, number>} */ ({
   int: 4, uint: 4, int32: 4, uint32: 4, float: 4, float32: 4, double: 8, float64: 8,
 });
 const NEEDED = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
-/** Degree by the number of coefficients above degree 0. */
+/** SH degree by the number of coefficients above degree 0. */
 export const DEGREES = /** @type {Record<number, number>} */ ({ 0: 0, 9: 1, 24: 2, 45: 3 });
-/** No header is longer. */
+/** Maximum bytes of a header. */
 const LONGEST_HEADER = 1 << 16;
 
 /**
- * @param {ByteReader} reader at the beginning of a PLY; behind its header afterwards
+ * @param {ByteReader} reader reader at the start of a PLY; after the call, behind its header
  * @returns {Promise<Header>}
  */
 export async function readHeader(reader) {
@@ -53,14 +53,14 @@ function elementsOf(lines) {
     if (keyword === "element") elements.push({ name: kind, count: Number(name), stride: 0, columns: {} });
     else if (keyword === "property" && element) {
       element.columns[name] = { offset: element.stride, type: kind };
-      element.stride += SIZES[kind] ?? NaN; // a list: its rows have no size
+      element.stride += SIZES[kind] ?? NaN; // a list, whose rows have no fixed size
     }
   }
   return elements;
 }
 
 /**
- * @param {ByteReader} reader behind the header
+ * @param {ByteReader} reader reader behind the header
  * @param {Header} header
  * @returns {SceneFile}
  */
@@ -80,10 +80,10 @@ export function plainPly(reader, { elements }) {
 }
 
 /**
- * Rows as float32, whatever types they are stored as.
+ * Return rows as float32, converted from the types in which they are stored.
  *
  * @param {Element} element
- * @param {Uint8Array} bytes whole rows, at the beginning of their buffer
+ * @param {Uint8Array} bytes whole rows, at the start of their buffer
  */
 export function floats({ stride, columns }, bytes) {
   const all = Object.values(columns);

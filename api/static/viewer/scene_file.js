@@ -1,5 +1,7 @@
 // @ts-check
-/** Scenes of any form, told by their content: rows of float32, batch by batch, by the names of a PLY's properties. */
+/**
+ * Scenes of any format, detected from the file's content: batches of float32 rows, with the names of PLY properties.
+ */
 import { ByteReader, SceneError } from "./byte_reader.js";
 import { compressedPly, isSplat, splat, spz } from "./packed.js";
 import { plainPly, readHeader } from "./ply.js";
@@ -7,16 +9,16 @@ import { words } from "../words.js";
 
 /**
  * @typedef {object} SceneFile
- * @property {number} count Gaussians
- * @property {number} degree of spherical harmonics
- * @property {number} width values of a row
- * @property {Record<string, number>} at place of each value in a row
- * @property {() => AsyncGenerator<Float32Array>} batches `BATCH` rows each, the last one fewer
+ * @property {number} count number of Gaussians
+ * @property {number} degree degree of spherical harmonics
+ * @property {number} width number of values in a row
+ * @property {Record<string, number>} at index of each value in a row
+ * @property {() => AsyncGenerator<Float32Array>} batches `BATCH` rows each, fewer in the last one
  */
 
 /**
  * @param {ByteReader} reader
- * @param {number} size bytes of the file; 0 where they are not known
+ * @param {number} size size of the file in bytes; 0 if unknown
  * @returns {Promise<SceneFile>}
  * @throws {SceneError}
  */

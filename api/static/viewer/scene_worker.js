@@ -1,5 +1,5 @@
 // @ts-check
-/** Reads a scene as it arrives, hands it over in batches, and sorts it for the viewer. */
+/** Worker that reads a scene as it arrives, passes it on in batches, and sorts it for the viewer. */
 import { ByteReader, SceneError } from "./byte_reader.js";
 import { depthOrder } from "./depth_order.js";
 import { pack } from "./packing.js";
@@ -27,7 +27,7 @@ port.onmessage = async (/** @type {MessageEvent} */ { data }) => {
 
 /**
  * @param {File | string} source
- * @param {{texels: number, bytes: number}} room texels of a texture, and bytes of all, at most
+ * @param {{texels: number, bytes: number}} room maximum texels of a texture, and maximum bytes of all textures
  */
 async function load(source, room) {
   const [stream, size] = await opened(source), reader = new ByteReader(stream);
@@ -53,7 +53,7 @@ async function opened(source) {
 }
 
 /**
- * The degree of which all fits.
+ * Return the highest SH degree whose textures fit into memory.
  *
  * @param {SceneFile} file
  * @param {{texels: number, bytes: number}} room
@@ -86,7 +86,7 @@ function give(rows, file) {
 }
 
 /**
- * Middle and radius of where most Gaussians are: strays and background do not count.
+ * Return center and radius of the bulk of the Gaussians, without outliers and background.
  *
  * @returns {{center: number[], radius: number, low: number[], high: number[]}}
  */

@@ -1,12 +1,14 @@
 // @ts-check
 /**
- * What the GPU computes: EWA splatting as `sgsst render` does it (blur of 0.3 square pixels, alpha between 1/255 and 0.99,
- * slopes clamped at 1.3 half fields of view), once with two colors. The determinant is a sum of squares (Cauchy-Binet),
- * which needles cannot cancel.
+ * Shaders: EWA splatting as in `sgsst render`, drawn once with two colors.
+ *
+ * Gaussians are dilated by 0.3 square pixels, alpha is clamped between 1/255 and 0.99, and slopes are clamped at 1.3
+ * times half the field of view. The determinant is a sum of squares (Cauchy-Binet), so that thin Gaussians cause no
+ * cancellation.
  */
 import { harmonicTexels, SCALE_LOW, SCALE_RANGE } from "./packing.js";
 
-/** Products of the direction, in the order and with the signs of 3DGS files. */
+/** Products of the view direction, in the order and with the signs of 3DGS files. */
 const BASIS = [
   "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
   "1.0925484305920792 * x * y", "-1.0925484305920792 * y * z", "0.31539156525252005 * (2. * z * z - x * x - y * y)",
@@ -35,8 +37,8 @@ function directional(degree) {
 }
 
 /**
- * @param {number} degree of spherical harmonics
- * @param {number} bits texels of a row are 2 to this
+ * @param {number} degree degree of spherical harmonics
+ * @param {number} bits base-2 logarithm of the texels of a row
  */
 export const splatVertex = (degree, bits) => `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
@@ -101,7 +103,7 @@ void main() {
   color = vec4((gl_FragCoord.x < cut ? leftColor : rightColor) * alpha, alpha);
 }`;
 
-/** A triangle over everything. */
+/** Triangle that covers the whole canvas. */
 export const wholeVertex = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3. : -1., gl_VertexID == 2 ? 3. : -1., 0, 1); }`;
 

@@ -5,17 +5,17 @@ import { words } from "../words.js";
 
 /** @typedef {{center: number[], radius: number, low: number[], high: number[]}} Middle */
 /** @typedef {import("./depth_order.js").Pose} Pose */
-/** @typedef {{count: number, degree: number, size: number}} Shown of a file's header */
+/** @typedef {{count: number, degree: number, size: number}} Shown values of a file's header */
 
-/** Bytes of textures, at most; telephones get a quarter. */
+/** Maximum bytes of textures; lower on devices with little memory, such as phones. */
 const MEMORY = (/** @type {any} */ (navigator).deviceMemory ?? 8) >= 8 ? 1.5e9 : 4e8;
 
 export class SplatScene {
   /**
    * @param {WebGL2RenderingContext} gl
    * @param {File | string} source
-   * @param {() => void} changed there is more to draw
-   * @param {number} memory bytes, at most
+   * @param {() => void} changed called when there is more to draw
+   * @param {number} memory maximum bytes of textures
    */
   constructor(gl, source, changed, memory = MEMORY) {
     this.gl = gl;
@@ -28,7 +28,7 @@ export class SplatScene {
     /** @type {Middle | null} */
     this.middle = null;
     this.whole = false;
-    /** How many Gaussians the last order knew of, and how many it draws. */
+    /** Number of Gaussians that the last order includes, and number that it draws. */
     this.sortedOf = 0;
     this.drawn = 0;
     /** @type {Map<string, WebGLTexture>} */
@@ -109,10 +109,10 @@ export class SplatScene {
   }
 
   /**
-   * Whole rows, then what is left of the last one.
+   * Upload texels to a texture: whole rows first, then the rest of the last one.
    *
    * @param {WebGLTexture | null | undefined} texture
-   * @param {number} begin texel, at the beginning of a row
+   * @param {number} begin first texel, at the start of a row
    * @param {Uint32Array | Uint16Array} data
    * @param {number} form
    * @param {number} type
@@ -128,7 +128,7 @@ export class SplatScene {
   }
 
   /**
-   * Another color set: three halves for each Gaussian, as `colors.f16` has them.
+   * Add a color set: three halves for each Gaussian, as in `colors.f16`.
    *
    * @param {string} name
    * @param {ReadableStream<Uint8Array>} stream
@@ -155,11 +155,11 @@ export class SplatScene {
   }
 
   /**
-   * Ask for an order, unless one is being computed.
+   * Request a depth order, unless one is being computed.
    *
    * @param {Pose} pose
-   * @param {number} number of the pose
-   * @returns {boolean} whether it was asked for
+   * @param {number} number number of the pose
+   * @returns {boolean} whether it was requested
    */
   sort(pose, number) {
     if (this.busy || !this.loaded) return false;
@@ -183,13 +183,13 @@ export class SplatScene {
     this.sortedFor = number;
   }
 
-  /** Bytes of its textures and its order. */
+  /** Bytes of the scene's textures and its order. */
   get bytes() {
     const count = this.header?.count ?? 0;
     return count * (32 + 16 * (this.texels ?? 0) + 6 * this.colors.size) + this.room * 4;
   }
 
-  /** Let go of everything. */
+  /** Free all resources. */
   end() {
     this.worker.terminate();
     const { gl } = this;

@@ -18,7 +18,7 @@ export const unit = (a) => times(a, 1 / (Math.hypot(...a) || 1));
 
 /**
  * @param {Vector} a
- * @param {Vector} axis of length 1
+ * @param {Vector} axis unit vector
  * @param {number} angle radians
  */
 export function rotated(a, axis, angle) {

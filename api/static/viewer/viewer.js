@@ -1,34 +1,34 @@
 // @ts-check
-/** Draws one or two scenes with two color sets and a wipe between them; only when something has changed. */
+/** Viewer of one or two scenes with two color sets and a wipe between them. It draws only after a change. */
 import { ViewCamera } from "./camera.js";
 import { lineFragment, lineVertex, overBackground, splatFragment, splatVertex, wholeVertex } from "./shaders.js";
 import { SplatScene } from "./splat_scene.js";
 import { words } from "../words.js";
 
-/** @typedef {{scene: SplatScene, colors: string, fade?: number}} Side what stands on one side of the wipe */
+/** @typedef {{scene: SplatScene, colors: string, fade?: number}} Side what is shown on one side of the wipe */
 /** @typedef {{program: WebGLProgram, at: (name: string) => WebGLUniformLocation | null}} Program */
 
-/** Milliseconds of a frame above which a moving picture has half, or a fourth, as many pixels on each side. */
+/** Milliseconds of a frame above which a moving view is drawn at a half, or at a quarter, of the resolution. */
 const SLOW = 70, VERY_SLOW = 350;
-/** Milliseconds without movement after which it has all. */
+/** Milliseconds without movement after which the full resolution is drawn. */
 const STILL = 160;
-/** Of lines, and how much of what is behind them they hide. */
+/** Color of lines, and their opacity. */
 const INK = [0.98, 0.6, 0.28, 0.55];
 
 export class Viewer {
-  /** A program for each degree of harmonics and depth of their textures. @type {Map<number, Program>} */
+  /** Programs by degree of harmonics and size of their textures. @type {Map<number, Program>} */
   splatPrograms = new Map();
-  /** What is blended into. @type {WebGLFramebuffer | null} */
+  /** Framebuffer for blending. @type {WebGLFramebuffer | null} */
   frame = null;
   /** @type {WebGLTexture | null} */
   picture = null;
   pictureSize = [0, 0];
-  /** What the camera was last set to show whole. @type {SplatScene["middle"]} */
+  /** The scene bounds that the camera was last set to show. @type {SplatScene["middle"]} */
   framed = null;
 
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {() => void} told the state has changed
+   * @param {() => void} told called after each change of the state
    */
   constructor(canvas, told = () => {}) {
     this.canvas = canvas;
@@ -36,14 +36,14 @@ export class Viewer {
     this.camera = new ViewCamera();
     /** @type {{left: Side, right: Side} | null} */
     this.sides = null;
-    /** Share of the width that shows the left side. */
+    /** Fraction of the width that shows the left side. */
     this.cut = 0;
     this.background = [0, 0, 0];
-    /** Lines in the world, pairs of points [n * 2 * 3]. */
+    /** Lines in the world, as pairs of points [n * 2 * 3]. */
     this.lines = new Float32Array(0);
     this.touched = false;
     this.frames = 0;
-    /** Of the last frames, milliseconds from its begin to its end on the GPU. @type {number[]} */
+    /** GPU times of the last frames in milliseconds. @type {number[]} */
     this.milliseconds = [];
     this.lost = false;
     this.ended = false;
@@ -106,7 +106,7 @@ export class Viewer {
   }
 
   /**
-   * Begin to read a scene. It is shown once it stands on a side.
+   * Start to read a scene. It is shown once it is on a side of the wipe.
    *
    * @param {File | string} source
    */
@@ -139,14 +139,14 @@ export class Viewer {
     this.draw();
   }
 
-  /** The view has moved. */
+  /** Update after a movement of the camera. */
   moved() {
     this.touched = true;
     this.movedAt = performance.now();
     this.draw();
   }
 
-  /** Draw with the next frame. */
+  /** Request a frame. */
   draw() {
     this.settled = false;
     this.canvas.dataset.state = "drawing";
@@ -174,7 +174,7 @@ export class Viewer {
     this.requested = requestAnimationFrame(() => (this.settled ? this.settle() : this.step()));
   }
 
-  /** Wait until the last picture is there, then rest. */
+  /** Wait until the last frame is finished, then stop. */
   settle() {
     this.requested = 0;
     if (this.lost || this.ended) return;
@@ -188,7 +188,7 @@ export class Viewer {
     this.told();
   }
 
-  /** Whether the GPU is through with the last frame. */
+  /** Return whether the GPU has finished the last frame. */
   finished() {
     const { gl } = this;
     if (!this.fence) return true;
@@ -203,7 +203,7 @@ export class Viewer {
     return true;
   }
 
-  /** Have the scenes sorted for this view; whether the picture is not yet that of the newest order. */
+  /** Request depth orders for this view, and return whether the displayed order is out of date. */
   askForOrder() {
     if (!this.sides) return false;
     let waiting = false;
@@ -225,7 +225,7 @@ export class Viewer {
     return { axes: this.camera.axes, eye: this.camera.eye, tan: [width / 2 / fx, height / 2 / fy], near: this.camera.near };
   }
 
-  /** Pixels of the canvas. */
+  /** Return the size of the canvas in pixels. */
   size() {
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     return [Math.max(1, Math.round(this.canvas.clientWidth * ratio)), Math.max(1, Math.round(this.canvas.clientHeight * ratio))];
@@ -251,7 +251,8 @@ export class Viewer {
   }
 
   /**
-   * The picture that is blended into: halves, since bytes would lose faint Gaussians.
+   * Bind the framebuffer for blending, with a texture of this size. It has half precision if the browser supports that,
+   * because 8 bits would lose faint Gaussians.
    *
    * @param {number} width
    * @param {number} height
@@ -294,7 +295,7 @@ export class Viewer {
   /**
    * @param {Side} left
    * @param {Side} right colors of the same scene
-   * @param {number} cut pixels
+   * @param {number} cut position of the wipe in pixels
    * @param {number} width
    * @param {number} height
    */
@@ -376,13 +377,13 @@ export class Viewer {
   }
 
   /**
-   * The picture as it stands.
+   * Return the current view as a PNG.
    *
    * @returns {Promise<Blob>}
    */
   picturePng() {
     this.scale = 1;
-    this.render(); // a canvas forgets its picture when the task ends
+    this.render(); // a canvas drops its content when the task ends
     return new Promise((done, wrong) => this.canvas.toBlob((blob) => (blob ? done(blob) : wrong(new Error(words.viewer.noPicture))), "image/png"));
   }
 
@@ -394,7 +395,7 @@ export class Viewer {
     this.told();
   }
 
-  /** The GPU is back, without anything that was on it: everything is read again. */
+  /** Reload everything after a lost GPU context is restored. */
   restore() {
     this.lost = false;
     this.prepare();
@@ -408,7 +409,7 @@ export class Viewer {
   /** @type {((sides: {left: Side, right: Side}) => void) | undefined} */
   onReload;
 
-  /** Let go of everything. */
+  /** Free all resources. */
   end() {
     this.ended = true;
     cancelAnimationFrame(this.requested);

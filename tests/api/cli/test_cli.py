@@ -1,4 +1,4 @@
-"""The `sgsst` command from end to end, on files so small that a job takes seconds."""
+"""End-to-end tests of the `sgsst` command, on files so small that a job takes seconds."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @dataclass
 class Files:
-    """A job's inputs, and the folder that its output goes into."""
+    """Inputs of a job, and the path of its output."""
 
     ply: Path
     cameras: Path
@@ -57,7 +57,7 @@ def files(tmp_path: Path) -> Files:
 
 
 def second_reader(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a binary little-endian PLY of floats, without plyfile."""
+    """Return the columns of a binary little-endian PLY of floats, read without plyfile."""
     head, _, body = path.read_bytes().partition(b"end_header\n")
     names = [line.split()[2].decode() for line in head.splitlines() if line.startswith(b"property")]
     count = next(int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element"))
@@ -334,7 +334,7 @@ def test_a_target_ends_the_run_and_the_report_says_what_the_time_bought(
 
 
 def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    """With next to no learning rate nothing falls: two windows of 24 steps, and the run ends."""
+    """With almost no learning rate the loss does not fall, so the run ends after two windows of 24 steps."""
     options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9", "--no-bounded"]
     assert main(files.stylize(*options)) == 0
     assert "has stopped falling" in capsys.readouterr().out
@@ -433,12 +433,12 @@ def test_a_report_that_fails_does_not_lose_the_scene(files: Files, capsys: pytes
     assert len(read_scene(files.out).scene) == len(wall())
 
 
-# --- stopping and going on -----------------------------------------------------------------------------------------
+# --- stop and resume -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
-    options = files.stylize("--steps-sos", "150", "--learning-rate", "0.1")  # a second: time for a signal to arrive
+    options = files.stylize("--steps-sos", "150", "--learning-rate", "0.1")  # a second: a signal arrives during it
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "api.cli", *options]
     with subprocess.Popen(
@@ -446,10 +446,10 @@ def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: py
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            if line.startswith("schedule"):  # from here on Ctrl-C lets the step in hand finish
+            if line.startswith("schedule"):  # from here on, Ctrl-C lets the current step finish
                 break
         process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=600)  # compiling the kernels included
+        _, error = process.communicate(timeout=600)  # includes compilation of the kernels
     assert process.returncode == 130, error
     assert "Traceback" not in error
     checkpoint = files.out.with_name("stylized.checkpoint.safetensors")
@@ -471,7 +471,7 @@ def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: py
 
 @pytest.mark.parametrize("command", ["plan", pytest.param("stylize", marks=pytest.mark.slow)])
 def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, command: str) -> None:
-    """On a terminal, whose bar tells when the views are looked at; of so many that the signal comes in between."""
+    """The bar of a terminal shows the survey, and there are enough views for the signal to arrive during it."""
     views, out = 2000, files.out if command == "stylize" else files.out.with_name("plan.json")
     inputs = [str(files.ply), "--style", str(files.style), "--orbit", str(views), "--backbone", "vgg16"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "120"}
@@ -492,7 +492,7 @@ def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, comm
 
 
 def _shown_until(terminal: int, pattern: str | None) -> str:
-    """What a program writes to its terminal until a pattern comes; until it ends with None."""
+    """Return what a program writes to its terminal until a pattern matches; with None, until the program ends."""
     shown = ""
     while pattern is None or not re.search(pattern, shown):
         try:
@@ -622,7 +622,7 @@ def _style_is_missing(files: Files) -> list[str]:
 
 
 def _style_is_a_bomb(files: Files) -> list[str]:
-    """A PNG of a few hundred bytes whose header declares 90000 x 90000 pixels."""
+    """Write a PNG of a few hundred bytes whose header declares 90000 x 90000 pixels."""
 
     def chunk(name: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
@@ -748,7 +748,7 @@ def test_photos_of_an_orbit_are_an_error(files: Files, capsys: pytest.CaptureFix
 def test_a_folder_without_write_permission_is_refused_before_any_work(
     files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if os.geteuid() == 0:  # root may write anywhere but where the kernel itself refuses
+    if os.geteuid() == 0:  # root may write anywhere except where the kernel itself refuses
         folder = Path("/proc")
         if not folder.is_dir():
             pytest.skip("root can write everywhere on this system")

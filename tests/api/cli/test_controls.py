@@ -1,4 +1,4 @@
-"""What artists ask for, through the command: told in the plan, done in the result, refused before the work."""
+"""Tests of artistic controls on the command line: shown in the plan, applied to the result, checked before the run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sgsst demo`, cut down to one step on small views: the same files and the same path through the program."""
+"""Test of `sgsst demo`, reduced to one step on small views: the same files and code path as the full demo."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_demo_stylizes_its_own_scene_and_says_where_the_results_are(
     assert report["loss"]["relative"] < 0.9
     assert report["cameras"]["count"] == 10
 
-    # what it prints is the command that it ran
+    # The printed command is the one that ran.
     command = next(line for line in shown.splitlines() if line.startswith("command:")).removeprefix("command:")
     arguments = shlex.split(command)
     assert arguments[:3] == ["sgsst", "stylize", str(out / "motorcycle.ply")]

@@ -64,7 +64,7 @@ def test_scene_is_of_a_size_to_work_with(scene: Scene) -> None:
     ids=["left", "right"],
 )
 def test_both_photos_come_back_from_their_cameras(scene: Scene, photo: int, camera: Camera) -> None:
-    """The right photo tests the calibration: all but its occluded parts are the left photo's pixels, moved by depth."""
+    """The right photo tests the calibration: its pixels are those of the left one, moved by depth, unless occluded."""
     image, coverage = render(scene, camera)
     expected = torch.from_numpy(data.stereo_motorcycle()[photo] / 255.0).float()
     error = (image.clamp(0, 1) - expected).square().mean()
@@ -85,7 +85,7 @@ def test_views_have_hardly_a_hole(demo: DemoScene, scene: Scene) -> None:
 
 
 def test_no_gaussian_is_stretched_over_an_edge(scene: Scene) -> None:
-    """Never longer than the steepest allowed slope makes a merged pixel (in both directions, obliquely seen)."""
+    """No Gaussian is longer than a merged pixel at the steepest allowed slope (in both directions, seen obliquely)."""
     radii = scene.scales.exp()
     footprint = scene.means[:, 2] / FOCAL
     longest = radii.max(dim=1).values / footprint
@@ -97,7 +97,7 @@ def test_no_gaussian_is_stretched_over_an_edge(scene: Scene) -> None:
 
 
 def test_discs_lie_in_their_surface() -> None:
-    """Samples of a slanted plane: centers on it, thin axes along its normal, round projections of one pixel's width."""
+    """Discs on a slanted plane have centers on it, thin axes along its normal, and round projections 1 pixel wide."""
     slope_x, slope_y, constant = 0.03, -0.05, 40.0
     generator = np.random.default_rng(0)
     x, y = generator.uniform(0, 741, 50), generator.uniform(0, 500, 50)

@@ -1,4 +1,4 @@
-"""`sgsst fsck`: every file that is missing, damaged or orphaned is found, and mended where that is possible."""
+"""Tests of `sgsst fsck`: missing, damaged and orphaned files are found, and repaired where possible."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MISSING, DAMAGED, ORPHANED, ROLLED_BACK = 4, 8, 16, 32
 
 @pytest.fixture(autouse=True)
 def umask() -> Iterator[None]:
-    """The command changes that of its process, which is this one."""
+    """Restore the umask, which the command changes in this process."""
     before = os.umask(0o022)
     yield
     os.umask(before)
@@ -61,7 +61,7 @@ def service(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
 
 @dataclass
 class Files:
-    """A service's files, and how they are lost and damaged."""
+    """Files of a service, with methods that lose and damage them."""
 
     folder: Path
     settings: ServiceSettings = field(init=False)
@@ -79,7 +79,7 @@ class Files:
         return path
 
     def input(self, content: bytes) -> str:
-        """Take a file in, and return its name."""
+        """Store an input, and return its name."""
         sha256 = self.blobs.keep(self.file(content))
         return f"blobs/{self.store.inputs.blobs([sha256])[sha256].location}"
 
@@ -108,7 +108,7 @@ class Files:
         return self.store.inputs.parts(row.id)[0].location
 
     def orphan(self, name: str) -> None:
-        """Put a file that no row refers to."""
+        """Create a file that no row refers to."""
         objects = self.place(name)
         if objects.local:
             Path(objects.root, name).parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +121,7 @@ class Files:
         self.place(name).remove(name)
 
     def flip(self, name: str, order: random.Random) -> None:
-        """Change one bit of a file."""
+        """Flip one bit of a file."""
         objects = self.place(name)
         content = bytearray(b"".join(objects.read(name, 0, objects.size(name))))
         content[order.randrange(len(content))] ^= 1 << order.randrange(8)
@@ -130,7 +130,7 @@ class Files:
 
 
 def run(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, dict[str, str]]]:
-    """The exit code, and what was found by the files' names."""
+    """Run the command; return its exit code and its findings by file name."""
     capsys.readouterr()
     code = main(["fsck", "--json", *options])
     found = {finding["name"]: finding for finding in json.loads(capsys.readouterr().out)}
@@ -204,7 +204,7 @@ def test_what_is_found_is_mended(
 
 
 def test_a_service_at_work_is_no_finding(service: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    """Files that come, are replaced and go while they are checked are not taken for lost or orphaned."""
+    """Files that are added, replaced or deleted during the check are not reported as missing or orphaned."""
     stop = threading.Event()
 
     def work() -> None:

@@ -1,5 +1,4 @@
-"""Options are declared once: commands, parameters of the API and the reference have all of them, with the same words
-and the same bounds."""
+"""Tests that commands, API parameters and the reference share one declaration per option, with its words and bounds."""
 
 from __future__ import annotations
 
@@ -25,15 +24,15 @@ from worker.request import SceneRequest
 
 ROOT = Path(__file__).resolve().parents[3]
 OPTIONS = declared(StylizeOptions)
-#: Options that the API has not, and parameters that `sgsst stylize` has not, with the reason.
-OPERATORS = {"resume", "checkpoint_seconds", "rank_timeout"}  # the service's operator says this for all jobs
-SERVICES = {"name"}  # for people who look at a list of jobs
-#: Numbers that measure nothing.
+#: Options that the API lacks, and parameters that `sgsst stylize` lacks, with the reason.
+OPERATORS = {"resume", "checkpoint_seconds", "rank_timeout"}  # the service's operator sets these for all jobs
+SERVICES = {"name"}  # for users who read a list of jobs
+#: Numbers that are not a quantity.
 NO_QUANTITY = {"seed"}
 
 
 def shown(command: str) -> dict[str, str]:
-    """Help texts of a command's options by their flags."""
+    """Return the help texts of a command's options by their flags."""
     group: Any = typer.main.get_command(app)
     return {"/".join(each.opts + each.secondary_opts): each.help for each in group.commands[command].params}
 
@@ -74,7 +73,7 @@ def test_commands_and_parameters_have_every_option() -> None:
 
 
 def outside(option: Declared) -> list[float]:
-    """Numbers just beyond an option's bounds."""
+    """Return numbers just outside an option's bounds."""
     found: list[float] = []
     for item in option.limits:
         if isinstance(item, Ge | Le):
@@ -92,14 +91,14 @@ BEYOND = [(name, value) for name, option in OPTIONS.items() for value in outside
 def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValidationError) as refused:
         JobParameters.model_validate({name: value})
-    error = refused.value.errors()[0]  # a second one says which word may stand for a number
+    error = refused.value.errors()[0]  # a second one lists the words that may replace a number
     if name in declared(Settings):
         with pytest.raises(SettingsError, match=declared(Settings)[name].field):
             make_settings(**{declared(Settings)[name].field: value})  # type: ignore[arg-type]
     if name in ViewOptions.model_fields:
         with pytest.raises(SettingsError, match=name):
             checked(SceneRequest, {"scene": "scene.ply", name: value})
-    if name == "memory_limit":  # its form on the command line has no digits for these
+    if name == "memory_limit":  # its command-line format has no digits for these
         return
     for command in ("stylize", "submit"):
         assert main([command, "scene.ply", "--style", "x.png", "--out", "x.ply", flags(OPTIONS[name]), str(value)]) == 2
@@ -109,7 +108,7 @@ def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.
 
 
 def test_bounds_have_settings_numbers_and_no_other(capsys: pytest.CaptureFixture[str]) -> None:
-    """Where a number ends, the number itself is in, or out, as the help says."""
+    """A bound itself is valid or not, as the help says."""
     assert {name for name, option in OPTIONS.items() if option.bounds} == {name for name, _ in BEYOND}
     assert OPTIONS["similar_views"].bounds == "0<=x<1"
     assert OPTIONS["near"].bounds == "x>0"

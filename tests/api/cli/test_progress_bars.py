@@ -1,4 +1,4 @@
-"""The bar of a job: on a terminal it is drawn, in a log there is a line now and then."""
+"""Tests of a job's progress: a bar on a terminal, and lines at intervals in a log."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from worker.description import Prepared
 
 
 def shown(*, terminal: bool) -> str:
-    """What is printed of a small job."""
+    """Return the output for a small job."""
     console = Console(file=io.StringIO(), force_terminal=terminal, width=120, color_system=None)
     with job_bar(console) as bar:
         for done, left in [(0, None), (3, 125.0), (8, 0.0)]:
             bar.show_planning(PlanningProgress(done, 8, left))
-            bar._bar.refresh()  # now, rather than in the next tenth of a second
+            bar._bar.refresh()  # now, instead of within a tenth of a second
         bar.start(Prepared([], 0, 50))
         for step in (1, 2):
             bar.show(Progress("coarse", step, 50, 123.4, 1.0, 61.0))

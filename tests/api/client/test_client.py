@@ -1,4 +1,4 @@
-"""`Client` and `AsyncClient` against the API in its real process: one source, and the same scenarios through both."""
+"""Tests of `Client` and `AsyncClient` against the API in a real process, with the same scenarios for both."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def store(service: Service) -> Iterator[Store]:
 
 @pytest.fixture(autouse=True)
 def no_waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """As many tries as outside of tests, without the seconds between them."""
+    """Allow as many attempts as outside of tests, without waits between them."""
     monkeypatch.setattr("api.client.events.FIRST_WAIT", 0.0)
     with stamina.set_testing(True, attempts=TRIES):
         yield
 
 
 class Awaited:
-    """An `AsyncClient` to be called as a `Client`: what runs through it runs in an event loop of its own."""
+    """Adapter that lets tests call an `AsyncClient` like a `Client`, in an event loop of its own."""
 
     def __init__(self, url: str) -> None:
         self._runner = asyncio.Runner()
@@ -189,7 +189,7 @@ def test_a_job_from_its_upload_to_its_removal(
 
 
 def finish(store: Store, service: Service, job_id: str, content: bytes, folder: Path) -> bytes:
-    """Do a dispatcher's part for a job that is queued: its result is the content."""
+    """Play the dispatcher for a queued job, whose result is the given content."""
     while (lease := store.leases.take("test")) is not None and lease.job_id != job_id:
         store.leases.stop(lease)
     assert lease is not None
@@ -240,7 +240,7 @@ def test_a_plan_tells_how_far_it_is(connect: Any, service: Service, files: dict[
             files["scene"],
             files["style"],
             planning=lambda done, total: told.append((done, total)),
-            learning_rate=0.1 if connect is Client else 0.3,  # what has been planned is remembered, and tells nothing
+            learning_rate=0.1 if connect is Client else 0.3,  # a plan that is cached sends no progress
             **options,
         )
         assert (plan["gaussians"], plan["views"]) == (616, 3)
@@ -263,11 +263,11 @@ def test_one_upload_serves_many_jobs(connect: Any, service: Service, files: dict
 
 
 class Relay:
-    """Passes connections on to a server, and cuts each one off after so many bytes of its answer.
+    """Proxy that forwards connections to a server, and cuts each one off after a number of bytes of its answer.
 
     Args:
-        port: of the server, on this machine.
-        limits: bytes of each connection, one after the other; later ones are not cut off.
+        port: Port of the server on this machine.
+        limits: Bytes of each connection, in order; later connections are not cut off.
     """
 
     def __init__(self, port: int, limits: list[int]) -> None:
@@ -318,7 +318,7 @@ def test_a_download_goes_on_where_it_broke_off(
         job_id = client.submit(files["scene"], files["style"], orbit=2).id
     content = finish(store, service, job_id, hashlib.sha256(job_id.encode()).digest() * 100_000, tmp_path)
     told: list[tuple[int, int]] = []
-    # a block is written once it is whole: the first connection leaves one, the second adds none, the third another
+    # A block is written once it is complete: the first connection leaves one, the second none, the third another one.
     with (
         Relay(int(service.environment["SGSST_PORT"]), [1_500_000, 700, 1_500_000]) as relay,
         connect(relay.url) as client,
@@ -375,9 +375,9 @@ def test_events_go_on_where_they_broke_off(
 def test_uploads_go_on_where_they_broke_off(
     connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The answer to a part is lost, so that the part is sent again, which the service refuses: it has it already."""
+    """The answer to a part is lost. The client sends the part again, and the service refuses it as already received."""
     monkeypatch.setattr(uploads, "PART_BYTES", 20_000)
-    # connections are kept open: each relay's first one carries the creation's answer, and not that of the first part
+    # Connections stay open: the first one of each relay passes the answer to the creation, not that to the first part.
     with Relay(int(service.environment["SGSST_PORT"]), [900]) as relay, connect(relay.url) as client:
         uploaded = client.upload(files["scene"])
         assert relay.cuts == 1

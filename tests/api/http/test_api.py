@@ -1,4 +1,4 @@
-"""The API by itself, in its real process: what it refuses and how, uploads, keys, memory."""
+"""Tests of the API in a real process: refusals, uploads, keys and memory."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def client(service: Service) -> Iterator[httpx.Client]:
 
 
 def form(files: dict[str, bytes], **changed: bytes | tuple[str, bytes] | None) -> list[tuple[str, Any]]:
-    """Multipart fields; a changed one may bring its own file name, None leaves it out."""
+    """Return multipart fields. A changed field may have a file name of its own; None removes it."""
     names = {"scene": "scene.ply", "cameras": "cameras.json", "style": "style.png"}
     parts: list[tuple[str, Any]] = []
     for role in {**files, **changed}:
@@ -76,7 +76,7 @@ def form(files: dict[str, bytes], **changed: bytes | tuple[str, bytes] | None) -
 
 
 def refused(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
-    """The problem document, after a look at its form."""
+    """Check the format of a problem document, and return it."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     check_documented(answer)
@@ -96,7 +96,7 @@ def jobs_of(client: httpx.Client) -> list[str]:
 
 
 def png(width: int, height: int, rows: bytes) -> bytes:
-    """A PNG that says it has so many pixels."""
+    """Return a PNG that declares this size."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -110,12 +110,12 @@ def lying(scene: bytes, count: int) -> bytes:
 
 
 def bomb() -> bytes:
-    """75 MB of black in 73 kB."""
+    """Return a PNG of 73 kB that expands to 75 MB of black pixels."""
     return png(5000, 5000, zlib.compress(bytes(15_001 * 5000), 9))
 
 
 def moved(cameras: bytes) -> bytes:
-    """The cameras a million units away."""
+    """Move the cameras a million units away."""
     return cameras.replace(b'"position": [', b'"position": [1e6, 1e6, 1e6], "before": [')
 
 
@@ -208,7 +208,7 @@ def test_missing_and_surplus_files(client: httpx.Client, files: dict[str, bytes]
 
 
 def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes]) -> None:
-    """In their order, however they come; and one weight for each."""
+    """Styles keep their order, whether uploaded or sent, and each needs one weight."""
     other = png(40, 30, zlib.compress(bytes(30 * (1 + 3 * 40))))
     headers = {
         "Tus-Resumable": "1.0.0",
@@ -289,7 +289,7 @@ def test_names_lead_nowhere(client: httpx.Client, files: dict[str, bytes]) -> No
 def test_stored_jobs_are_shown_as_they_were_stored(
     service: Service, client: httpx.Client, files: dict[str, bytes]
 ) -> None:
-    """Whatever parameters are called today: of a job that this version would refuse, only a retry is refused."""
+    """Parameter names that this version lacks are shown as stored. Only a retry of such a job is refused."""
     made = client.post("/v1/jobs", files=form(files)).json()
     store = open_store(ServiceSettings(data=service.data))
     told = {"preset": "preview", "sharpness": 3, "steps_sos": -5, "workers": "many"}
@@ -307,7 +307,7 @@ def test_stored_jobs_are_shown_as_they_were_stored(
 
 
 def value_of(option: Declared) -> object:
-    """One that an option may have."""
+    """Return a valid value of an option."""
     kind = kind_of(option)
     if kind is bool:
         return True
@@ -347,7 +347,7 @@ def test_the_command_line_sends_every_parameter(
 
 
 def raw(service: Service, head: str, body: bytes, *, close: bool = True) -> bytes:
-    """What the service answers to exactly these bytes."""
+    """Return the service's answer to exactly these bytes."""
     host, port = service.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=30) as connection:
         connection.sendall(head.replace("\n", "\r\n").encode() + b"\r\n\r\n" + body)
@@ -371,7 +371,7 @@ def test_a_body_that_is_cut_off(service: Service, client: httpx.Client, files: d
     head = (
         f"POST /v1/jobs HTTP/1.1\nHost: 127.0.0.1\nContent-Length: {len(body)}\nContent-Type: {headers['content-type']}"
     )
-    raw(service, head, body[: len(body) // 2])  # the connection breaks
+    raw(service, head, body[: len(body) // 2])  # the client disconnects
     assert jobs_of(client) == before
     wait_for(lambda: not list((service.data / "incoming").iterdir()), "half files to be removed")
 
@@ -382,7 +382,7 @@ def test_a_connection_may_rest_between_requests(service: Service) -> None:
     with socket.create_connection((host, int(port)), timeout=30) as connection:
         connection.sendall(post.encode())
         assert b" 422 " in connection.recv(65536).splitlines()[0]
-        time.sleep(2.5)  # longer than a request may stand still
+        time.sleep(2.5)  # longer than a request may stall
         connection.sendall(b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
         answer = b"".join(iter(lambda: connection.recv(65536), b""))
         assert b"HTTP/1.1 200 OK" in answer
@@ -624,7 +624,7 @@ def _answers(url: str) -> bool:
 
 
 def test_a_stream_with_nothing_left_to_tell(client: httpx.Client, files: dict[str, bytes]) -> None:
-    """Of a job that has ended, after its last event or one that never was: it would not end."""
+    """A stream would never end after the last event of an ended job, or after an event that does not exist."""
     job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
     client.post(f"/v1/jobs/{job_id}/cancel")
     told = client.get(f"/v1/jobs/{job_id}/events").text
@@ -696,7 +696,7 @@ def test_metrics_tell_what_became_of_attempts(tmp_path: Path, files: dict[str, b
             for name, number in found.items()
             if name.startswith("sgsst_queue_wait_seconds_bucket")
         }
-        # the first waited hardly, the other three (one of them twice) a thousand seconds
+        # The first waited briefly, the other three (one of them twice) a thousand seconds.
         assert (waits[15.0], waits[900.0], waits[1800.0], waits[float("inf")]) == (1, 1, 4, 4)
         assert found["sgsst_job_seconds_count"] == found["sgsst_outages_total"] == "0.0"
         assert found["sgsst_iterations_per_second"] == "5.0"

@@ -1,4 +1,4 @@
-"""The running service, one of whose readers has been taken over by a scene."""
+"""Test of the running service with a reader process that a scene has taken over."""
 
 from __future__ import annotations
 

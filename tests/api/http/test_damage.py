@@ -1,4 +1,4 @@
-"""Files that the disk has lost or changed: they are neither sent nor used, and come back when they are sent again."""
+"""Tests of files that the disk has lost or changed: they are neither sent nor used, and a new upload restores them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, byte
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     data = tmp_path_factory.mktemp("damage") / "data"
     data.mkdir()
-    data.chmod(0o755)  # as an earlier version left it
+    data.chmod(0o755)  # as an earlier version created it
     with Service(data, alone=True) as running:
         yield running
 
@@ -63,7 +63,7 @@ def lease_of(store: Store, job_id: str) -> Lease:
 
 
 def publish(service: Service, store: Store, job_id: str, name: str, content: bytes, folder: Path) -> Path:
-    """Make a file a result of a job; returns where it lies."""
+    """Publish a file as a result of a job, and return its path."""
     artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
     source = folder / "made"
     source.write_bytes(content)
@@ -74,7 +74,7 @@ def publish(service: Service, store: Store, job_id: str, name: str, content: byt
 
 
 def flip(path: Path) -> None:
-    """Change one bit of a file in its place."""
+    """Flip one bit of a file in place."""
     path.chmod(0o600)
     with path.open("r+b") as file:
         file.seek(path.stat().st_size // 2)
@@ -149,7 +149,7 @@ def test_a_file_that_is_sent_again_comes_back(
 def test_nobody_else_can_read_the_data(service: Service, client: httpx.Client, files: dict[str, Any]) -> None:
     submit(client, files)
     assert stat.S_IMODE(service.data.stat().st_mode) == 0o700
-    # below the folder of results are those of this test's process
+    # Folders below that of the results belong to the process of this test.
     own = [path for path in service.data.rglob("*") if "artifacts" not in path.parts[:-1]]
     assert {"sgsst.db", "sgsst.db-wal", "artifacts"} <= {path.name for path in own}
     assert not [path for path in own if path.stat().st_mode & 0o077]

@@ -1,4 +1,4 @@
-"""The OpenAPI document: whole, with an example of everything, and every example as its schema says."""
+"""Tests of the OpenAPI document: complete, with an example of everything, and all examples valid."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def resolved(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def examples_of(described: dict[str, Any]) -> list[object]:
-    """Of a media type, a parameter or a header: its own ones, or those of its schema."""
+    """Return the examples of a media type, a parameter or a header, or those of its schema."""
     own = [entry["value"] for entry in described.get("examples", {}).values()]
     if "example" in described:
         own.append(described["example"])
@@ -36,7 +36,7 @@ def examples_of(described: dict[str, Any]) -> list[object]:
 
 
 def check(where: str, described: dict[str, Any]) -> None:
-    """Fail without an example, or with one that is not as the schema says."""
+    """Fail if there is no example, or one that violates its schema."""
     found = examples_of(described)
     assert found, f"{where}: no example"
     schema = {**described["schema"], "components": DOCUMENT["components"]}
@@ -47,7 +47,7 @@ def check(where: str, described: dict[str, Any]) -> None:
 
 
 def bodies(operation: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every media type of request and answers."""
+    """Yield every media type of the request and the answers."""
     for kind, body in operation.get("requestBody", {}).get("content", {}).items():
         yield f"request {kind}", body
     for status, answer in operation["responses"].items():
@@ -79,7 +79,7 @@ def test_every_operation_has_examples(label: str, operation: dict[str, Any]) -> 
 
 @pytest.mark.parametrize(("label", "operation"), OPERATIONS, ids=[label for label, _ in OPERATIONS])
 def test_every_refusal_has_its_codes(label: str, operation: dict[str, Any]) -> None:
-    """Each error status lists its codes, each code has an example, and it is one of that status."""
+    """Each error status lists its codes, and each code has an example of that status."""
     refusals = {int(status): answer for status, answer in operation["responses"].items() if int(status) >= 400}
     assert {400, 431, 500} <= refusals.keys()
     assert {401, 403} <= refusals.keys() or "security" not in operation

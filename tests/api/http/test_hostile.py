@@ -1,4 +1,4 @@
-"""Hostile requests against the real API: each is refused with a problem document, costs no memory, leaves nothing."""
+"""Tests of hostile requests against the real API: each gets a problem document, and leaves no files or used memory."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import wall, write_files
 
 MB = 1_000_000
-#: What the API may grow by during one test, at its peak.
+#: Maximum growth in bytes of the API process during one test, at its peak.
 GROWTH = 48 * MB
-#: Seconds after which the service under test gives up a body, or a request's head, that stands still.
+#: Seconds after which the service under test gives up on a stalled body or head.
 STILL = 2.0
 TUS = {"Tus-Resumable": "1.0.0"}
 OFFSET_STREAM = "application/offset+octet-stream"
@@ -58,7 +58,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory: pytest.TempPathFactory) -> Files:
-    """The scene in other forms."""
+    """Return the scene in other formats."""
     folder, scene = tmp_path_factory.mktemp("packed"), wall()
     found: Files = {}
     for form in PACKED_FORMS:
@@ -85,7 +85,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, files: Files) -> Iterator[
         "SGSST_MAX_JOBS_PER_KEY": "10000",
     }
     with Service(tmp_path_factory.mktemp("hostile") / "data", alone=True, **limits) as running:
-        with running.client() as client:  # what is loaded once is no growth
+        with running.client() as client:  # One-time allocations do not count as growth.
             assert client.post("/v1/jobs", files=form(files)).status_code == 202
             client.get("/openapi.json")
         yield running
@@ -106,10 +106,10 @@ def store(service: Service) -> Iterator[Store]:
 
 @pytest.fixture(autouse=True)
 def unharmed(service: Service) -> Iterator[None]:
-    """Around each test: the API is the same process, has not grown, left no half file, and did not break."""
+    """Check around each test that the API is the same process, has not grown or failed, and left no partial file."""
     before = api_of(service)
     logged = service.log.stat().st_size
-    Path(f"/proc/{before.pid}/clear_refs").write_text("5")  # the peak is counted from here
+    Path(f"/proc/{before.pid}/clear_refs").write_text("5")  # reset the peak memory
     start = memory_of(before, "VmRSS")
     yield
     assert api_of(service).pid == before.pid
@@ -137,7 +137,7 @@ def memory_of(process: psutil.Process, field: str) -> int:
 
 
 def form(files: Files, **changed: bytes | tuple[str, bytes] | None) -> list[tuple[str, Any]]:
-    """Multipart fields; a changed one may bring its own file name, None leaves it out."""
+    """Return multipart fields. A changed field may have a file name of its own; None removes it."""
     names = {"scene": "scene.ply", "cameras": "cameras.json", "style": "style.png"}
     parts: list[tuple[str, Any]] = []
     for role in {**files, **changed}:
@@ -148,7 +148,7 @@ def form(files: Files, **changed: bytes | tuple[str, bytes] | None) -> list[tupl
 
 
 def refused(answer: httpx.Response, status: int, *codes: str) -> dict[str, Any]:
-    """The problem document, after a look at its form."""
+    """Check the format of a problem document, and return it."""
     assert answer.status_code == status, f"{answer.status_code} {answer.text[:500]}"
     assert answer.headers["content-type"] == "application/problem+json"
     check_documented(answer)
@@ -170,7 +170,7 @@ def count_jobs(store: Store) -> int:
 
 
 def header(scene: bytes, old: str, new: str | bytes) -> bytes:
-    """The scene with one thing in its header changed."""
+    """Return the scene with one change in its header."""
     end = scene.index(b"end_header") + len(b"end_header")
     assert old.encode() in scene[:end]
     return scene[:end].replace(old.encode(), new.encode() if isinstance(new, str) else new, 1) + scene[end:]
@@ -185,7 +185,7 @@ def with_faces(scene: bytes, declared: str, data: bytes) -> bytes:
 
 
 def before_vertices(scene: bytes, declared: str, data: bytes) -> bytes:
-    """Another element in front of the Gaussians."""
+    """Insert another element before the Gaussians."""
     changed = header(scene, VERTEX, declared + VERTEX)
     start = changed.index(b"end_header\n") + len(b"end_header\n")
     return changed[:start] + data + changed[start:]
@@ -278,7 +278,7 @@ SCENES: list[tuple[str, Make]] = [
 
 
 def with_bound(scene: bytes, value: float) -> bytes:
-    """A compressed PLY whose first bound is that."""
+    """Return a compressed PLY with another first bound."""
     start = scene.index(b"end_header\n") + 11
     return scene[:start] + struct.pack("<f", value) + scene[start + 4 :]
 
@@ -288,7 +288,7 @@ def spz(count: int, data: bytes, *, version: int = 3, degree: int = 0) -> bytes:
 
 
 def spz_bomb() -> bytes:
-    """One Gaussian, and a gigabyte of zeros behind it."""
+    """Return an SPZ of one Gaussian, followed by a gigabyte of zeros."""
     deflate = zlib.compressobj(9, wbits=31)
     data = deflate.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20))
     for _ in range(64):
@@ -310,7 +310,7 @@ def zipped(name: str, data: bytes) -> bytes:
 
 
 def text_scene(scene: bytes, first: str) -> bytes:
-    """The scene's header over text, whose first row begins with this word."""
+    """Return an ASCII scene with the header of `scene`; its first row starts with the given word."""
     head = header(scene, "binary_little_endian", "ascii")
     head = head[: head.index(b"end_header\n") + 11]
     values = head.count(b"property")
@@ -331,7 +331,7 @@ def test_scenes_that_lie(client: httpx.Client, store: Store, files: Files, packe
 def test_packed_scenes_are_told_by_their_content(
     client: httpx.Client, store: Store, files: Files, packed: Files, what: str
 ) -> None:
-    """Whatever their names; as a file of the form, and by tus."""
+    """The format is detected whatever the file name, for files in the request and for tus uploads."""
     answer = client.post("/v1/jobs", files=form(files, scene=("my scan.ply", packed[what])))
     assert answer.status_code == 202, answer.text
     headers = {**TUS, "Upload-Length": str(len(packed[what]))}
@@ -350,20 +350,20 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def png(width: int, height: int, *chunks: bytes) -> bytes:
-    """A PNG that says it has so many RGB pixels."""
+    """Return a PNG that declares this size in RGB pixels."""
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
     return b"\x89PNG\r\n\x1a\n" + head + b"".join(chunks) + chunk(b"IEND", b"")
 
 
 def zeros(size: int) -> bytes:
-    """So many zero bytes, deflated, without holding them."""
+    """Return deflated zero bytes, without allocating all of them."""
     packer = zlib.compressobj(9)
     parts = [packer.compress(bytes(MB)) for _ in range(size // MB)]
     return b"".join(parts) + packer.compress(bytes(size % MB)) + packer.flush()
 
 
 def jpeg(width: int, height: int) -> bytes:
-    """A JPEG whose header says that it is larger than it is."""
+    """Return a JPEG whose header declares a larger size than it has."""
     file = io.BytesIO()
     Image.new("RGB", (16, 16)).save(file, "JPEG")
     data = file.getvalue()
@@ -372,7 +372,7 @@ def jpeg(width: int, height: int) -> bytes:
 
 
 def jpeg_of_scans(count: int) -> bytes:
-    """A progressive JPEG of 20 megapixels, whose last scan is repeated."""
+    """Return a progressive JPEG of 20 megapixels whose last scan is repeated."""
     file = io.BytesIO()
     Image.new("L", (5000, 4000), 128).save(file, "JPEG", progressive=True)
     data = file.getvalue()
@@ -386,12 +386,12 @@ def picture(format_: str, width: int, height: int) -> bytes:
 
 
 def text_bomb() -> bytes:
-    """A small PNG with a compressed comment that unpacks to 200 MB."""
+    """Return a small PNG with a compressed comment that expands to 200 MB."""
     return png(16, 16, chunk(b"zTXt", b"Comment\0\0" + zeros(200 * MB)), chunk(b"IDAT", zeros(49 * 16)))
 
 
 def tagged() -> bytes:
-    """EXIF that points behind its own end, in a picture that is whole otherwise."""
+    """Return a PNG whose EXIF points beyond its own end."""
     file = io.BytesIO()
     info = PngImagePlugin.PngInfo()
     info.add(b"eXIf", b"MM\0*\0\0\0\x08\xff\xff" + b"\x01\x12\0\x03\xff\xff\xff\xff\xff\xff\xff\xf0" * 4)
@@ -510,14 +510,14 @@ MODEL: list[tuple[str, bytes]] = [
 
 @pytest.mark.parametrize("name", ["points3D.bin", "rigs.bin", "frames.bin"])
 def test_models_whose_other_files_lie(client: httpx.Client, files: Files, name: str) -> None:
-    """Eight bytes that declare 2^60 entries: nobody reads them."""
+    """Eight bytes declare 2^60 entries; nothing reads these files."""
     model = [*MODEL, (name, struct.pack("<Q", 2**60))]
     answer = client.post("/v1/jobs", files=[*form(files, cameras=None), *(("cameras", file) for file in model)])
     assert answer.status_code == 202 or answer.json()["detail"].startswith("None of the 1 cameras sees"), answer.text
 
 
 def test_camera_files_cannot_ask_for_files_of_the_machine(client: httpx.Client, files: Files, tmp_path: Path) -> None:
-    """A transforms.json without sizes lets the reader look into the image that it names, wherever that is."""
+    """For a transforms.json without sizes, the reader opens the image that it names, wherever that is."""
     there = tmp_path / "secret.png"
     there.write_bytes(files["style"])
     told = set()
@@ -577,7 +577,7 @@ def test_names_lead_nowhere(client: httpx.Client, service: Service, files: Files
         request = client.build_request("POST", "/v1/jobs", files=[*body, (role, ("NAME", content))])
         data = request.read().replace(b'filename="NAME"', b'filename="' + encoded + b'"')
         answer = client.post("/v1/jobs", content=data, headers={"content-type": request.headers["content-type"]})
-        if answer.status_code != 202:  # such as a name that no field can have: refused is as good
+        if answer.status_code != 202:  # for example a name that no field can have; refusing it is valid too
             codes = ("malformed-body", "invalid-request", "unknown-upload", "invalid-image")
             refused(answer, 400 if answer.status_code == 400 else 422, *codes)
             continue
@@ -668,7 +668,7 @@ def test_content_types(client: httpx.Client, kind: str, status: int) -> None:
 
 
 def test_a_body_that_is_compressed(client: httpx.Client, files: Files) -> None:
-    """Nothing unpacks bodies, so that no bomb can be one."""
+    """Nothing decompresses bodies, so a body cannot be a decompression bomb."""
     request = client.build_request("POST", "/v1/jobs", files=form(files))
     answer = post(
         client, gzip.compress(request.read()), request.headers["content-type"], **{"content-encoding": "gzip"}
@@ -704,7 +704,7 @@ def test_too_long(client: httpx.Client, files: Files) -> None:
         yield b"\r\n" + END
 
     refused(post(client, chunked(85)), 413, "too-large")  # a file
-    refused(post(client, chunked(120)), 413, "too-large")  # and a request, of which no length was told
+    refused(post(client, chunked(120)), 413, "too-large")  # a request of undeclared length
     refused(post(client, b'{"scene": "' + b"x" * 2 * MB + b'"}', "application/json"), 413, "too-large")
 
 
@@ -713,13 +713,13 @@ def test_too_long(client: httpx.Client, files: Files) -> None:
 NUMBERS = ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "1" + "0" * 400, "-1", "1.5e-400", "9" * 5000]
 OPTIONS = declared(JobParameters)
 FIELDS = [name for name, option in OPTIONS.items() if kind_of(option) in (int, float)]
-#: Fields that may have one of these numbers.
+#: Fields that accept one of these numbers.
 MAY_BE_0 = {name for name in FIELDS if Ge(0) in OPTIONS[name].limits}
 MAY_BE_NEGATIVE = {"elevation", "style_rotation"}  # angles
 
 
 def told(client: httpx.Client, parameters: str) -> httpx.Response:
-    """The answer to a job of these parameters; its files, which are looked for after them, are not there."""
+    """Return the answer to a job with these parameters. Its files do not exist, but parameters are checked first."""
     body = f'{{"scene": "upl_00000000000", "style": "upl_00000000000", "parameters": {parameters}}}'
     return post(client, body.encode(), "application/json")
 
@@ -729,7 +729,7 @@ def test_numbers_that_are_none(client: httpx.Client, field: str) -> None:
     refused(told(client, "{}"), 422, "unknown-upload")
     for number in NUMBERS:
         if field in MAY_BE_0 | MAY_BE_NEGATIVE and number == "1.5e-400":
-            continue  # is 0
+            continue  # rounds to 0
         if field in MAY_BE_NEGATIVE and number == "-1":
             continue
         refused(told(client, f'{{"{field}": {number}}}'), 422, "invalid-request", "invalid-settings")
@@ -818,12 +818,12 @@ def send(client: httpx.Client, where: str, offset: object, data: Any, **headers:
     return client.patch(where, content=data, headers={**fixed, **headers})
 
 
-#: What Python's `int` takes for a number.
+#: Texts that Python's `int` accepts.
 NO_DIGITS: list[Any] = ["1_0", "+10", "10.0", "1 0", "\u0661\u0660".encode(), "\uff11\uff10".encode()]
 
 
 def test_numbers_are_digits_alone(client: httpx.Client, service: Service, done: str) -> None:
-    """In queries and headers; lengths of bodies are refused below the app."""
+    """Queries and headers accept digits only; malformed body lengths are refused below the app."""
     for number in ("1_0", "+10", " 10", "10 ", "\u0661\u0660", "10.0"):
         refused(client.get("/v1/jobs", params={"limit": number}), 422, "invalid-request")
     for number in NO_DIGITS:
@@ -836,7 +836,7 @@ def test_numbers_are_digits_alone(client: httpx.Client, service: Service, done: 
 
 
 def test_uploads_state_their_version(client: httpx.Client) -> None:
-    """As tus 1.0 has it: each of its requests but OPTIONS; `GET` is not of tus."""
+    """tus 1.0 requires the version in all requests except OPTIONS. `GET` is not part of tus."""
     where = begin(client, 5)
     data = {"Upload-Length": "5", "Upload-Offset": "0", "Content-Type": OFFSET_STREAM}
     for version in ({}, {"Tus-Resumable": ""}, {"Tus-Resumable": "0.2.2"}):
@@ -878,7 +878,7 @@ def test_names_of_uploads_lead_nowhere(client: httpx.Client, service: Service) -
     for name in NAMES:
         metadata = f"filename {base64.b64encode(name.encode()[:2900]).decode()}".strip()
         answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": "5", "Upload-Metadata": metadata})
-        if answer.status_code == 400:  # cut within a letter
+        if answer.status_code == 400:  # cut within a character
             continue
         assert answer.status_code == 201, answer.text
         shown = answer.json()["filename"]
@@ -952,7 +952,7 @@ def test_two_writers_of_one_upload(client: httpx.Client, service: Service) -> No
     head += f"Content-Type: {OFFSET_STREAM}\nContent-Length: 1000"
     with connect(service) as first:
         first.sendall(lines(head + "\nExpect: 100-continue"))
-        assert b" 100 " in first.recv(100)  # it is this one's turn
+        assert b" 100 " in first.recv(100)  # this request has the turn
         first.sendall(bytes(10))
         refused(send(client, where, 0, bytes(10)), 423, "upload-locked")
     wait_for(lambda: client.head(where, headers=TUS).headers["upload-offset"] == "10", "what has come to be saved")
@@ -1007,7 +1007,7 @@ def test_keys_that_are_none(client: httpx.Client, header: bytes) -> None:
 
 @pytest.fixture(scope="module")
 def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A job with results, as a dispatcher leaves it; its name would like to be a header."""
+    """Create a job with results, as a dispatcher leaves it. Its name attempts header injection."""
     with service.client() as client:
         name = 'x"; Set-Cookie: a=b <script>/../../é'
         data = {"parameters": json.dumps({"name": name})}
@@ -1138,7 +1138,7 @@ def lines(head: str) -> bytes:
 
 
 def exchange(service: Service, head: str, body: bytes = b"") -> tuple[bytes, bytes]:
-    """Head and body of the answer to exactly these bytes, until the service closes."""
+    """Return head and body of the answer to exactly these bytes, up to the end of the connection."""
     with connect(service) as connection:
         connection.sendall(lines(head) + body)
         answer = b""
@@ -1149,7 +1149,7 @@ def exchange(service: Service, head: str, body: bytes = b"") -> tuple[bytes, byt
 
 
 def answer_on(connection: socket.socket) -> tuple[bytes, bytes]:
-    """Head and body of the next answer, which has a length; the connection stays open."""
+    """Return head and body of the next answer, which declares its length. The connection stays open."""
     connection.settimeout(60)
     answer = connection.recv(65536)
     while not (found := re.search(rb"content-length: ([0-9]+)\r\n.*?\r\n\r\n", answer, re.DOTALL | re.IGNORECASE)) or (
@@ -1162,7 +1162,7 @@ def answer_on(connection: socket.socket) -> tuple[bytes, bytes]:
 
 
 def closed(connection: socket.socket) -> bytes:
-    """All that still comes until the service closes; fails if it does not."""
+    """Return everything until the service closes the connection; fail if it does not."""
     connection.settimeout(60)
     answer = b""
     try:
@@ -1174,7 +1174,7 @@ def closed(connection: socket.socket) -> bytes:
 
 
 def test_slow_clients_are_cut_off_and_block_nobody(service: Service, client: httpx.Client, files: Files) -> None:
-    """Many connections that say nothing, half a head, or half a body: others are served, and they all end."""
+    """Connections that send nothing, half a head or half a body all end, and others are served meanwhile."""
     body = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
     starts = [b"", b"GET /v1/jobs HTTP/1.1\r\nHost: 127.0", lines(body), lines(body) + part(FILE.format("scene"))[:60]]
     slow = [connect(service) for _ in range(200)]
@@ -1191,7 +1191,7 @@ def test_slow_clients_are_cut_off_and_block_nobody(service: Service, client: htt
 
 
 def test_clients_that_drip_are_cut_off(service: Service) -> None:
-    """A byte now and then is not standing still, but it is no rate at which anything could be sent."""
+    """A byte now and then is not a stall, but far below the minimum rate."""
     head = lines(
         f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
     )
@@ -1256,7 +1256,7 @@ HEADS: list[tuple[str, bytes]] = [
 
 @pytest.mark.parametrize("data", [case[1] for case in HEADS], ids=[case[0] for case in HEADS])
 def test_heads_that_make_no_sense(service: Service, client: httpx.Client, data: bytes) -> None:
-    """Refused below the app; the connection ends, so that nothing of it passes for another request."""
+    """Malformed heads are refused below the app. The connection is closed, so no remainder is read as a request."""
     with connect(service) as connection:
         connection.sendall(data)
         connection.shutdown(socket.SHUT_WR)
@@ -1275,7 +1275,7 @@ def test_heads_that_make_no_sense(service: Service, client: httpx.Client, data: 
 
 
 def test_a_chunk_that_makes_no_sense(service: Service) -> None:
-    """Within a body that is being read: said once, and nothing behind it is taken for a request."""
+    """A malformed chunk of a body that is being read is answered once, and what follows is not taken for a request."""
     start = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}"
     with connect(service) as connection:
         connection.sendall(lines(start + "\nTransfer-Encoding: chunked\nExpect: 100-continue"))
@@ -1288,7 +1288,7 @@ def test_a_chunk_that_makes_no_sense(service: Service) -> None:
 
 
 def test_a_head_that_is_too_large(service: Service) -> None:
-    # no byte more than are read: the answer would be lost with them
+    # Not a byte more than the service reads: a reset would discard its answer.
     for headers in (b"X: " + b"y" * MAX_HEAD_BYTES, b"X: y\r\n" * (MAX_HEADERS + 1)):
         with connect(service) as connection:
             connection.sendall(lines("GET /v1/jobs HTTP/1.1")[:-2] + headers)
@@ -1324,7 +1324,7 @@ def test_trailers_that_never_end(service: Service, path: str, start: bytes, more
 
 
 def test_trailers_are_no_headers(service: Service, client: httpx.Client) -> None:
-    """Not even of the next request on the connection."""
+    """Trailers do not become headers, not even of the next request on the connection."""
     where = begin(client, 5)
     head = f"PATCH {where} HTTP/1.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\nContent-Type: {OFFSET_STREAM}"
     with connect(service) as connection:
@@ -1345,7 +1345,7 @@ def test_requests_that_wait_for_no_answer(service: Service) -> None:
 
 
 def test_a_body_that_nobody_reads_has_to_end(service: Service) -> None:
-    """The request is answered before its body has come: a byte now and then does not hold the connection."""
+    """The request is answered before its body arrives. A byte now and then does not hold the connection open."""
     for rest in (b"", b"x"):
         with connect(service) as connection:
             connection.sendall(lines("POST /livez HTTP/1.1\nContent-Length: 1000000"))
@@ -1373,7 +1373,7 @@ def test_a_body_that_ends_late_keeps_its_connection(service: Service) -> None:
 
 
 def test_json_that_is_too_long_is_not_waited_for(service: Service) -> None:
-    """Nor read, where its length is declared; where it is not, it is not read beyond its limit."""
+    """A JSON body with too large a declared length is not read at all; an undeclared one is read up to the limit."""
     kind = "Content-Type: application/json"
     for path, size in (("/v1/session", 256_000), ("/v1/session", 4097), ("/v1/jobs", 2 * MB)):
         with connect(service) as connection:
@@ -1382,12 +1382,12 @@ def test_json_that_is_too_long_is_not_waited_for(service: Service) -> None:
         assert answer.startswith(b"HTTP/1.1 413 ")
     with connect(service) as connection:
         connection.sendall(lines(f"POST /v1/session HTTP/1.1\n{kind}\nTransfer-Encoding: chunked"))
-        connection.sendall(b"2000\r\n" + b"x" * 0x2000)  # 8 kB of a chunk that has not ended
+        connection.sendall(b"2000\r\n" + b"x" * 0x2000)  # 8 kB of an unfinished chunk
         assert connection.recv(65536).startswith(b"HTTP/1.1 413 ")
 
 
 def test_bodies_that_arrive_together(service: Service, client: httpx.Client) -> None:
-    """Large ones are refused while too many are coming; small ones are not."""
+    """Large bodies are refused while too many are arriving; small ones are accepted."""
     large = json.dumps({"scene": "x" * (MB - 1000), "style": "x"}).encode()
     head = lines(f"POST /v1/jobs HTTP/1.1\nContent-Type: application/json\nContent-Length: {len(large)}")
     with contextlib.ExitStack() as stack:
@@ -1396,7 +1396,7 @@ def test_bodies_that_arrive_together(service: Service, client: httpx.Client) -> 
             connection.setblocking(False)
             with contextlib.suppress(OSError):
                 connection.send(head)
-        left = dict.fromkeys(held, large[:-1])  # no body ends
+        left = dict.fromkeys(held, large[:-1])  # no body is complete
         while left:
             _, ready, _ = select.select([], list(left), [], 1.0)
             if not ready:
@@ -1417,7 +1417,7 @@ def test_bodies_that_arrive_together(service: Service, client: httpx.Client) -> 
 
 
 def test_connections_beyond_the_systems_limit(tmp_path: Path) -> None:
-    """Each is answered with 503 or closed, and none of those that are there suffers."""
+    """Connections beyond the limit are answered with 503 or closed, and existing ones keep working."""
     running = Service(tmp_path / "data", alone=True)
     running._command = ["sh", "-c", 'ulimit -n 200 && exec "$@"', "sh", *running._command]
     with running, running.client() as client:
@@ -1437,14 +1437,14 @@ def test_connections_beyond_the_systems_limit(tmp_path: Path) -> None:
 
 
 def test_files_beyond_the_systems_limit(tmp_path: Path) -> None:
-    """Uploads side by side, each with a file: those for which no descriptor is left are told to come back."""
+    """Concurrent uploads for which no file descriptor is left get 503 with Retry-After."""
     running = Service(tmp_path / "data", alone=True)
     running._command = ["sh", "-c", 'ulimit -n 200 && exec "$@"', "sh", *running._command]
     head = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 1000000"
     body = part(FILE.format("style"), bytes(200_000))
     with running, contextlib.ExitStack() as stack:
         held = [stack.enter_context(connect(running)) for _ in range(140)]
-        assert running.ready()  # over a later connection, so that all of these are accepted
+        assert running.ready()  # on a later connection, so that all of these are accepted
         for connection in held:
             connection.sendall(lines(head) + body[:-2])
         answered = wait_for(lambda: select.select(held, [], [], 0)[0], "an upload to be refused", running.said)
@@ -1464,7 +1464,7 @@ def test_two_hosts(service: Service, second: str) -> None:
         assert json.loads(body)["code"] == "malformed-request"
 
 
-#: Names that a page's author can point at this machine, and texts that are no host.
+#: Names that a page's author can point at this machine, and texts that are not a host.
 FOREIGN = [
     "127.evil.example",
     "127.0.0.1.evil.example",

@@ -1,4 +1,4 @@
-"""Files as answers: a job's inputs, its pictures and the course of its loss; names that need care."""
+"""Tests of files as answers: inputs of a job, its images, its loss history, and hostile names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from service.store import Store, open_store
 from tests.api.service import Service, check_documented
 from tests.small_scenes import wall, write_files
 
-#: Names that files are sent with.
+#: Names of uploaded files.
 HOSTILE = [
     "../../etc/passwd",
     'a"; filename="evil.html',
@@ -71,7 +71,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def submit(client: httpx.Client, files: dict[str, Path], styles: list[str]) -> str:
     parts = [(role, (files[role].name, files[role].read_bytes())) for role in ("scene", "cameras")]
-    # other bytes behind the picture make it another file
+    # Bytes after the end of the image make it a different file.
     parts += [("style", (name, files["style"].read_bytes() + bytes(place))) for place, name in enumerate(styles)]
     answer = client.post("/v1/jobs", files=parts)
     assert answer.status_code == 202, answer.text
@@ -175,7 +175,7 @@ def test_suggested_names_need_no_care(name: str) -> None:
             assert suggested not in (".", "..")
             assert not set(suggested) & set('/\\\r\n\0"\u202e')
             assert len(suggested) <= 120
-        # as another program reads it
+        # As another program parses it.
         message = Message()
         message["Content-Disposition"] = header
         assert message.get_content_disposition() == match[1]

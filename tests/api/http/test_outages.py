@@ -1,4 +1,4 @@
-"""The database is stopped, killed or locked: requests get 503 with Retry-After, and health checks answer."""
+"""Tests with a stopped, killed or locked database: requests get 503 with Retry-After, and health checks answer."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from tests.api.service import Service, wait_for
 from tests.postgres import Postgres, controlled_server, fresh_database, is_installed
 from tests.small_scenes import wall, write_files
 
-#: Requests at a time: more than the threads that an API process has for them.
+#: Concurrent requests: more than an API process has threads for.
 MANY = 60
-#: Seconds that a health check may take on a busy machine. It would take minutes if it waited for requests.
+#: Seconds that a health check may take on a busy machine; if it waited for requests, it would take minutes.
 HEALTH_SECONDS = 10.0
 #: Operations that need no database.
 WITHOUT_DATABASE = {("get", "/livez"), ("get", "/readyz"), ("options", "/v1/uploads")}
@@ -36,7 +36,7 @@ CODES = ("database-unavailable", "database-busy")
 
 @dataclass
 class Outage:
-    """A service whose database can be taken away."""
+    """A service whose database can be stopped or killed."""
 
     service: Service
     key: str
@@ -45,12 +45,12 @@ class Outage:
     postgres: Postgres
 
     def client(self) -> httpx.Client:
-        """To talk to it, with a key."""
+        """Return an HTTP client of the service, with a key."""
         return self.service.client(self.key)
 
     @contextlib.contextmanager
     def kind(self, name: str) -> Iterator[None]:
-        """Take the database away for as long as the block takes."""
+        """Make the database unavailable during the block."""
         self.postgres.signal(signal.SIGSTOP if name == "stopped" else signal.SIGKILL)
         try:
             yield
@@ -58,7 +58,7 @@ class Outage:
             self.back(name)
 
     def back(self, name: str) -> None:
-        """Bring it back, and wait until the service has noticed."""
+        """Restore the database, and wait until the service uses it again."""
         if name == "stopped":
             self.postgres.signal(signal.SIGCONT)
         else:
@@ -79,7 +79,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 def open_service(data: Path, database: str | None, files: dict[str, bytes]) -> Iterator[tuple[Service, str, str, str]]:
-    """Yield a service with keys, a key, a job and an upload of its holder."""
+    """Yield a service that requires keys, a key, and a job and an upload of its owner."""
     settings = {"SGSST_REQUIRE_KEYS": "true", **({"SGSST_DATABASE": database} if database else {})}
     with Service(data, alone=True, **settings) as service:
         store = open_store(ServiceSettings(data=data, database=database))
@@ -103,14 +103,14 @@ def outage(tmp_path_factory: pytest.TempPathFactory, files: dict[str, bytes]) ->
 
 @cache
 def operations() -> list[tuple[str, str]]:
-    """Every operation of the API that needs the database: method and path."""
+    """Return method and path of every operation that needs the database."""
     document = create_app(ServiceSettings()).openapi()
     found = [(method, path) for path, methods in document["paths"].items() for method in methods]
     return [each for each in found if each not in WITHOUT_DATABASE]
 
 
 def request(client: httpx.Client, method: str, path: str, outage: Outage, files: dict[str, bytes]) -> httpx.Response:
-    """Send a request that would succeed, or be refused for the job's state, if the database were there."""
+    """Send a request that would succeed, or be refused for the job's state, if the database were available."""
     told: dict[str, Any] = {}
     if (method, path) == ("post", "/v1/jobs"):
         told = {"files": form(files)}
@@ -128,7 +128,7 @@ def request(client: httpx.Client, method: str, path: str, outage: Outage, files:
 
 
 def check_away(answer: httpx.Response) -> None:
-    """Fail unless it says that the database is away, and when to come back."""
+    """Fail unless the answer reports that the database is unavailable, and when to retry."""
     assert answer.status_code == 503, (answer.request.method, str(answer.request.url), answer.text)
     assert int(answer.headers["retry-after"]) > 0
     if answer.request.method != "HEAD":
@@ -145,7 +145,7 @@ def check_health(service: Service, ready: int) -> None:
 
 
 def at_once(send: Callable[[], httpx.Response]) -> contextlib.ExitStack:
-    """Begin MANY requests; the block's end waits for their answers and checks them."""
+    """Start MANY requests; at the end of the block, wait for their answers and check them."""
     stack = contextlib.ExitStack()
     pool = stack.enter_context(ThreadPoolExecutor(MANY))
     answers = [pool.submit(send) for _ in range(MANY)]
@@ -226,7 +226,7 @@ def test_a_locked_database_is_busy_and_can_be_read(tmp_path: Path, files: dict[s
 
 
 def test_waiting_for_a_lock_is_bounded_for_all_writers_together(tmp_path: Path) -> None:
-    """One writer at a time tries a database that was locked; the others do not wait for their own time-outs."""
+    """One writer at a time waits for a locked database; the others do not each wait for a time-out of their own."""
     store: Store = open_store(ServiceSettings(data=tmp_path), answer_seconds=0.5)
     with contextlib.closing(sqlite3.connect(tmp_path / "sgsst.db")) as other:
         other.isolation_level = None

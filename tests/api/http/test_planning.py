@@ -1,4 +1,4 @@
-"""Dry runs that tell how far they are."""
+"""Tests of dry runs that report their progress."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_nor_for_who_has_left_without_events(service: Service, files: dict[str, 
 def begin_and_leave(
     service: Service, client: httpx.Client, files: dict[str, bytes], both: int, **parameters: Any
 ) -> None:
-    """Have a job planned until its first event, and wait for one of `both` processes to end."""
+    """Start planning a job, disconnect at the first event, and wait for one of `both` processes to end."""
     with connect_sse(client, "POST", "/v1/jobs", **request(files, **parameters)) as source:
         next(source.iter_sse())
     wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")

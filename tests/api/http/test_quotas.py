@@ -1,4 +1,4 @@
-"""Quotas and rates as a client meets them: 429, when to come back, and what of."""
+"""Tests of quotas and rate limits as a client sees them: 429 with the reason and the time to retry."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def owner_and_key(service: Service, quotas: Quotas) -> tuple[str, str]:
 
 
 def on_disk(service: Service) -> int:
-    """Bytes of all inputs that the service keeps or receives, whoever they belong to."""
+    """Return the bytes of all inputs that the service stores or receives, for all owners."""
     found = {}
     for folder in ("blobs", "incoming", "uploads", "inspections"):
         for path in (service.data / folder).rglob("*"):
@@ -140,20 +140,20 @@ def test_connections_are_bounded(service: Service) -> None:
     wait_for(lambda: httpx.get(f"{service.url}/livez").status_code == 200, "room for a connection", service.said)
 
 
-# --- bytes that nobody is charged for ------------------------------------------------------------------------------
+# --- bytes without a charge ----------------------------------------------------------------------------------------
 
 MB = 1_000_000
 
 
 def body_of(scene: int) -> tuple[bytes, dict[str, str]]:
-    """A multipart body with a scene of so many bytes that no other request has, and its headers."""
+    """Return a multipart body with a unique scene of this size, and its headers."""
     content = b"ply\n" + os.urandom(32) + bytes(scene)
     request = httpx.Request("POST", "http://x", files={"scene": ("scene.ply", content)})
     return request.read(), {"Content-Type": request.headers["content-type"]}
 
 
 def test_refused_requests_leave_nothing(service: Service, files: dict[str, bytes]) -> None:
-    """Each request fits into the quota; what they bring together is ten times as much."""
+    """Each request fits into the quota, but their sum is ten times as large."""
     before = on_disk(service)
     with service.client(key(service, Quotas(stored_bytes=5 * MB))) as client:
         for number in range(12):
@@ -245,7 +245,7 @@ def stored_bytes(service: Service, owner: str) -> int:
 
 
 def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: dict[str, bytes]) -> None:
-    """The process that checks the hostile key's files stands still; so do further files of this key, and no others."""
+    """If the process that checks a hostile key's files is stopped, further files of that key wait, and no others."""
     with (
         Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service,
         service.client(key(service, NO_QUOTAS)) as hostile,
@@ -253,7 +253,7 @@ def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: d
         ThreadPoolExecutor(3) as pool,
     ):
         assert hostile.post("/v1/jobs", files=form(files), timeout=PATIENCE).status_code == 202
-        # the spare process is started before the one that gets the first files, whose child has to end
+        # The spare process starts before the one that gets the first files, whose child must end.
         wait_for(lambda: len(service.processes("service.inspection.process")) == 2, "the child to end", service.said)
         both = service.processes("service.inspection.process")
         checking = max(both, key=lambda process: (process.create_time(), process.pid))
@@ -275,14 +275,14 @@ def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: d
 
 @pytest.mark.skipif(not is_installed(), reason="PostgreSQL's server is not installed")
 def test_of_a_hundred_requests_at_once_none_passes_a_limit(tmp_path: Path, files: dict[str, bytes]) -> None:
-    """On PostgreSQL, where transactions run side by side and do not see each other's rows."""
+    """On PostgreSQL, where concurrent transactions do not see each other's rows."""
     limits = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_JOBS_PER_KEY": "7"}
     with (
         server(durable=True) as url,
         Service(tmp_path / "data", alone=True, SGSST_DATABASE=fresh_database(url), **limits) as service,
         service.client(key(service, NO_QUOTAS)) as client,
     ):
-        assert client.post("/v1/jobs", files=form(files)).status_code == 202  # inspected once for all
+        assert client.post("/v1/jobs", files=form(files)).status_code == 202  # so that later jobs need no inspection
         size = sum(len(content) for content in files.values())
 
         _, many = owner_and_key(service, NO_QUOTAS)
@@ -305,7 +305,7 @@ def test_of_a_hundred_requests_at_once_none_passes_a_limit(tmp_path: Path, files
 
 
 def at_once(service: Service, text: str, path: str, **request: Any) -> dict[int, int]:
-    """Send a request a hundred times at the same moment; return how often each status was answered."""
+    """Send a request a hundred times concurrently; return how often each status was answered."""
     with service.client(text) as client, ThreadPoolExecutor(100) as pool:
         answers = list(pool.map(lambda _: client.post(path, timeout=PATIENCE, **request).status_code, range(100)))
     return {status: answers.count(status) for status in set(answers)}

@@ -1,4 +1,4 @@
-"""Schemathesis against the real API: whatever the document allows and does not, no 5xx, no answer outside of it."""
+"""Schemathesis against the real API: for valid and invalid requests, no 5xx, and no answer outside the document."""
 
 from __future__ import annotations
 
@@ -33,8 +33,11 @@ load_all_checks()
 
 
 def refuses_what_is_wrong(ctx: Any, response: Response, case: schemathesis.Case) -> bool | None:
-    """As the library has it, but for headers and queries that nobody knows, which HTTP has ignored, and for more
-    refusals, such as tus' 412 and 460."""
+    """Check like the library, with two exceptions.
+
+    Unknown headers and query parameters are ignored, as usual in HTTP. All refusals with 4xx are accepted, such as 412
+    and 460 of tus.
+    """
     known = {parameter["name"] for parameter in case.operation.definition.raw.get("parameters", [])}
     unknown = "x-schemathesis-unknown-property" in case.headers or not known.issuperset(case.query or {})
     if unknown or 400 <= response.status_code < 500:
@@ -43,13 +46,16 @@ def refuses_what_is_wrong(ctx: Any, response: Response, case: schemathesis.Case)
 
 
 def refuses_what_lacks_a_header(ctx: Any, response: Response, case: schemathesis.Case) -> bool | None:
-    """As the library has it, but for more refusals: tus has 412 where its version is missing."""
+    """Check like the library, but also accept 412, which tus answers if its version is missing."""
     return None if response.status_code == 412 else missing_required_header(ctx, response, case)
 
 
 def checks() -> list[Any]:
-    """All of the library, but for one: a body of the right form is refused for more reasons than a document can tell
-    (files that were never sent, an offset that is not the next one), so that not every such request is accepted."""
+    """Return all checks of the library except one.
+
+    A body that matches the schema may be refused for reasons that the document cannot express, such as files that were
+    never sent or a wrong offset.
+    """
     own = {
         "positive_data_acceptance": None,
         "negative_data_rejection": refuses_what_is_wrong,
@@ -61,7 +67,7 @@ def checks() -> list[Any]:
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    # a huge Upload-Length is no reason to look for the room that it would take
+    # A huge Upload-Length must not fail for lack of disk space.
     limits = {"SGSST_MAX_UPLOAD_BYTES": "1000000", "SGSST_REQUIRE_KEYS": "true"}
     with Service(tmp_path_factory.mktemp("schema") / "data", alone=True, **limits) as running:
         yield running
@@ -82,7 +88,7 @@ def key(store: Store) -> str:
 @schemathesis.openapi.from_dict(DOCUMENT).parametrize()
 @settings(max_examples=20, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
 def test_every_operation(case: schemathesis.Case, service: Service, key: str) -> None:
-    """Examples, edges of every parameter, methods that are none, and rubbish."""
+    """Examples, limits of every parameter, unsupported methods and random input."""
     case.call_and_validate(
         base_url=service.url, checks=checks(), timeout=60, headers={"Authorization": f"Bearer {key}"}
     )
@@ -90,7 +96,7 @@ def test_every_operation(case: schemathesis.Case, service: Service, key: str) ->
 
 # --- chains --------------------------------------------------------------------------------------------------------
 
-#: The same chains at every run.
+#: The same chains in every run.
 BOUNDS = settings(
     max_examples=40,
     stateful_step_count=8,
@@ -100,13 +106,13 @@ BOUNDS = settings(
     phases=[Phase.generate],
     suppress_health_check=list(HealthCheck),
 )
-#: What is reached by links alone, for nobody can make an id up.
+#: Operations that are reachable by links only: ids cannot be guessed.
 JOBS = ("get_job", "cancel_job", "delete_job", "watch_job")
 ENDS = ("cancel_job", "retry_job")
 ARTIFACTS = ("list_artifacts", "get_artifact")
 INPUTS = ("get_progress", "list_inputs", "get_input")
 UPLOADS = ("get_upload", "head_upload", "append_upload", "delete_upload")
-#: Parameters that are not only of the right form, but right, so that something is made that links lead to.
+#: Parameters that are not only well-formed but valid, so that requests create what links lead to.
 RIGHT: dict[str, dict[str, Any]] = {
     "dry_run": {"type": "boolean", "enum": [False]},
     "Upload-Length": {"type": "integer", "minimum": 100, "maximum": 200},
@@ -116,7 +122,7 @@ RIGHT: dict[str, dict[str, Any]] = {
 
 
 class Uploaded:
-    """A small scene whose files were uploaded once, and who plays the dispatcher for jobs of it."""
+    """A small scene whose files are uploaded once. Plays the dispatcher for its jobs."""
 
     def __init__(self, service: Service, store: Store, key: str, folder: Path) -> None:
         self._store = store
@@ -126,7 +132,7 @@ class Uploaded:
         self._ids = [_upload(self._client, path) for path in (self._ply, style, cameras)]
 
     def document(self) -> dict[str, Any]:
-        """The document, in which every job is one of these files: which ids are there is no matter of form."""
+        """Return the document with the ids of these files in every job: a schema cannot express which ids exist."""
         found = copy.deepcopy(DOCUMENT)
         scene, style, cameras = self._ids
         seed = {"type": "integer", "minimum": 0, "maximum": 9}
@@ -145,7 +151,7 @@ class Uploaded:
         return found
 
     def finish_jobs(self) -> None:
-        """Every job that waits ends with results, as a dispatcher leaves it (`test_service` has a real one)."""
+        """Finish every waiting job with results, as a dispatcher does (`test_service` runs a real one)."""
         while (lease := self._store.leases.take("test")) is not None:
             result = self._artifacts.put(lease.job_id, lease.epoch, "stylized.ply", self._ply)
             self._store.leases.begin(lease)
@@ -153,7 +159,7 @@ class Uploaded:
             self._store.leases.succeed(lease, [result], {"steps": 1})
 
     def delete_jobs(self) -> None:
-        """So that every chain finds the same: none."""
+        """Delete all jobs, so that every chain starts without any."""
         self.finish_jobs()
         for job in self._client.get("/v1/jobs", params={"limit": 200}).json()["jobs"]:
             assert self._client.delete(f"/v1/jobs/{job['id']}").status_code == 204
@@ -169,7 +175,7 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     ("path", "behind"),
     [
         ("/v1/jobs(?!.*(artifacts|inputs|progress))", JOBS),
-        # by themselves once more: among all others, chance seldom cancels and then retries, or lists and then takes
+        # Again on their own: among all operations, chains rarely cancel and then retry, or list and then take.
         ("/v1/jobs($|/{job_id}/(cancel|retry))", ENDS),
         ("/v1/jobs($|/{job_id}/artifacts)", ARTIFACTS),
         ("/v1/jobs($|/{job_id}/(inputs|progress))", INPUTS),
@@ -177,11 +183,11 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     ],
 )
 def test_chains_of_requests(service: Service, key: str, uploaded: Uploaded, path: str, behind: tuple[str, ...]) -> None:
-    """Stateful: ids that answers give are used in the requests that the document links to them."""
+    """Stateful test: ids from answers are used in the requests that the document links to them."""
     followed: Counter[str] = Counter()
     loaded = schemathesis.openapi.from_dict(uploaded.document()).include(path_regex=f"^{path}")
     loaded.config.update(base_url=service.url)
-    loaded.config.generation.update(modes=[GenerationMode.POSITIVE])  # what is wrong has had its turn above
+    loaded.config.generation.update(modes=[GenerationMode.POSITIVE])  # invalid requests are tested above
 
     class Chains(loaded.as_state_machine()):  # type: ignore[misc]
         def setup(self) -> None:
@@ -191,7 +197,7 @@ def test_chains_of_requests(service: Service, key: str, uploaded: Uploaded, path
             return {"headers": {"Authorization": f"Bearer {key}"}, "timeout": 60}
 
         def before_call(self, case: schemathesis.Case) -> None:
-            if name_of(case) in ("list_artifacts", "watch_job"):  # the stream of a job that waits would not end
+            if name_of(case) in ("list_artifacts", "watch_job"):  # the stream of a waiting job would not end
                 uploaded.finish_jobs()
 
         def validate_response(self, response: Response, case: schemathesis.Case, **ignored: object) -> None:
@@ -204,7 +210,7 @@ def test_chains_of_requests(service: Service, key: str, uploaded: Uploaded, path
             return output
 
     missed: Sequence[str] = behind
-    for chains in (40, 80, 160):  # what a chain leads to hangs on answers too: where it was not far enough, further
+    for chains in (40, 80, 160):  # chains depend on answers too, so try longer runs if some operation was not reached
         if missed:
             Chains.run(settings=settings(BOUNDS, max_examples=chains))
             missed = [name for name in behind if not followed[name]]

@@ -1,4 +1,4 @@
-"""Browsers: a key shown once, a cookie from then on, and pages of other sites that try to use it."""
+"""Tests of browser sessions: a key is sent once, then a cookie; pages of other sites cannot use it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def store(service: Service) -> Iterator[Store]:
 
 @pytest.fixture
 def browser(service: Service) -> Iterator[httpx.Client]:
-    """It keeps cookies, and names the page that asks, as browsers do."""
+    """Return a client that stores cookies and sends `Origin`, as browsers do."""
     with service.client() as made:
         made.headers["Origin"] = service.url
         yield made
@@ -66,7 +66,7 @@ def refused(answer: httpx.Response, status: int, code: str) -> None:
 
 
 def job_of(store: Store, owner: str) -> str:
-    """A job of a scene that was never sent: nobody runs it."""
+    """Create a job of a scene that was never sent, so that nothing runs it."""
     sha256 = "a" * 64
     store.inputs.add_blob(sha256, "aa/a", 10)
     inputs = [{"role": "scene", "name": "scene.ply", "sha256": sha256, "size": 10}]
@@ -93,7 +93,7 @@ def test_a_key_is_shown_once(browser: httpx.Client, store: Store) -> None:
 
 
 def test_the_cookie_is_for_https_where_the_page_came_by_it(service: Service, key: str) -> None:
-    # behind a proxy that ends TLS: the request itself came by http
+    # Behind a proxy that terminates TLS, the request itself arrives by HTTP.
     with service.client() as browser:
         host = service.url.removeprefix("http://")
         assert cookie_of(sign_in(browser, key, Origin=f"https://{host}"))["secure"]
@@ -155,7 +155,7 @@ def test_a_key_in_the_request_wins(browser: httpx.Client, store: Store, key: str
     asked = browser.get("/v1/jobs", headers={"Authorization": f"Bearer {text}"})
     assert [job["id"] for job in asked.json()["jobs"]] == [job_id]
     refused(browser.get("/v1/jobs", headers={"Authorization": "Bearer wrong"}), 401, "unauthorized")
-    # and needs no page: nothing adds it to a request of another site
+    # A key needs no page: no browser adds it to another site's request.
     del browser.headers["Origin"]
     canceled = browser.post(f"/v1/jobs/{job_id}/cancel", headers={"Authorization": f"Bearer {text}"})
     assert canceled.status_code == 200
@@ -176,7 +176,7 @@ def test_two_sessions_do_not_see_each_others_jobs(service: Service, store: Store
 
 # --- other sites ---------------------------------------------------------------------------------------------------
 
-#: What browsers send with a request that a page of another site makes, or that nobody knows who makes.
+#: Headers of browsers for requests from another site's page, or from an unknown page.
 ELSEWHERE: list[dict[str, str]] = [
     {"Origin": "https://evil.example"},
     {"Origin": "https://evil.example", "Sec-Fetch-Site": "cross-site"},
@@ -205,7 +205,7 @@ def test_pages_of_other_sites_change_nothing(
     del browser.headers["Origin"]
     sent = {name: value.replace("SELF", service.url) for name, value in headers.items()}
     upload = {"Tus-Resumable": "1.0.0", "Upload-Length": "5"}
-    simple = {"Content-Type": "text/plain"}  # what a form can send without being asked first
+    simple = {"Content-Type": "text/plain"}  # a form can send this without a preflight request
     for method, path, more, body in (
         ("POST", "/v1/jobs", simple, b"{}"),
         ("POST", f"/v1/jobs/{job_id}/cancel", {}, b""),
@@ -235,7 +235,7 @@ def test_the_services_own_pages_change_something(
 
 
 def test_reading_changes_nothing_wherever_it_comes_from(browser: httpx.Client, store: Store) -> None:
-    """A link or a picture of another site can make a browser GET anything (without the cookie, by SameSite)."""
+    """A link or an image of another site can make a browser GET anything (without the cookie, by SameSite)."""
     row, key = store.keys.create("hans")
     job_id = job_of(store, row.id)
     sign_in(browser, key)
@@ -253,7 +253,7 @@ def test_reading_changes_nothing_wherever_it_comes_from(browser: httpx.Client, s
 
 
 def test_other_sites_sign_nobody_in(service: Service, key: str) -> None:
-    """Else they could make somebody work under a key of theirs."""
+    """Otherwise another site could make a user work under a key of its own."""
     with service.client() as browser:
         for headers in ELSEWHERE[:-1]:
             sent = {name: value.replace("SELF", service.url) for name, value in headers.items()}
@@ -294,14 +294,14 @@ def test_wrong_keys_are_refused_and_not_for_ever(tmp_path: Path) -> None:
         answer = sign_in(browser, key)
         refused(answer, 429, "too-many-tries")
         assert 0 < int(answer.headers["retry-after"]) <= WITHIN_SECONDS + 1
-        # who has a key elsewhere is not kept out by it
+        # The limit does not block a valid key from the same address.
         assert browser.get("/v1/jobs", headers={"Authorization": f"Bearer {key}"}).status_code == 200
         store.close()
 
 
 @pytest.mark.parametrize("trusted", ["", "10.0.0.0/8", "127.0.0.1"])
 def test_only_a_trusted_proxy_names_the_client(tmp_path: Path, trusted: str) -> None:
-    """Whoever connects from this machine otherwise gets as many tries as there are addresses to make up."""
+    """If any local client were trusted, it could invent an address for each attempt."""
     proxies = {"SGSST_REQUIRE_KEYS": "true", "SGSST_TRUSTED_PROXIES": trusted}
     with Service(tmp_path / "data", alone=True, **proxies) as service, service.client() as browser:
         for number in range(MOST_FAILURES + 1):
@@ -368,7 +368,7 @@ def test_where_no_key_is_needed_a_cookie_that_is_no_good_does_no_harm(tmp_path: 
 
 
 def test_streams_and_files_come_with_the_cookie(browser: httpx.Client, store: Store) -> None:
-    """`EventSource`, pictures and downloads can send no key of their own."""
+    """`EventSource`, images and downloads cannot send a key."""
     row, key = store.keys.create("lea")
     job_id = job_of(store, row.id)
     sign_in(browser, key)

@@ -1,4 +1,4 @@
-"""The page's files: addresses, caching, policy."""
+"""Tests of the page's static files: addresses, caching and policy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Webhooks at submission: URLs that cannot be called are refused with a problem document."""
+"""Tests of webhooks at submission: URLs that cannot be called are refused with a problem document."""
 
 from __future__ import annotations
 

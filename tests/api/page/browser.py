@@ -1,4 +1,4 @@
-"""A real browser for tests of the page: Debian's Chromium, driven by playwright, with WebGL in software."""
+"""A real browser for tests of the page: Chromium, driven by Playwright, with WebGL in software."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
-#: Where WebGL is computed by the processor: the same pixels on every machine.
+#: WebGL is computed by the CPU, for the same pixels on every machine.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
-#: Milliseconds that a test waits for anything.
+#: Timeout of tests in milliseconds.
 PATIENCE = 180_000
-#: Runs in the page before anything of its own: what its policy refuses is counted.
+#: Script that runs before the page's own, and counts violations of the page's content security policy.
 _COUNT_VIOLATIONS = """
 window.violations = [];
 document.addEventListener("securitypolicyviolation", ({ violatedDirective, blockedURI }) => {
@@ -34,7 +34,7 @@ document.addEventListener("securitypolicyviolation", ({ violatedDirective, block
 
 
 def missing() -> str | None:
-    """Why there is no browser; None where there is one."""
+    """Return why there is no browser; None if there is one."""
     try:
         import playwright.sync_api  # noqa: F401
     except ImportError:
@@ -45,14 +45,14 @@ def missing() -> str | None:
 
 
 def chromium() -> str | None:
-    """Path of the browser."""
+    """Return the path of the browser."""
     named = os.environ.get("SGSST_CHROMIUM")
     return named or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @contextmanager
 def open_browser(*flags: str) -> Iterator[Any]:
-    """A browser of playwright's synchronous interface; in its block no event loop of asyncio can run."""
+    """Yield a browser of Playwright's synchronous API. No asyncio event loop can run inside the block."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
@@ -62,11 +62,11 @@ def open_browser(*flags: str) -> Iterator[Any]:
 
 
 class Watched:
-    """A page, and everything that it must not do.
+    """A page that is watched for errors and forbidden requests.
 
     Attributes:
-        page: of playwright.
-        wrong: errors of the console, exceptions, and requests to other origins.
+        page: Page of Playwright.
+        wrong: Console errors, exceptions, and requests to other origins.
     """
 
     def __init__(self, browser: Any, url: str, *, width: int = 600, height: int = 500, **context: Any) -> None:
@@ -89,25 +89,25 @@ class Watched:
             self.wrong.append(f"request: {request.url}")
 
     def check(self, *allowed: str) -> None:
-        """Fail where something went wrong but for console errors that hold one of some texts."""
+        """Fail on any error, except for console errors that contain one of the allowed texts."""
         violations = self.page.evaluate("() => window.violations")
         found = [text for text in self.wrong if not any(part in text for part in allowed)]
         assert not found, found
         assert not violations, violations
 
     def settled(self) -> None:
-        """Wait until the 3D view shows all of its scene, sorted for its camera."""
+        """Wait until the 3D view shows its whole scene, sorted for its camera."""
         self.page.locator("canvas[data-state=settled]").wait_for()
 
     def wipe(self, key: str) -> None:
-        """Press a key on the slider: Home shows the right side alone, End the left one."""
+        """Press a key on the slider: Home shows only the right side, End only the left one."""
         slider = self.page.get_by_label("Wipe", exact=True)
         slider.wait_for()
         slider.focus()
         self.page.keyboard.press(key)
 
     def pixels(self) -> NDArray[np.float64]:
-        """The 3D view [h, w, 3], 0 to 255, as the page saves it."""
+        """Return the 3D view as saved by the page, [h, w, 3], 0 to 255."""
         self.settled()
         with self.page.expect_download() as download:
             self.page.get_by_role("button", name="Save image").click()
@@ -116,7 +116,7 @@ class Watched:
 
 
 def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
-    """What `sgsst render` makes of a scene's file, [h, w, 3] of 0 to 255."""
+    """Return a scene file as rendered by `sgsst render`, [h, w, 3], 0 to 255."""
     found = read_scene(scene).scene
     colors = view_colors(found.sh_dc, rest_colors(found.sh_rest, found.means, camera))
     image = make_rasterizer("cpu", found).render(colors, camera)
@@ -124,12 +124,13 @@ def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
 
 
 def psnr(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
-    """Peak signal-to-noise ratio of pictures [h, w, 3] of 0 to 255, decibels."""
+    """Return the peak signal-to-noise ratio of images [h, w, 3] of 0 to 255, in decibels."""
     assert found.shape == wanted.shape, (found.shape, wanted.shape)
     return float(10 * np.log10(255**2 / max(float(((found - wanted) ** 2).mean()), 1e-9)))
 
 
-#: Shows a scene by the page's own modules: `[base, scene, cameras, name, width, height]` to what `STEPS` return.
+#: Script that shows a scene with the page's own modules. It takes `[base, scene, cameras, name, width, height]`, and
+#: returns what `STEPS` return.
 VIEW = """async ([base, scene, cameras, name, width, height]) => {
   const { Viewer } = await import(`${base}/viewer/viewer.js`), { readCameras } = await import(`${base}/cameras.js`);
   const canvas = document.createElement("canvas");
@@ -160,12 +161,15 @@ VIEW = """async ([base, scene, cameras, name, width, height]) => {
 
 
 def view_script(steps: str = "(viewer, source, picture) => picture()") -> str:
-    """`VIEW` with steps: a function of viewer, scene, a maker of PNGs in base64, and the modules' address."""
+    """Return `VIEW` with these steps.
+
+    Steps are a function of the viewer, the scene, a function that returns a base64 PNG, and the address of the modules.
+    """
     return VIEW.replace("STEPS", steps)
 
 
 def decoded(png: str) -> NDArray[np.float64]:
-    """Pixels [h, w, 3] of a PNG in base64."""
+    """Return the pixels [h, w, 3] of a base64 PNG."""
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB"), dtype=np.float64)
 
 

@@ -1,4 +1,4 @@
-"""The page's tests need a browser and a service."""
+"""Fixtures of the page's tests: a browser and a service."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.api.service import Service
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Of this module alone: while it is open, nothing else may use asyncio."""
+    """Yield a browser for this module only: while it is open, nothing else may use asyncio."""
     reason = missing()
     if reason:
         pytest.skip(reason)
@@ -30,7 +30,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> I
 
 @pytest.fixture
 def visit(browser: Any, service: Service) -> Iterator[Callable[..., Watched]]:
-    """Opens pages of the service, in windows that know nothing of each other."""
+    """Yield a function that opens pages of the service, each in a separate browser context."""
     opened: list[Watched] = []
 
     def visit(path: str = "/", **context: Any) -> Watched:

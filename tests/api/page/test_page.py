@@ -1,4 +1,4 @@
-"""What a user does on the page, in a real browser with the real service behind it."""
+"""Tests of the page as a user sees it, in a real browser with a real service."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 Visit = Callable[..., Watched]
 STEPS: dict[str, Any] = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
-#: Longer than a test looks at it.
+#: More steps than any test waits for.
 LONG = STEPS | {"steps_sos": 1_000_000}
 REFUSED = "the server responded with a status of 422"
 
@@ -39,7 +39,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
 
 
 def submit(service: Service, files: dict[str, Path], key: str | None = None, **parameters: Any) -> str:
-    """A job by the API alone."""
+    """Submit a job by the API, without the page, and return its id."""
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     with service.client(key) as client:
         answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(STEPS | parameters)})
@@ -48,7 +48,7 @@ def submit(service: Service, files: dict[str, Path], key: str | None = None, **p
 
 
 def done(service: Service, job_id: str) -> str:
-    """Wait until a job has succeeded."""
+    """Wait until a job has succeeded, and return its id."""
 
     def succeeded() -> bool:
         status = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["status"]
@@ -65,7 +65,7 @@ def choose(watched: Watched, files: dict[str, Path]) -> None:
 
 
 def set_options(watched: Watched, **values: Any) -> None:
-    """Fill in options, which stand folded."""
+    """Fill in options, which are in a collapsed section."""
     page = watched.page
     page.locator(".presets input").first.wait_for()
     page.locator("details.fold", has_text="All options").evaluate("(fold) => { fold.open = true; }")
@@ -89,20 +89,20 @@ _DROP = """(files) => {
 
 
 def drop(watched: Watched, files: dict[str, Path]) -> None:
-    """All files at once, from outside the browser onto the page."""
+    """Drop all files at once on the page."""
     carried = [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in files.values()]
     watched.page.evaluate(_DROP, carried)
 
 
 def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
-    """Drop, look, ask what it costs, start, watch, and wipe: the pixels on each side are those of `sgsst render`."""
+    """Drop files, view them, plan, start, watch and wipe: the pixels on each side are those of `sgsst render`."""
     watched = visit(width=600, height=500)
     page = watched.page
     drop(watched, files)
     page.get_by_text("616 Gaussians · SH degree 1").wait_for()
     watched.settled()
     page.get_by_text("3 cameras shown in the scene").wait_for()
-    assert httpx.get(f"{service.url}/v1/jobs").json()["jobs"] == []  # nothing was sent to show it
+    assert httpx.get(f"{service.url}/v1/jobs").json()["jobs"] == []  # nothing was sent for the preview
 
     set_options(watched, **STEPS)
     page.get_by_role("button", name="Estimate time").click()
@@ -127,14 +127,14 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     before = frame_of(watched, original)
     watched.wipe("Home")
     after = frame_of(watched, stylized)
-    assert psnr(before, original) > 38  # the view is larger than the rendered picture
+    assert psnr(before, original) > 38  # the view is larger than the rendered image
     assert psnr(after, stylized) > 38
     assert psnr(before, stylized) < 25
     watched.check()
 
 
 def frame_of(watched: Watched, like: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The camera's frame in the middle of the 3D view, in another picture's size."""
+    """Return the camera's frame in the center of the 3D view, resized like another image."""
     pixels = watched.pixels()
     height, width = pixels.shape[:2]
     h, w = min(height, width * 3 / 4), min(width, height * 4 / 3)
@@ -158,7 +158,7 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     def slow(route: Any) -> None:
         if len(sent) <= 3:
             route.continue_()
-        # further parts hang until the page is left
+        # Further parts hang until the test leaves the page.
 
     page.on("request", note)
     page.route("**/v1/uploads/*", lambda route: slow(route) if route.request.method == "PATCH" else route.continue_())
@@ -182,7 +182,7 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     page.get_by_role("button", name="Cancel").click()
     page.locator(".badge", has_text="Canceled").wait_for()
 
-    sent.clear()  # the same files once more: the service has them
+    sent.clear()  # the same files again: the service has them
     page.get_by_role("link", name="New").click()
     set_options(watched, **LONG)
     choose(watched, files | {"scene": big})
@@ -216,7 +216,7 @@ def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_pat
 
 
 def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """The stream goes on where it was, and the history of the whole run is there."""
+    """The stream resumes where it stopped, and the loss history is complete."""
     job_id = submit(service, files, **LONG)
     watched = visit(f"/#/jobs/{job_id}")
     page = watched.page
@@ -257,7 +257,7 @@ def test_refusals_stand_beside_their_field(visit: Visit, files: dict[str, Path],
 
 
 def test_names_of_files_are_text(visit: Visit, service: Service, tmp_path: Path) -> None:
-    """Wherever they stand: before the upload, in the list, in the view of the job, on the sides of the wipe."""
+    """File names are shown as text everywhere: before upload, in the list, in the job's view and on the wipe."""
     hostile = "<img src=x onerror=document.title='broken'>"
     ply, file, style = write_files(tmp_path, wall())
     files = {
@@ -299,7 +299,7 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     right = watched.pixels()
     watched.wipe("End")
     left = watched.pixels()
-    assert np.abs(left - right).mean() > 0.1  # runs of different seeds differ a little
+    assert np.abs(left - right).mean() > 0.1  # runs with different seeds differ slightly
     page.get_by_label("Left").select_option("original")
     assert np.abs(watched.pixels() - left).mean() > 5
 
@@ -322,11 +322,11 @@ def test_refined_result_has_a_geometry_of_its_own(visit: Visit, service: Service
     right = watched.pixels()
     watched.wipe("End")
     assert np.abs(watched.pixels() - right).mean() > 5
-    watched.check("status of 404")  # that there are no colors alone is asked first
+    watched.check("status of 404")  # the page first asks for colors alone, which do not exist
 
 
 def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """Geometry comes from the packed file, colors from the result: in the file's order."""
+    """Geometry comes from the compressed file, colors from the result, in the order of the file."""
     packed = files["scene"].with_name("scene.spz")
     write_packed(packed, read_scene(files["scene"]).scene, "spz")
     job_id = done(service, submit(service, files | {"scene": packed}, name="packed"))
@@ -338,12 +338,12 @@ def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service
     for key, path in (("End", packed), ("Home", result)):
         wanted = rendered(path, camera)
         watched.wipe(key)
-        assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered picture
+        assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered image
     watched.check()
 
 
 def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """From the list to a finished job, and around it, without a pointer."""
+    """Open a finished job from the list and use its view, without a pointer."""
     job_id = done(service, submit(service, files, name="by keyboard"))
     watched = visit("/#/jobs")
     page = watched.page
@@ -413,7 +413,7 @@ def test_nothing_moves_while_the_page_loads(visit: Visit) -> None:
           setTimeout(() => done(sum), 300);
         })"""
     )
-    assert moved < 0.1  # what counts as good
+    assert moved < 0.1  # the threshold of a good layout shift
     watched.check()
 
 
@@ -457,7 +457,7 @@ def _new_key(service: Service, name: str) -> str:
 
 
 def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
-    """Two paintings in shares, and a half that is kept: what the page sends is what the job has."""
+    """A weighted mix of two styles and a frozen half: the job has what the page sends."""
     night = tmp_path / "night.png"
     Image.new("RGB", (64, 64), (20, 30, 90)).save(night)
     watched = visit()
@@ -490,7 +490,7 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
 
 
 def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) -> None:
-    """On a telephone: one finger turns the scene, two that close move it away; the page stays where it is."""
+    """On a phone, one finger rotates the scene, a pinch moves it away, and the page does not scroll."""
     watched = Watched(browser, service.url, width=360, height=640, has_touch=True, is_mobile=True)
     page = watched.page
     page.goto(service.url)
@@ -512,7 +512,7 @@ def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) 
 
 
 def touch(watched: Watched, places: list[list[tuple[float, float]]]) -> None:
-    """Fingers that come down, move from place to place, and leave."""
+    """Put fingers down, move them from position to position, and lift them."""
     device = watched.context.new_cdp_session(watched.page)
     for number, fingers in enumerate(places):
         points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(fingers)]
@@ -523,7 +523,7 @@ def touch(watched: Watched, places: list[list[tuple[float, float]]]) -> None:
 
 
 def shown(pixels: NDArray[np.float64]) -> int:
-    """Pixels in which something stands: the background is black."""
+    """Return the number of pixels that are not background, which is black."""
     return int((pixels.max(axis=2) > 20).sum())
 
 

@@ -1,4 +1,4 @@
-"""The 3D view against `sgsst render`, its wipe, its order, and a graphics device that goes away."""
+"""Tests of the 3D view against `sgsst render`, of its wipe and depth order, and of a lost GPU context."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.slow
 
-#: What the viewer was built to reach in every camera, decibels.
+#: Minimum PSNR in decibels in every camera.
 FAITHFUL = 45.0
 Visit = Callable[..., Watched]
 
 
 def base_of(watched: Watched) -> str:
-    """Where the page's modules are."""
+    """Return the address of the page's modules."""
     source: str = watched.page.locator("script[type=module]").get_attribute("src")
     return source.rsplit("/", 1)[0]
 
@@ -71,7 +71,7 @@ def test_packed_scenes_are_shown(
 ) -> None:
     scene, views = real_scene(shared_data, name)
     ply, _, _ = write_files(tmp_path, scene, views)
-    ply.unlink()  # the browser and `sgsst render` see the packed scene alone; its name tells nothing
+    ply.unlink()  # the browser and `sgsst render` read only the compressed scene, whose name is no hint
     if form == "splat":
         ply.write_bytes(splat_bytes(scene))
     else:
@@ -85,7 +85,7 @@ def test_packed_scenes_are_shown(
 
 
 def splat_bytes(scene: Scene) -> bytes:
-    """A .splat, of which there is no writer."""
+    """Return a scene as .splat, for which the project has no writer."""
     rows = splat_rows(np.zeros(len(scene) * SPLAT_BYTES, np.uint8))
     rows.flags.writeable = True
     quats = scene.quats / scene.quats.norm(dim=1, keepdim=True)
@@ -108,7 +108,7 @@ def test_old_spz_is_shown(visit: Visit, tmp_path: Path, version: int) -> None:
 
 
 def old_spz(scene: Scene, version: int) -> bytes:
-    """SPZ as the first two versions had it, without spherical harmonics; y up."""
+    """Return a scene as SPZ of version 1 or 2, without spherical harmonics; y is up."""
     flip = np.array([1, -1, -1])
     means = scene.means.double().numpy() * flip
     fixed = np.rint(means * 2**12).astype("<i4")
@@ -175,7 +175,7 @@ def test_two_scenes_share_the_wipe(visit: Visit, tmp_path: Path) -> None:
 
 
 def test_order_is_right_from_every_side(visit: Visit, tmp_path: Path) -> None:
-    """Against a plain sort of float64 depths: no Gaussian before one that is nearer by more than float32 can tell."""
+    """The order is compared with a sort of float64 depths: Gaussians may only be swapped within float32 precision."""
     write_files(tmp_path, wall())
     steps = """async (viewer, source, picture, base) => {
       const { depthOrder } = await import(`${base}/viewer/depth_order.js`);
@@ -201,7 +201,7 @@ def test_order_is_right_from_every_side(visit: Visit, tmp_path: Path) -> None:
       return worst;
     }"""
     for left_out, twice, back in shown(visit("/#/jobs"), tmp_path, "view_1", (64, 48), steps):
-        assert abs(left_out) <= 1  # one may lie on the near plane to within rounding
+        assert abs(left_out) <= 1  # one may lie on the near plane within rounding
         assert twice == 0
         assert back < 1e-5
 
