@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Packages whose docstrings follow docs/style.md. Add a package once it passes.
 PACKAGES = (
     "benchmarks",
+    "deploy",
     "service",
     "sgsst_core/bench",
     "sgsst_core/features",
