@@ -5,7 +5,7 @@
 
 Run it in the service's own environment (`SGSST_DATABASE`, `SGSST_ARTIFACTS`, `AWS_...`). PostgreSQL also needs
 `pg_dump` and `pg_restore` of the server's version or later. Files that FOLDER already has from an earlier backup are
-not copied again, because names of files are never written twice. The exception are unfinished uploads in a local store.
+not copied again, because names of files are never written twice. Unfinished uploads in a local store are the exception.
 
 Files are copied before and after the database, so whatever its rows refer to exists in one of the two passes. The
 exception is a checkpoint that was created and replaced in between. The database is then saved again, up to three times
