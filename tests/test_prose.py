@@ -25,6 +25,8 @@ PACKAGES = (
     "sgsst_core/report",
     "sgsst_core/scene",
     "sgsst_core/stylizing",
+    "tests/deploy",
+    "tests/service",
 )
 OPENERS = ("Of", "Who", "What", "That", "From which", "In which")
 SECTIONS = ("Args", "Attributes", "Raises")
