@@ -204,7 +204,7 @@ def test_pods_reach_what_they_need_alone(overlay: str) -> None:
 
 
 def test_webhooks_are_a_choice(tmp_path: Path) -> None:
-    """The component enables webhooks and gives dispatchers access to all ports of public addresses, but no private ones."""
+    """The component enables webhooks and lets dispatchers reach all ports of public addresses, but no private ones."""
     for overlay in OVERLAYS:
         assert "SGSST_WEBHOOKS" not in rendered(overlay)
     found = changed(tmp_path, lambda overlay: overlay["components"].append("../../components/webhooks"))

@@ -1,4 +1,4 @@
-"""`deploy/requirements`: packages that pip installs into the images, in tested versions and with digests of all files."""
+"""`deploy/requirements`: packages that pip installs in the images, in tested versions and with digests of all files."""
 
 from __future__ import annotations
 
