@@ -21,7 +21,7 @@ _ASK_AGAIN_SECONDS = 2.0
 
 
 def main() -> int:
-    """Prepare database and bucket and return the exit status: 0 on success."""
+    """Prepare the database and the bucket, and return the exit status: 0 on success."""
     settings = ServiceSettings()
     set_up(settings.log_format)
     keep_private(settings)

@@ -35,17 +35,17 @@ class ServiceSettings(BaseSettings):
         max_upload_bytes: Size limit of one file.
         max_gaussians, max_views, max_pixels: Limits per job; pixels are those of all views together.
         max_image_pixels: Limit for the style and for each photo.
-        max_photos: Limit of files per job.
-        max_jobs_per_key: Limit of unfinished jobs per key.
+        max_photos: Maximum number of photos per job.
+        max_jobs_per_key: Maximum number of unfinished jobs per key.
         max_jobs_a_day_per_key, max_gpu_seconds_a_day_per_key, max_bytes_per_key, max_requests_a_second_per_key: Quotas
             of keys without their own (`service.store.quotas`); None for no limit.
-        max_connections: Limit of concurrent connections per API process, including event streams.
+        max_connections: Maximum number of concurrent connections per API process, including event streams.
         trusted_proxies: Addresses and networks of reverse proxies, separated by commas, whose `X-Forwarded-For` and
             `X-Forwarded-Proto` are trusted; empty for none.
         min_free_bytes: Free disk space below which the service accepts no data.
-        inspection_seconds, inspection_bytes: CPU time and memory limits for checking a job's files, in addition to
-            those that grow with the size of the files (`service.inspection.inspector`).
-        dry_run_seconds: CPU time limit for a dry run, in addition to what its Gaussians and views need.
+        inspection_seconds, inspection_bytes: Base limits of CPU time and memory for checking a job's files; both grow
+            with the size of the files (`service.inspection.inspector`).
+        dry_run_seconds: Base limit of CPU time for a dry run; it grows with Gaussians and views.
         receive_seconds: Time without new bytes after which a request body is abandoned.
         session_days: Lifetime of a browser session that was started with a key.
         upload_hours: Time after which an unfinished upload, or a finished one that no job uses, expires.

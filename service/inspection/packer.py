@@ -33,7 +33,7 @@ _SECONDS_PER_BYTE = 600 / 1e9
 
 
 class Packer:
-    """Creator of compressed results, one at a time; concurrent requests for the same result share one task."""
+    """Compressor of results, one at a time; concurrent requests for the same result share one task."""
 
     def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
@@ -107,5 +107,5 @@ class Packer:
             self._artifacts.remove(location)
 
     async def close(self) -> None:
-        """Stop the process and what it is compressing."""
+        """Stop the process, and with it any compression in progress."""
         await self._process.close()

@@ -3,7 +3,7 @@
 It imports the slow modules once. For each request it forks a child with limits on time and memory, which reads the
 files and exits. The child is confined (`service.inspection.sandbox`): a hostile file that takes it over can falsify the
 answer to its own request, and nothing else. Requests and answers are lines of JSON on stdin and stdout, one request at
-a time. The answer to a plan is preceded by lines of progress, `{"planning": ...}`.
+a time. Lines of progress, `{"planning": ...}`, precede the answer to a plan.
 """
 
 from __future__ import annotations

@@ -221,7 +221,7 @@ def summary(result: Result) -> dict[str, Any]:
 
 
 def failure(error: Exception) -> Message:
-    """Return the message for an error, with whether it is permanent, so that a retry would fail again."""
+    """Return the message for an error; the error is permanent if a retry would fail in the same way."""
     from sgsst_core.errors import DivergedError, InvalidInputError, SgsstError
 
     if is_outage(error):

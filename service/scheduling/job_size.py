@@ -1,6 +1,6 @@
 """Estimate of how many GPUs a job is worth from its record, before its files are read or planned.
 
-The job's plan, made with measured times, decides in the end, and GPUs that it does not use are returned. Until then the
+The job's plan, made with measured times, has the final say, and GPUs that it does not use are returned. Until then the
 job holds what it was given, so a job of a few seconds should not be given eight GPUs. All estimates are for one H200
 and come from `benchmarks.forecast`; on slower machines all jobs are worth more GPUs than estimated here.
 """

@@ -127,7 +127,7 @@ class Database:
     def reading_rows(self) -> Iterator[Connection]:
         """Provide a connection as `reading` does, but without the ORM.
 
-        This costs a third, which matters for queries that run hundreds of times a second.
+        It takes a third of the work, for queries that run hundreds of times a second.
         """
         with self._reads.guarded(), self.engine.connect() as connection:
             yield connection

@@ -1,4 +1,4 @@
-"""Queries for the next job, which every dispatcher runs all the time, and reservations for jobs that do not fit yet.
+"""Queries for the next job, which every dispatcher runs continually, and reservations for jobs that do not fit yet.
 
 The queue may have tens of thousands of jobs, most of them of a few owners. Only the first job of each owner can be
 next. The query therefore steps from owner to owner in an index and compares only their first jobs: the time grows with

@@ -57,7 +57,7 @@ class Quotas:
         return replace(self, **{name: value for name, value in (own or {}).items() if name in known})
 
     def given(self) -> dict[str, Any]:
-        """Return the quotas that are limits, for `with_own`."""
+        """Return the quotas that set a limit, for `with_own`."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 

@@ -54,7 +54,7 @@ def test_the_image_without_gpus_has_no_package_of_cuda() -> None:
 
 @pytest.mark.parametrize("kind", ["cpu", "cuda"])
 def test_nothing_that_is_needed_is_missing(kind: str) -> None:
-    """Requirements of the project and its packages are checked as far as these are installed here."""
+    """Only requirements of packages that are installed here can be checked."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [
         *project["dependencies"],

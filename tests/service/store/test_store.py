@@ -243,7 +243,7 @@ def test_a_job_that_always_breaks_at_the_same_step_is_given_up(store: Store, clo
     job_id = queue(store)
     assert fail_at(store, clock, None, lost=lost)
     assert fail_at(store, clock, 90, lost=lost), "this one came on"
-    # each attempt first publishes the checkpoint that it resumes from again, or an older step if it starts over
+    # each attempt first republishes the checkpoint that it resumes from, or an older step if it starts over
     assert fail_at(store, clock, 90, lost=lost)
     assert fail_at(store, clock, 10, lost=lost)
     assert not fail_at(store, clock, 90, lost=lost)
