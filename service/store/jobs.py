@@ -303,7 +303,6 @@ class Jobs:
 
 
 def _row_of_new_job(new: NewJob, now: float) -> dict[str, Any]:
-    """Return the row of a new job."""
     return {
         "id": new_id("job", now),
         "owner": new.owner,
