@@ -1,15 +1,15 @@
-"""Back up a service and restore it: its database, and the store of its files.
+"""Back up and restore a service: its database and its file store.
 
-    python deploy/backup.py save FOLDER        # beside a service that runs
-    python deploy/backup.py restore FOLDER     # into an empty database, before API and dispatchers are started
+    python deploy/backup.py save FOLDER        # beside a running service
+    python deploy/backup.py restore FOLDER     # into an empty database, before API and dispatchers start
 
-with the service's own environment (`SGSST_DATABASE`, `SGSST_ARTIFACTS`, `AWS_...`), and for PostgreSQL `pg_dump` and
-`pg_restore` of the server's version or a later one. What FOLDER has of an earlier backup is not copied again: names of
-files are never written twice, but for unfinished uploads where the store is a local folder.
+Run it in the service's own environment (`SGSST_DATABASE`, `SGSST_ARTIFACTS`, `AWS_...`). PostgreSQL also needs
+`pg_dump` and `pg_restore` of the server's version or later. Files that FOLDER already has from an earlier backup are
+not copied again, because names of files are never written twice. Unfinished uploads in a local store are the exception.
 
-Files are copied before and after the database: what its rows refer to was there at one of the two, but for a checkpoint
-that was made and replaced in between. Then the database is saved again, up to three times; a job whose checkpoint is
-still missing begins anew.
+Files are copied before and after the database, so whatever its rows refer to exists in one of the two passes. The
+exception is a checkpoint that was created and replaced in between. The database is then saved again, up to three times
+in total; a job whose checkpoint is still missing restarts from the beginning.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from service.settings import ServiceSettings
 from service.store import Store
 from service.store.tables import ArtifactRow, BlobRow, JobRow, UploadPartRow
 
-#: Files on their way at a time.
+#: Number of files copied concurrently.
 _AT_A_TIME = 8
-#: How often the database is saved until all checkpoints that it refers to are there.
+#: Maximum number of times the database is saved until all checkpoints that it refers to are copied.
 _ATTEMPTS = 3
-#: Beside a local store of results lie inputs, and unfinished uploads, which grow.
+#: Folders beside a local result store: inputs, and unfinished uploads, whose files grow.
 _LOCAL_FOLDERS, _GROWING = ("blobs", "uploads"), "uploads"
-#: What the name of a file begins with that is not yet there as a whole.
+#: Prefix of the name of an incomplete file.
 _HALF = ".half-"
 
 
 class BackupError(Exception):
-    """What to do about it is its text."""
+    """Failed backup; the message says what to do."""
 
 
 def main() -> int:
-    """Returns 0 where everything was saved or restored."""
+    """Run the command and return the exit status: 0 on success."""
     parser = argparse.ArgumentParser(description="Back up a service, or restore it.")
     parser.add_argument("what", choices=("save", "restore"))
     parser.add_argument("folder", type=Path)
@@ -64,7 +64,7 @@ def main() -> int:
 
 
 def save(settings: ServiceSettings, folder: Path) -> None:
-    """Database and files into a folder."""
+    """Save database and files to a folder."""
     store = Store(settings)
     folder.mkdir(parents=True, exist_ok=True)
     files = folder / "files"
@@ -81,7 +81,7 @@ def save(settings: ServiceSettings, folder: Path) -> None:
 
 
 def restore(settings: ServiceSettings, folder: Path) -> None:
-    """Files and database from a folder; rows of checkpoints whose files are missing go."""
+    """Restore files and database from a folder; rows of checkpoints without files are deleted."""
     if not (folder / "database").exists():
         raise BackupError(f"{folder} holds no backup.")
     store = Store(settings)
@@ -102,13 +102,13 @@ def restore(settings: ServiceSettings, folder: Path) -> None:
 
 
 def _checkpoints(store: Store) -> set[str]:
-    """Where the database says that checkpoints are."""
+    """Return the locations of all checkpoints in the database."""
     with store.database.reading() as session:
         return set(session.scalars(select(ArtifactRow.location).where(ArtifactRow.name == CHECKPOINT)))
 
 
 def _places(settings: ServiceSettings) -> dict[str, ObjectStore]:
-    """Where files are, by the name of their folder in a backup."""
+    """Return the stores of files by the names of their folders in a backup."""
     store = ObjectStore(settings.artifacts_url)
     if not store.local:
         return {"store": store}
@@ -125,7 +125,7 @@ def _copy_all(settings: ServiceSettings, files: Path) -> int:
 
 
 def _copy(source: ObjectStore, target: ObjectStore) -> int:
-    """What the target has not; returns how many files that was. One that vanishes meanwhile is no longer needed."""
+    """Copy the files that the target lacks and return their number; files that vanish meanwhile are not needed."""
     there = set() if Path(source.root).name == _GROWING else set(target.below(""))
     wanted = sorted(name for name in source.below("") if name not in there and not Path(name).name.startswith(_HALF))
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
@@ -144,7 +144,8 @@ def _copy_one(source: ObjectStore, target: ObjectStore, name: str) -> bool:
             half = path.with_name(f"{_HALF}{path.name}")
             half.parent.mkdir(parents=True, exist_ok=True)
             source.get(name, half)
-            half.replace(path)  # an interrupted copy is not taken for the file the next time
+            # the final name only appears on complete files, so an interrupted copy is repeated next time
+            half.replace(path)
     except FileNotFoundError:
         return False
     return True
@@ -172,7 +173,7 @@ def _load(store: Store, folder: Path) -> None:
 
 
 def _run(program: str, *words: str, url: URL) -> None:
-    """A program of PostgreSQL's; where the server is it reads from its environment, the password too."""
+    """Run a PostgreSQL program, which reads the server's address and the password from its environment."""
     where = {"PGHOST": url.host, "PGPORT": url.port, "PGUSER": url.username, "PGPASSWORD": url.password}
     where |= {"PGDATABASE": url.database, "PGPASSFILE": url.query.get("passfile")}
     environment = {**os.environ, **{name: str(value) for name, value in where.items() if value is not None}}
@@ -183,7 +184,7 @@ def _run(program: str, *words: str, url: URL) -> None:
 
 
 def _missing(store: Store, places: dict[str, ObjectStore]) -> list[str]:
-    """Files that rows refer to and that are not there. Rows of checkpoints among them are removed."""
+    """Return the files that rows refer to but that are missing; rows of missing checkpoints are deleted instead."""
     there = {name: set(place.below("")) for name, place in places.items()}
     remote = "blobs" not in there
     blobs = {name.removeprefix(f"{BLOBS}/") for name in there["store"]} if remote else there["blobs"]

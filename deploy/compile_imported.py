@@ -1,4 +1,4 @@
-"""Import what the programs import, so that its bytecode is in the image: its root is read-only where it runs."""
+"""Import what the programs import, so that the image contains the bytecode: its root is read-only at run time."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 # shellcheck shell=bash
-# For scripts that make hosts out of namespaces (two_hosts.sh, three_hosts.sh): a network that no other run of theirs has.
+# For scripts that make hosts out of namespaces (two_hosts.sh, three_hosts.sh): a network that no concurrent run uses.
 
 BRIDGE=
 NET=
 
-# A bridge of this machine in a free one of the networks 10.77.81 to 10.77.99, with this machine at number 1. Sets BRIDGE,
-# with which names of hosts begin, and NET. Making the bridge is what takes the network, so two runs never get the same.
-# What a killed run has left is passed over: `ip link delete sgsst-NN` frees its network.
+# Create a bridge on this machine in a free network of 10.77.81 to 10.77.99, with this machine as number 1. Sets BRIDGE,
+# the prefix of host names, and NET. Creating the bridge reserves the network, so two runs never get the same. Leftovers
+# of killed runs are skipped: `ip link delete sgsst-NN` frees their networks.
 take_network() {
   local number problem=
   for number in $(seq 81 99); do
@@ -22,10 +22,10 @@ take_network() {
   return 1
 }
 
-# A host's own network on the bridge. $1 name, $2 address.
+# Create a host's own network on the bridge. $1 name, $2 address.
 add_host() {
   local host=$BRIDGE-$1
-  ip netns delete "$host" 2> /dev/null || true # its file outlives a machine whose /run is on a disk
+  ip netns delete "$host" 2> /dev/null || true # left over if the machine restarts and /run is on a disk
   ip netns add "$host"
   ip link add "$host" type veth peer name eth0 netns "$host"
   ip link set "$host" master "$BRIDGE" up
@@ -35,13 +35,13 @@ add_host() {
   ip -n "$host" route add default via "$NET.1"
 }
 
-# Take a host off the bridge. $1 name.
+# Remove a host from the bridge. $1 name.
 remove_host() {
   ip link delete "$BRIDGE-$1" 2> /dev/null || true
   ip netns delete "$BRIDGE-$1" 2> /dev/null || true
 }
 
-# Give the network back, with all hosts on it. The arguments: their names.
+# Release the network with all hosts on it. Arguments: names of the hosts.
 give_network_back() {
   local name
   [ -n "$BRIDGE" ] || return 0

@@ -1,14 +1,13 @@
-"""Write the packages of the images to deploy/requirements, with the digests of their files: pip installs no other file.
+"""Lock the packages of the images in deploy/requirements with the digests of their files; pip installs no other file.
 
-Versions are those of constraints.txt. After a change of those, or of the dependencies, run this with uv
-(`pip install uv`):
+Versions come from constraints.txt. When they or the dependencies change, run this with uv (`pip install uv`):
 
     python deploy/lock.py torch-2.13.0+cpu-cp311-cp311-manylinux_2_28_x86_64.whl
 
 The wheel of PyTorch without CUDA comes from https://download.pytorch.org/whl/cpu/torch/, because PyPI has none.
 
-`build.txt` has what builds the project, `common.txt` what both images need, `cpu.txt` and `cuda.txt` what one needs
-beside it.
+`build.txt` has the build dependencies of the project, `common.txt` the packages of both images, `cpu.txt` and
+`cuda.txt` the additional packages of each image.
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "deploy" / "requirements"
-#: Python of the images.
+#: Python version of the images.
 PYTHON = "3.11"
 HEAD = "# Written by deploy/lock.py.\n"
-#: In constraints.txt, the line above the packages that only PyTorch with CUDA needs.
+#: Line in constraints.txt above the packages that only PyTorch with CUDA needs.
 CUDA_SECTION = "# What PyTorch's CUDA build for Linux adds."
 
 
 def main(wheels: list[Path]) -> None:
-    """Write all files.
+    """Write all requirements files.
 
     Args:
-        wheels: PyTorch without CUDA, one for each kind of processor that images are built for.
+        wheels: Wheels of PyTorch without CUDA, one per CPU architecture of the images.
     """
     pinned = _compile(str(ROOT / "pyproject.toml"), "--extra", "postgresql", "--extra", "s3")
     cuda = {name for name in pinned if name in cuda_packages() or name == "torch"}
@@ -52,7 +51,7 @@ def cuda_packages() -> set[str]:
 
 
 def _compile(source: str, *options: str, given: str | None = None) -> dict[str, str]:
-    """Return each package that is needed, by name, with the digests of its files."""
+    """Return the required packages by name, with the digests of their files."""
     command = ["uv", "pip", "compile", source, *options, "--quiet", "--no-header", "--no-annotate"]
     command += ["--constraint", str(ROOT / "constraints.txt"), "--generate-hashes"]
     command += ["--python-version", PYTHON, "--python-platform", "x86_64-manylinux_2_28"]

@@ -1,7 +1,7 @@
-"""Write the passwords of the composed services into their volumes: each is generated at the first start, and kept.
+"""Write the passwords of the composed services into their volumes; each is generated once, at the first start.
 
-A password that the environment names is taken instead, also later. Runs as root in a container of its own, before all
-others (`secrets` in compose.yaml); every service mounts only what it needs.
+A password in the environment takes precedence, at later starts too. The script runs as root in a container of its own
+before all others (`secrets` in compose.yaml). Every service mounts only the passwords that it needs.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import secrets
 import sys
 from pathlib import Path
 
-#: User of the service's processes: libpq reads a password file only if nobody else can.
+#: User of the service's processes: libpq accepts a password file only if nobody else can read it.
 SERVICE_USER = 10001
 HOST, USER = "database", "sgsst"
 
 
 def make_secrets(folder: Path, given: dict[str, str]) -> None:
-    """Write all files below a folder.
+    """Write all files in a folder.
 
     Args:
-        given: Environment; an empty or missing variable has a password generated.
+        given: Environment variables; passwords with an empty or missing variable are generated.
     """
     password = _secret(folder / "database" / "password", given.get("SGSST_DATABASE_PASSWORD"))
     escaped = password.replace("\\", "\\\\").replace(":", "\\:")
@@ -41,16 +41,16 @@ def make_secrets(folder: Path, given: dict[str, str]) -> None:
 
 
 def _secret(path: Path, given: str | None) -> str:
-    """Return the secret that is given, the one that a file holds, or a new one; the file holds it afterwards."""
+    """Return the given secret, the one in the file, or a new one, and store it in the file."""
     secret = given or (path.read_text() if path.exists() else secrets.token_hex(32))
     _write(path, secret)
     return secret
 
 
 def _write(path: Path, text: str, *, private: bool = False) -> None:
-    """Write a file whole or not at all; a private one can be read by the service alone.
+    """Write a file atomically; a private one is readable by the service only.
 
-    The other services run as users of their own images: what shields their files is who mounts the volume.
+    Other services run as users of their own images, so their files are protected by which services mount the volume.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# The service on three hosts that share PostgreSQL and an S3 store, and nothing else: no folder, no path. The hosts are sets
-# of namespaces of this machine, with a bridge between them: `api` (the API), `head` (Ray's head without work, and the
-# dispatcher), `node` (a Ray node, which computes; no network's weights are installed there).
+# Run the service on three hosts that share only PostgreSQL and an S3 store: no folder, no path. The hosts are sets of
+# namespaces on this machine with a bridge between them: `api` (the API), `head` (Ray's head without work, and the
+# dispatcher), and `node` (a Ray node for the computations, without installed network weights).
 #
-# A job is submitted by curl from outside, and its result compared with that of `sgsst stylize`. With "kill" as second
-# argument the node is killed with all its processes and its disk, in the middle of the job, and started anew.
+# A job is submitted with curl from outside, and its result is compared with that of `sgsst stylize`. With "kill" as
+# second argument, the node is killed in the middle of the job with all its processes and its disk, and started again.
 #
-# Needs: Linux, root, iproute2, util-linux, curl, PostgreSQL's programs, and the environment that `make demo` makes in .venv
-# (or another one in BIN) with [postgresql,s3] and moto[server]. Everything that it set up is gone when it ends.
+# Needs: Linux, root, iproute2, util-linux, curl, PostgreSQL's programs, and the environment that `make demo` creates in
+# .venv (or another one in BIN) with [postgresql,s3] and moto[server]. Everything is cleaned up at the end.
 #
 # Usage: deploy/three_hosts.sh [FOLDER] [kill]
 set -euo pipefail
@@ -19,7 +19,7 @@ HOW=${2:-quiet}
 RAY_PORT=6479
 PG_PORT=5498
 S3_PORT=5599
-PATIENCE=${PATIENCE:-900} # seconds that the job may take
+PATIENCE=${PATIENCE:-900} # time limit of the job in seconds
 WORK=$(mktemp -d /tmp/sgsst-three-XXXXXX)
 PG_BIN=$(dirname "$(readlink -f "$(command -v initdb || ls /usr/lib/postgresql/*/bin/initdb)" | tail -n 1)")
 CACHE=${SGSST_CACHE:-$HOME/.cache/sgsst}
@@ -44,7 +44,8 @@ clean_up() {
 trap clean_up EXIT
 trap 'exit 130' INT TERM
 
-# A host: its own network, processes, name, and disks for what is temporary and for the service. $1 name, $2 address.
+# Start a host with its own network, processes, name, and disks for temporary files and for the service. $1 name, $2
+# address.
 start_host() {
   local name=$1 address=$2
   add_host "$name" "$address"
@@ -68,7 +69,7 @@ stop_host() {
   remove_host "$1"
 }
 
-# A command on a host. $1 name, the rest: the command.
+# Run a command on a host. $1 name, the rest: the command.
 on_host() {
   local first
   first=$(pgrep -P "${hosts[$1]}" | head -n 1)
@@ -76,7 +77,7 @@ on_host() {
   nsenter -t "$first" -n -u -p -m --wd="$PWD" "$@"
 }
 
-# A service on a host, in the background, with its words in NAME.log. $1 host, $2 name, the rest: the command.
+# Run a service on a host in the background, with its output in NAME.log. $1 host, $2 name, the rest: the command.
 run_on() {
   local host=$1 name=$2
   shift 2
@@ -182,7 +183,7 @@ for name in stylized.ply report.json plan.json log.txt; do
   curl -sf "$url/v1/jobs/$job/artifacts/$name" -o "$OUT/$name"
 done
 echo "computed on: $(field "['workers']['ranks'][0]['host']" < "$OUT/report.json")"
-threads=$(field "['workers']['ranks'][0]['threads']" < "$OUT/report.json") # sums of other threads round in other ways
+threads=$(field "['workers']['ranks'][0]['threads']" < "$OUT/report.json") # other numbers of threads round differently
 OMP_NUM_THREADS=$threads sgsst stylize "$scene/motorcycle.ply" --cameras "$scene/cameras.json" --style "$scene/starry_night.jpg" \
   --out "$OUT/expected.ply" --resolution 96 --views 2 --steps-coarse 0 --steps-sos 24 --backbone vgg16 --compute-everything \
   --seed 1 > /dev/null

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# One job on two hosts that are one machine: two sets of namespaces with a bridge between them, one Ray node in each, and
-# one `sgsst stylize --workers 2` whose ranks talk over the hosts' own addresses.
+# Run one job on two hosts that are one machine: two sets of namespaces with a bridge between them and one Ray node in
+# each. The ranks of one `sgsst stylize --workers 2` communicate over the hosts' own addresses.
 #
-# Needs: Linux, root, iproute2 (`apt-get install -y iproute2`), util-linux, and the environment that `make demo` makes in
-# .venv, or another one in BIN. Takes about two minutes; everything that it set up is gone when it ends, however it ends.
+# Needs: Linux, root, iproute2 (`apt-get install -y iproute2`), util-linux, and the environment that `make demo` creates
+# in .venv, or another one in BIN. Takes about two minutes. Everything is cleaned up at the end, even after errors.
 #
 # Usage: deploy/two_hosts.sh [OUT.ply]
 set -euo pipefail
@@ -24,14 +24,15 @@ for tool in ip unshare nsenter; do
 done
 
 clean_up() {
-  for pid in "${hosts[@]}"; do kill -KILL "$pid" 2> /dev/null || true; done # a host's first process takes all others along
+  # killing a host's first process kills all others
+  for pid in "${hosts[@]}"; do kill -KILL "$pid" 2> /dev/null || true; done
   give_network_back a b
   rm -rf "$WORK"
 }
 trap clean_up EXIT
 trap 'exit 130' INT TERM
 
-# A host: its own network, processes, name and temporary folder. $1 name, $2 address, the rest: its Ray node.
+# Start a host with its own network, processes, name and temporary folder. $1 name, $2 address, the rest: its Ray node.
 start_host() {
   local name=$1 address=$2
   shift 2
@@ -40,10 +41,10 @@ start_host() {
   ip netns exec "$BRIDGE-$name" unshare --uts --pid --mount --fork --mount-proc --kill-child bash -c \
     "hostname host-$name; mount -t tmpfs tmpfs $WORK/ray; exec $(printf '%q ' "$@")" > "$WORK/$name.log" 2>&1 &
   hosts[$name]=$!
-  disown  # or the shell would report its end
+  disown # keeps the shell from reporting its end
 }
 
-# A command on a host, beside its Ray node. $1 name, the rest: the command.
+# Run a command on a host beside its Ray node. $1 name, the rest: the command.
 on_host() {
   local first
   first=$(pgrep -P "${hosts[$1]}" | head -n 1)
@@ -93,6 +94,6 @@ report = json.load(open(sys.argv[1]))
 ranks, megabytes = report["workers"]["ranks"], int(sys.argv[2]) / 1e6
 print("ranks:", ", ".join(f"{rank['host']} ({rank['device']}, {rank['threads']} threads)" for rank in ranks))
 print(f"sent by host-b over the bridge: {megabytes:.1f} MB in {len(report['history'])} steps")
-# A view of 160 x 120 pixels with its gradient, statistics and colors is more than a megabyte a step.
+# Per step, a view of 160 x 120 pixels with its gradient, statistics and colors takes more than a megabyte.
 sys.exit({rank["host"] for rank in ranks} != {"host-a", "host-b"} or megabytes < len(report["history"]))
 PYTHON

@@ -1,1 +1,1 @@
-"""Jobs as a service: settings, durable store, inputs and artifacts on disk, and the dispatcher that runs them."""
+"""Job service: settings, durable store, inputs and artifacts on disk, and the dispatcher that runs the jobs."""

@@ -1,6 +1,6 @@
-"""`python -m service.ensure_network_weights [NAME...]`: fetch networks that are not installed, and say so.
+"""`python -m service.ensure_network_weights [NAME...]`: fetch the named networks that are not installed.
 
-Without names any one will do, and VGG16 is fetched where there is none.
+Without names, one installed network is enough: VGG16 is fetched only if there is neither VGG19 nor VGG16.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from sgsst_core.features.network_weights import fetch_network_weights, list_netw
 
 
 def main() -> int:
-    """Returns 0 where the networks are there at the end."""
+    """Fetch the networks and return the exit status: 0 on success."""
     installed = {entry.name for entry in list_network_weights() if entry.path}
     wanted = sys.argv[1:]
     if not wanted and not installed & {"vgg19", "vgg16"}:

@@ -1,4 +1,4 @@
-"""The exceptions of the service, in one tree; `code` is what programs read, the message is for people."""
+"""Exceptions of the service, in one tree: `code` is for programs, the message for people."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ _AGAIN = "If you have sent it, send it again; a result has to be computed again.
 
 
 class ServiceError(SgsstError):
-    """Root of what the service refuses on purpose.
+    """Base class of all errors that the service raises on purpose.
 
     Attributes:
-        status: HTTP status that a front end answers with.
-        extra: members that a problem document carries beside the message.
+        status: HTTP status of the response.
+        extra: Additional members of the problem document.
     """
 
     code = "service-error"
@@ -26,13 +26,13 @@ class ServiceError(SgsstError):
 
 
 class NotFoundError(ServiceError):
-    """There is nothing of that name, or it is somebody else's."""
+    """Object that does not exist or belongs to another owner."""
 
     code, status = "not-found", 404
 
 
 class RefusedInputError(ServiceError):
-    """An input that cannot be used; `code` is the core's, `extra["input"]` names the part of the request."""
+    """Input that cannot be used; `code` is the core's, `extra["input"]` names the part of the request."""
 
     code, status = "invalid-input", 422
 
@@ -42,61 +42,64 @@ class RefusedInputError(ServiceError):
 
 
 class ConflictError(ServiceError):
-    """The job or upload is in a state in which this cannot be done."""
+    """Operation that the state of the job or upload does not allow."""
 
     code, status = "conflict", 409
 
 
 class IdempotencyError(ServiceError):
-    """An Idempotency-Key that was used before, for another request."""
+    """Idempotency-Key that was already used for a different request."""
 
     code, status = "idempotency-key-reused", 422
 
 
 class TooLargeError(ServiceError):
-    """More bytes, Gaussians or pixels than the settings allow."""
+    """Request with more bytes, Gaussians or pixels than the settings allow."""
 
     code, status = "too-large", 413
 
 
 class QueueFullError(ServiceError):
-    """This key has as many unfinished jobs as it may have."""
+    """Job that would exceed the key's limit of unfinished jobs."""
 
     code, status = "queue-full", 429
 
 
 class QuotaError(ServiceError):
-    """This key has used up what it may use: `extra["quota"]`; there is more after `extra["retry_after"]` seconds."""
+    """Exhausted quota of a key; `extra["quota"]` names it.
+
+    It recovers after `extra["retry_after"]` seconds.
+    """
 
     code, status = "quota-exceeded", 429
 
 
 class RateLimitError(ServiceError):
-    """This key sends requests faster than it may."""
+    """Request that exceeds the key's rate limit."""
 
     code, status = "rate-limited", 429
 
 
 class NoSpaceError(ServiceError, InfrastructureError):
-    """The disk is too full to take more in."""
+    """Data that the service refuses because its disk is too full."""
 
     code, status = "insufficient-storage", 507
 
 
 class BusyError(ServiceError):
-    """What is needed is in use; the same request will succeed later."""
+    """Request that needs something that is in use; repeating it later will succeed."""
 
     code, status = "busy", 503
 
 
 class StoreError(ServiceError, InfrastructureError):
-    """The store of files cannot be reached; the cause says what has happened."""
+    """File store that cannot be reached; the exception's cause has the details."""
 
     code, status = "store-unavailable", 503
 
 
 class DamagedWeightsError(ServiceError, InfrastructureError):
-    """Weights of a feature network on this machine are damaged: no job is accepted until they are installed again."""
+    """Damaged feature network weights on this machine: no job is accepted until they are reinstalled."""
 
     code, status = "weights-damaged", 503
 
@@ -109,29 +112,29 @@ class DamagedWeightsError(ServiceError, InfrastructureError):
 
 
 class LostFileError(ServiceError):
-    """A file that a row refers to is not in the store of files, which itself answers."""
+    """File that a row refers to but that is missing from the file store, although the store responds."""
 
     code, status = "file-lost", 500
 
     @classmethod
     def of(cls, sha256: str) -> Self:
-        """Return the error of a file of this SHA-256."""
+        """Return the error for the file with this SHA-256."""
         return cls(f"The service has lost the file with SHA-256 {sha256}. {_AGAIN}")
 
 
 class DamagedFileError(ServiceError):
-    """A file of the store does not have the SHA-256 that was recorded for it; it is neither sent nor used."""
+    """Stored file whose SHA-256 differs from the recorded one; it is neither sent nor used."""
 
     code, status = "file-damaged", 500
 
     @classmethod
     def of(cls, sha256: str) -> Self:
-        """Return the error of a file whose SHA-256 should be this."""
+        """Return the error for the file that should have this SHA-256."""
         return cls(f"The service's copy of the file with SHA-256 {sha256} is damaged. {_AGAIN}")
 
 
 class LockedError(ServiceError):
-    """Another request is writing to this upload."""
+    """Upload that another request is writing to."""
 
     code, status = "upload-locked", 423
 
@@ -142,18 +145,18 @@ class LockedError(ServiceError):
 
 
 class DatabaseUnavailableError(ServiceError, InfrastructureError):
-    """Database that does not answer."""
+    """Database that does not respond."""
 
     code, status = "database-unavailable", 503
 
 
 class DatabaseBusyError(DatabaseUnavailableError):
-    """Database that others have locked for too long, or whose connections are all in use."""
+    """Database that stays locked for too long, or whose connections are all in use."""
 
     code, status = "database-busy", 503
 
 
 class LeaseLostError(ServiceError):
-    """Another dispatcher has taken the job over: whatever this one still has to say about it is void."""
+    """Job that another dispatcher has taken over: all further writes of the previous holder are rejected."""
 
     code, status = "lease-lost", 409

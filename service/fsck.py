@@ -1,4 +1,7 @@
-"""Compare the files of a service with the rows of its database, beside a service that runs, and mend what can be."""
+"""Compare the files of a service with the rows of its database, and repair what can be repaired.
+
+The service may be running meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +25,12 @@ from service.settings import ServiceSettings
 from service.store import Store
 from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadPartRow, UploadRow
 
-#: Rows that are read at a time, and files that are read at the same time.
+#: Rows per query, and number of files that are read concurrently.
 _PAGE, _AT_A_TIME = 500, 4
-#: A file without a row is an orphan at this age: a younger one's row may still be on its way. Clocks of object stores
-#: are not this machine's.
+#: Minimum age of an orphan in seconds: the row of a younger file may not have been written yet. Object stores get a
+#: longer time because their clocks may differ from this machine's.
 _ORPHAN_SECONDS, _REMOTE_ORPHAN_SECONDS = 3600.0, 6 * 3600.0
-#: Damaged files are moved to this folder of their store.
+#: Folder of a store that damaged files are moved to.
 QUARANTINE = "quarantine"
 
 Kind = Literal["missing", "damaged", "orphaned"]
@@ -36,14 +39,14 @@ What = Literal["input", "result", "checkpoint", "upload"]
 
 @dataclass(frozen=True)
 class Finding:
-    """A file that does not agree with the database.
+    """File that does not agree with the database.
 
     Attributes:
-        kind: What is wrong with the file.
-        what: What the file is.
-        name: Name of the file in the store of files, or in the data folder.
+        kind: Kind of the fault.
+        what: Kind of the file.
+        name: Name of the file in the file store or in the data folder.
         holders: Jobs and uploads that need the file.
-        mended: What was done; empty for nothing.
+        mended: Description of the repair; empty if nothing was done.
     """
 
     kind: Kind
@@ -55,11 +58,11 @@ class Finding:
 
 @dataclass(frozen=True)
 class _File:
-    """A file that a row refers to.
+    """File that a row refers to.
 
     Attributes:
-        is_current: Tells whether the row still refers to it.
-        forget: Deletes the row, or says why not; returns what was done.
+        is_current: Callback that returns whether the row still refers to the file.
+        forget: Callback that deletes the row if possible and returns what happened.
     """
 
     what: What
@@ -72,22 +75,22 @@ class _File:
 
 
 class FileCheck:
-    """A check of all files that a database and its stores of files have."""
+    """Check of all files of a database and its file stores."""
 
     def __init__(self, settings: ServiceSettings, store: Store) -> None:
         self._store, self._database = store, store.database
         self._artifacts = Artifacts(settings.artifacts_url)
         self._blobs = open_blobs(settings, store.inputs, self._artifacts)
         self._objects = self._blobs.objects
-        #: Files that have been read so far.
+        #: Number of files read so far.
         self.checked = 0
 
     def findings(self, *, mend: bool = False) -> Iterator[Finding]:
-        """Yield what is wrong.
+        """Yield all files that do not agree with the database.
 
         Args:
-            mend: Move damaged files to `QUARANTINE`, delete rows whose files are gone and that nothing else needs, and
-                delete orphans. A database that has gone back in time keeps its orphans.
+            mend: Whether to move damaged files to `QUARANTINE`, to delete rows whose files are gone and that nothing
+                needs, and to delete orphans. Orphans are never deleted after a rollback of the database.
         """
         with ThreadPoolExecutor(_AT_A_TIME) as pool:
             for files in self._pages():
@@ -98,7 +101,7 @@ class FileCheck:
         yield from self._orphans(mend=mend and not self._database.rolled_back)
 
     def _examine(self, file: _File, *, mend: bool) -> Finding | None:
-        # twice: a service at work may have replaced or removed it meanwhile, with its row
+        # The second check rules out that a running service has just replaced or removed the file and its row.
         kind = file.fault() and file.is_current() and file.fault()
         if not kind:
             return None
@@ -115,7 +118,7 @@ class FileCheck:
     # --- files that rows refer to ----------------------------------------------------------------------------------
 
     def _pages(self) -> Iterator[Sequence[_File]]:
-        """Yield files in pages, by the order of their rows: a table of any length takes bounded memory."""
+        """Yield files page by page in row order, so that a table of any length takes bounded memory."""
         last = ""
         while page := self._page_of_blobs(last):
             last = page[-1].sha256
@@ -230,7 +233,10 @@ class FileCheck:
             yield Finding("orphaned", what, name, mended="deleted" if mend else "")
 
     def _unknown(self) -> Iterator[tuple[ObjectStore, What, str]]:
-        """Yield files that no row refers to, nor will. Files are listed before rows are read."""
+        """Yield files that no row refers to or will refer to.
+
+        Files are listed before rows are read, so that the row of every listed file is already visible.
+        """
         blobs = self._old(self._objects, BLOBS)
         known = {f"{BLOBS}/{location}" for location in self._store.inputs.locations()}
         yield from ((self._objects, "input", name) for name in blobs if name not in known)

@@ -1,7 +1,7 @@
-"""`python -m service.health api|dispatcher`: whether the process of this container works; exit status 1 where not.
+"""`python -m service.health api|dispatcher`: check the process of this container; the exit status is 1 on failure.
 
-A dispatcher has no port. It is well as long as the database has heard of it within a lease's time; where the database
-itself does not answer, a restart would only lose the jobs that still run, so that the dispatcher counts as well.
+A dispatcher has no port. It is healthy if the database has received a heartbeat within the duration of a lease. It also
+counts as healthy while the database does not respond, because a restart would only lose the running jobs.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import sys
 import urllib.request
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # asked several times a minute: what is not needed is not imported
+if TYPE_CHECKING:  # avoids the import at run time: the check runs several times a minute
     from service.store import Store
 
 _SECONDS = 8
-#: Seconds that the database has for each answer.
+#: Timeout of each database query in seconds.
 _ANSWER_SECONDS = 2.0
 
 
 def main() -> int:
-    """Returns 0 where the process is well."""
+    """Run the check and return the exit status: 0 if the process is healthy."""
     match sys.argv[1:]:
         case ["api"]:
             return 0 if _answers(f"http://127.0.0.1:{os.environ.get('SGSST_PORT', '8000')}/livez") else 1
@@ -43,7 +43,7 @@ def _answers(url: str) -> bool:
 
 
 def dispatcher_is_well(store: Store) -> bool:
-    """Whether a dispatcher of this machine, or of this container, was heard of lately, or nobody can tell."""
+    """Return whether a dispatcher of this machine or container has sent a heartbeat lately, or the database is down."""
     from service.errors import DatabaseUnavailableError
     from service.scheduling.identity import is_of_this_machine
 

@@ -1,4 +1,4 @@
-"""Logs of the service: a line of text, or of JSON with the job's id as a field of its own."""
+"""Log formats of the service: lines of text, or of JSON with the job's id as a separate field."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _OWN = ("job", "attempt", "method", "path", "status", "seconds", "owner")
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line."""
+    """Formatter that writes one JSON object per line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """As the base class."""
+        """Return the record as a JSON object."""
         entry = {
             "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)) + f".{int(record.msecs):03d}Z",
             "level": record.levelname.lower(),
@@ -30,13 +30,14 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Time, level, message, and the job where there is one.
+    """Formatter that writes time, level, message, and the job if there is one.
 
-    A record starts at the beginning of a line and nothing else does, whatever text of a request it repeats.
+    Every record starts on a new line, and no other line starts without indentation, whatever request text a record
+    repeats.
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """As the base class."""
+        """Return the record as a line of text, followed by the indented traceback if there is one."""
         own = " ".join(f"{name}={_value(getattr(record, name))}" for name in _OWN if hasattr(record, name))
         line = f"{self.formatTime(record, '%H:%M:%S')} {record.levelname.lower():<7} {record.getMessage()}"
         line = _printable(f"{line}  {own}" if own else line)
@@ -47,18 +48,18 @@ class TextFormatter(logging.Formatter):
 
 
 def _value(value: object) -> str:
-    """Return a value as one word, in quotes unless it is one of letters alone."""
+    """Return a value as a single word, quoted if it contains spaces, quotes, backslashes or unprintable characters."""
     text = str(value)
     return text if text.isprintable() and re.fullmatch(r'[^\s"\\]+', text) else json.dumps(text)
 
 
 def _printable(text: str) -> str:
-    """Return a text with escapes for what would end its line, steer a terminal, or change the order of its letters."""
+    """Escape characters that would end the line, control a terminal, or change the text direction."""
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 def set_up(form: str) -> None:
-    """Send everything from INFO on to stderr, in the form "json" or "text"."""
+    """Log records of level INFO and above to stderr in the format "json" or "text"."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

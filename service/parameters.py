@@ -1,4 +1,4 @@
-"""What a job may be told beside its files: the options of `sgsst stylize`, as JSON."""
+"""Parameters of a job besides its files: the options of `sgsst stylize`, as JSON."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from worker.options import StylizeOptions
 from worker.regions import MOST_REGIONS, RegionOptions, RegionRequest, region_requests
 from worker.styles import MOST_PICTURES
 
-#: A name is shown in terminals, and kept by databases that know no zero bytes.
+#: Names without control characters: they are shown in terminals, and some databases cannot store zero bytes.
 _NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
 
 
 class JobParameters(StylizeOptions):
-    """Parameters of a job; what is left out is the preset's, as for `sgsst stylize`."""
+    """Parameters of a job; omitted ones take the preset's values, as for `sgsst stylize`."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}]},
@@ -46,10 +46,10 @@ class JobParameters(StylizeOptions):
 
     @property
     def region_requests(self) -> tuple[RegionRequest, ...]:
-        """The regions that are asked for.
+        """Return the requested regions.
 
         Raises:
-            SettingsError: they make no sense, or are chosen by masks.
+            SettingsError: If they are inconsistent or selected by masks.
         """
         found = region_requests(self.regions or (), exists=lambda path: False)
         for region in found:
@@ -62,10 +62,10 @@ class JobParameters(StylizeOptions):
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
-    """Return the parameters of a job that an earlier version may have stored, under former names too.
+    """Return the parameters of a stored job, which an earlier version may have written under former names.
 
     Raises:
-        SettingsError: If this version does not take them.
+        SettingsError: If this version does not support them.
     """
     try:
         return checked(JobParameters, _with_present_names(values))
@@ -76,7 +76,7 @@ def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
 
 
 def _with_present_names(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return stored parameters, of a job or of a region, under their present names."""
+    """Rename stored parameters of a job or region to their current names."""
     found = {RENAMED.get(name, name): value for name, value in values.items()}
     if found.get("regions"):
         found["regions"] = [_with_present_names(region) for region in found["regions"]]

@@ -1,8 +1,8 @@
-"""`python -m service.prepare`: make what API and dispatchers share, the database's tables and the bucket for files.
+"""`python -m service.prepare`: create what API and dispatchers share, the database tables and the bucket for files.
 
-Once for an installation, and before the processes of a new version are started: its migrations only add, so that
-processes of the old version go on meanwhile (tests/service/store/test_migrations.py). Both the database and the store
-are waited for.
+Run it once per installation, and before the processes of a new version start. Migrations only add to the schema, so
+processes of the previous version keep working meanwhile (tests/service/store/test_migrations.py). The command waits
+until both the database and the file store respond.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _ASK_AGAIN_SECONDS = 2.0
 
 
 def main() -> int:
-    """Returns 0 where everything is there at the end."""
+    """Prepare the database and the bucket, and return the exit status: 0 on success."""
     settings = ServiceSettings()
     set_up(settings.log_format)
     keep_private(settings)
@@ -35,7 +35,7 @@ def main() -> int:
 
 
 def _make_bucket(objects: ObjectStore, patience: float) -> None:
-    """Make the bucket, of a store that may not answer yet."""
+    """Create the bucket, retrying for `patience` seconds while the store does not respond."""
     until = time.monotonic() + patience
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Permissions of the service's files: they belong to the user who runs it, and nobody else can read them."""
+"""Permissions of the service's files: only the user who runs the service can read them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from sqlalchemy.engine import make_url
 from service.files.objects import ObjectStore
 from service.settings import ServiceSettings
 
-#: What SQLite puts beside a database.
+#: Suffixes of the files that SQLite creates for a database.
 _BESIDE = ("", "-wal", "-shm")
 
 _log = logging.getLogger(__name__)
 
 
 def keep_private(settings: ServiceSettings) -> None:
-    """Create the data folder, close it and the database to other users, and let all that this process writes be closed.
+    """Create the data folder, restrict it and the database to the owner, and set a umask for everything written later.
 
-    The log names what another user owns and could not be closed.
+    Paths that belong to another user and cannot be restricted are logged.
     """
     os.umask(0o077)
     settings.folder.mkdir(parents=True, exist_ok=True)

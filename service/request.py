@@ -1,4 +1,4 @@
-"""A job of the store as what the worker is asked for."""
+"""Conversion of a stored job to the request that the worker takes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from worker.styles import StyleFile
 
 
 def scene_request(staged: Staged, parameters: JobParameters) -> SceneRequest:
-    """Scene and cameras."""
+    """Return the request for scene and cameras."""
     return SceneRequest.of(staged.scene, staged.cameras, parameters)
 
 
 def _styles(staged: Staged, parameters: JobParameters) -> tuple[StyleFile, ...]:
-    """The pictures of the job's own style: those that no region has. Without weights they count alike."""
+    """Return the images of the job's own style, excluding those of regions; without weights they are mixed equally."""
     taken = region_styles(parameters.region_requests)
     own = [path for path in staged.styles if path.name not in taken]
     weights = parameters.style_weights or [1.0] * len(own)
@@ -27,7 +27,7 @@ def _styles(staged: Staged, parameters: JobParameters) -> tuple[StyleFile, ...]:
 
 
 def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, ...]:
-    """The regions, with the paths of their styles."""
+    """Return the regions with the paths of their staged styles."""
     paths = {path.name: path for path in staged.styles}
 
     def staged_file(file: StyleFile) -> StyleFile:
@@ -39,7 +39,7 @@ def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, 
 
 
 def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest:
-    """Everything; paths are relative to the folder that the job was staged in."""
+    """Return the complete request; its paths are relative to the staging folder."""
     return StylizeRequest(
         scene_request(staged, parameters),
         _styles(staged, parameters),

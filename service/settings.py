@@ -1,4 +1,4 @@
-"""Settings of the service: environment variables `SGSST_...`, each with a default that suits one machine."""
+"""Settings of the service: environment variables `SGSST_...`, with defaults for a single machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MB, GB = 1_000_000, 1_000_000_000
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host is `localhost` or a loopback address; no other name counts, wherever it leads."""
+    """Return whether a host is `localhost` or a loopback address; other names are not resolved."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -21,46 +21,47 @@ def is_loopback(host: str) -> bool:
 
 
 class ServiceSettings(BaseSettings):
-    """What API and dispatcher share; both read the same environment.
+    """Settings that API and dispatcher read from the same environment.
 
     Attributes:
-        data: folder of database, inputs and results.
+        data: Folder of database, inputs and results.
         database: SQLAlchemy URL; None for SQLite in `data`. PostgreSQL: `postgresql+psycopg://user@host/name`.
-        artifacts: fsspec URL of the store of files: results, and inputs unless it is a local folder; None for a folder
-            in `data`. S3: `s3://bucket/prefix`.
-        file_cache_bytes: of inputs that a host keeps of what is in the store of files.
-        host, port: where the API listens.
-        require_keys: whether requests need an API key; None: unless the API is bound to loopback.
-        max_request_bytes: of one request's body; uploads in parts may be larger.
-        max_upload_bytes: of one file.
-        max_gaussians, max_views, max_pixels: of a job; pixels are those of all views together.
-        max_image_pixels: of the style and of each photo.
-        max_photos: files in one job.
-        max_jobs_per_key: unfinished jobs of one key.
-        max_jobs_a_day_per_key, max_gpu_seconds_a_day_per_key, max_bytes_per_key, max_requests_a_second_per_key: quotas
-            of keys that have none of their own (`service.store.quotas`); None for no bound.
-        max_connections: to one process of the API at the same time, watchers included.
+        artifacts: fsspec URL of the file store. It holds the results and, unless it is a local folder, the inputs; None
+            for a folder in `data`. S3: `s3://bucket/prefix`.
+        file_cache_bytes: Size limit of a host's cache of inputs from the file store.
+        host, port: Address the API listens on.
+        require_keys: Whether requests need an API key; None requires keys unless the API is bound to loopback.
+        max_request_bytes: Size limit of one request body; multipart uploads may be larger.
+        max_upload_bytes: Size limit of one file.
+        max_gaussians, max_views, max_pixels: Limits per job; pixels are those of all views together.
+        max_image_pixels: Limit for the style and for each photo.
+        max_photos: Maximum number of photos per job.
+        max_jobs_per_key: Maximum number of unfinished jobs per key.
+        max_jobs_a_day_per_key, max_gpu_seconds_a_day_per_key, max_bytes_per_key, max_requests_a_second_per_key: Quotas
+            of keys without their own (`service.store.quotas`); None for no limit.
+        max_connections: Maximum number of concurrent connections per API process, including event streams.
         trusted_proxies: Addresses and networks of reverse proxies, separated by commas, whose `X-Forwarded-For` and
-            `X-Forwarded-Proto` are believed; empty for none.
-        min_free_bytes: nothing is taken in once the disk has less left.
-        inspection_seconds, inspection_bytes: what checking a job's files may take, processor time and memory; their
-            size adds to both (`service.inspection.inspector`).
-        dry_run_seconds: processor time that planning without running may take; Gaussians and views add to it.
-        receive_seconds: a request's body that stands still for so long is given up.
-        session_days: that a browser stays signed in which has shown a key.
-        upload_hours: after which an unfinished upload, or a finished one that no job uses, expires.
-        retention_days: after which a finished job's results expire; the job's record stays as long again.
-        lease_seconds: after which another dispatcher takes a job over that has not been heard of.
-        max_attempts: of a job in a row that come no further, before it fails for good.
-        retry_seconds: wait before the second attempt; doubles with each.
-        parallel_jobs: jobs side by side; None: one for each GPU, or one.
-        cluster_gpus: GPUs of the Ray cluster at RAY_ADDRESS that this dispatcher may give to jobs.
-        start_seconds: for which a process that starts waits for a database server that does not answer yet.
-        checkpoint_seconds: how often a running job saves its state.
-        preview_seconds: how often it shows a picture of it, and its log where that has grown.
-        stop_seconds: what a job may take to stop before it is killed.
-        webhooks: whether jobs may name a URL that is told when they end.
-        webhook_private_addresses: whether such URLs may lead to private networks.
+            `X-Forwarded-Proto` are trusted; empty for none.
+        min_free_bytes: Free disk space below which the service accepts no data.
+        inspection_seconds, inspection_bytes: Base limits of CPU time and memory for checking a job's files; both grow
+            with the size of the files (`service.inspection.inspector`).
+        dry_run_seconds: Base limit of CPU time for a dry run; it grows with Gaussians and views.
+        receive_seconds: Time without new bytes after which a request body is abandoned.
+        session_days: Lifetime of a browser session that was started with a key.
+        upload_hours: Time after which an unfinished upload, or a finished one that no job uses, expires.
+        retention_days: Time after which the results of a finished job expire; the job's record is kept for the same
+            time again.
+        lease_seconds: Time without heartbeat after which another dispatcher takes over a job.
+        max_attempts: Consecutive attempts without progress after which a job fails.
+        retry_seconds: Delay before the second attempt; it doubles with each further one.
+        parallel_jobs: Number of concurrent jobs; None for one per GPU, or one without GPUs.
+        cluster_gpus: GPUs of the Ray cluster at RAY_ADDRESS that this dispatcher may assign to jobs.
+        start_seconds: Time that a starting process waits for a database server that does not respond yet.
+        checkpoint_seconds: Interval between checkpoints of a running job.
+        preview_seconds: Interval between preview images of a running job; its log is updated as often if it has grown.
+        stop_seconds: Time that a job has for stopping before it is killed.
+        webhooks: Whether jobs may name a URL that is notified when they end.
+        webhook_private_addresses: Whether such URLs may lead to private networks.
         log_format: "json" or "text".
     """
 
@@ -115,35 +116,35 @@ class ServiceSettings(BaseSettings):
 
     @cached_property
     def folder(self) -> Path:
-        """`data`, absolute: processes may have different working folders."""
+        """Absolute path of `data`, because processes may have different working directories."""
         return self.data.expanduser().absolute()
 
     @property
     def database_url(self) -> str:
-        """The database's URL, SQLite's in `data` by default."""
+        """URL of the database; SQLite in `data` by default."""
         return self.database or f"sqlite:///{self.folder / 'sgsst.db'}"
 
     @property
     def artifacts_url(self) -> str:
-        """The results' URL, a folder in `data` by default."""
+        """URL of the results; a folder in `data` by default."""
         return self.artifacts or f"file://{self.folder / 'artifacts'}"
 
     @property
     def session_seconds(self) -> float:
-        """`session_days`, in seconds."""
+        """Duration of `session_days` in seconds."""
         return self.session_days * 86_400.0
 
     @property
     def retention_seconds(self) -> float:
-        """`retention_days`, in seconds."""
+        """Duration of `retention_days` in seconds."""
         return self.retention_days * 86_400.0
 
     @property
     def on_loopback(self) -> bool:
-        """Whether only programs of this machine can reach the API."""
+        """Whether only programs on this machine can reach the API."""
         return is_loopback(self.host)
 
     @property
     def keys_required(self) -> bool:
-        """Whether a request without an API key is refused."""
+        """Whether a request without an API key is rejected."""
         return not self.on_loopback if self.require_keys is None else self.require_keys

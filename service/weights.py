@@ -1,4 +1,4 @@
-"""Verification of network weights in the processes of the service: at their start, and when a file has changed."""
+"""Verification of network weights by the service: when a process starts, and when a weight file has changed."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _log = logging.getLogger(__name__)
 
 
 def check_weights() -> None:
-    """Check that no installed weights are damaged, and log once which are and what the operator has to do.
+    """Verify the installed weights, and log each damage once with what the operator has to do.
 
     Raises:
-        DamagedWeightsError: Some are.
+        DamagedWeightsError: If any weights are damaged.
     """
     if found := damaged_weights():
         for damage in found:

@@ -14,6 +14,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (
     "api",
     "benchmarks",
+    "deploy",
+    "service",
     "sgsst_core/bench",
     "sgsst_core/features",
     "sgsst_core/loss",
@@ -25,6 +27,8 @@ PACKAGES = (
     "sgsst_core/scene",
     "sgsst_core/stylizing",
     "tests/api",
+    "tests/deploy",
+    "tests/service",
 )
 OPENERS = ("Of", "Who", "What", "That", "From which", "In which")
 SECTIONS = ("Args", "Attributes", "Raises")

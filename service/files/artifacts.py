@@ -1,4 +1,4 @@
-"""Results: whole files under names of their own, in the store of files."""
+"""Results of jobs: complete files under unique names in the file store."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.files.objects import ObjectStore
 from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
 
-#: What the system says where a file cannot have another name there: it is on another file system, or on one without.
+#: Error numbers of a failed hard link: the target is on another file system, or its file system has no links.
 _NO_LINKS = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK)
 _MEDIA_TYPES = {
     ".ply": "application/octet-stream",
@@ -31,7 +31,10 @@ _log = logging.getLogger(__name__)
 
 
 class Artifacts:
-    """Where results are. A name is never written twice: rows in the store point to what counts."""
+    """Results in the file store.
+
+    A name is never written twice; the rows of the database refer to the current files.
+    """
 
     def __init__(self, url: str) -> None:
         self.objects = ObjectStore(url)
@@ -40,11 +43,13 @@ class Artifacts:
             self.objects.make_folder()
 
     def put(self, job_id: str, epoch: int, name: str, source: Path, *, final: bool = False) -> Published:
-        """Bring a file in; it is durable and whole when this returns, and visible once its row is in the store.
+        """Store a result file.
+
+        The file is complete and durable when this returns. It becomes visible once its row is in the database.
 
         Args:
-            final: nobody writes to the file any more, though another may take its name: in a folder of the same file
-                system it is not copied, but has one more name.
+            final: Whether nobody writes to the file any more, although another file may replace it. In a folder of the
+                same file system such a file is hard-linked instead of copied.
         """
         location = f"{job_id}/{epoch}/{secrets.token_hex(6)}/{name}"
         if not self.local:
@@ -61,23 +66,23 @@ class Artifacts:
         return Published(name, location, size, sha256)
 
     def read(self, location: str, start: int, stop: int) -> Iterator[bytes]:
-        """The bytes from `start` up to `stop`, in pieces."""
+        """Yield the bytes from `start` up to `stop` in chunks."""
         return self.objects.read(location, start, stop)
 
     def check(self, location: str, sha256: str) -> None:
-        """Prove that a result is what its row says, unless that has just been done.
+        """Compare a result with the SHA-256 of its row, unless that has just been done.
 
         Raises:
-            LostFileError, DamagedFileError: It is not.
+            LostFileError, DamagedFileError: If the result is missing or differs.
         """
         self.objects.check_once(location, sha256)
 
     def fetch(self, location: str, target: Path, sha256: str) -> None:
-        """Copy a result to a local file; it appears whole or not at all.
+        """Copy a result to a local file, atomically.
 
         Raises:
-            LostFileError: The result is not in the store of files.
-            DamagedFileError: What came has another SHA-256.
+            LostFileError: If the file store does not have the result.
+            DamagedFileError: If the received file has a different SHA-256.
         """
         try:
             with atomic_path(target) as temporary:
@@ -90,7 +95,7 @@ class Artifacts:
             raise LostFileError.of(sha256) from error
 
     def remove(self, location: str) -> None:
-        """Remove one file, where it is still there."""
+        """Remove a file if it exists."""
         self.objects.remove(location)
 
     def remove_job(self, job_id: str) -> None:
@@ -98,11 +103,11 @@ class Artifacts:
         self.objects.remove_below(job_id)
 
     def sweep(self, job_id: str, epoch: int, kept: set[str]) -> None:
-        """Remove a job's files that no row refers to: those of attempts that were cut off.
+        """Remove files of a job that no row refers to, left behind by interrupted attempts.
 
         Args:
-            epoch: of the last lease whose files are looked at; a later one's may still be without their rows.
-            kept: locations that rows refer to.
+            epoch: Epoch of the last lease whose files are removed; files of later leases may not have their rows yet.
+            kept: Locations that rows refer to.
         """
         for location in self.objects.below(job_id):
             below = location.partition("/")[2]
@@ -110,17 +115,17 @@ class Artifacts:
                 self.remove(location)
 
     def ping(self) -> None:
-        """Prove that the place can be reached; raises OSError or StoreError."""
+        """Raise OSError or StoreError if the store of the results cannot be reached."""
         self.objects.ping()
 
 
 def media_type(name: str) -> str:
-    """What a result is, for HTTP."""
+    """Return the media type of a result for HTTP."""
     return _MEDIA_TYPES.get(Path(name).suffix) or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
 def _linked(source: Path, target: Path) -> bool:
-    """Put a file's second name in the place of another file, where the file system can."""
+    """Replace `target` with a hard link to a file; return False if the file system does not support that."""
     target.unlink()
     try:
         os.link(source, target)
@@ -133,7 +138,7 @@ def _linked(source: Path, target: Path) -> bool:
 
 @contextmanager
 def _held(source: Path) -> Iterator[Path]:
-    """One more name for a file as it is now: whoever replaces it meanwhile changes nothing of what is sent."""
+    """Hold a file by a second hard link, so that replacing it during the transfer does not affect what is sent."""
     held = source.with_name(f".{secrets.token_hex(6)}-{source.name}")
     try:
         os.link(source, held)

@@ -1,7 +1,7 @@
-"""Inputs: received in constant memory, kept once under the SHA-256 of their content.
+"""Inputs of jobs, received in constant memory and stored once per SHA-256 of their content.
 
-Where the store of files is a local folder they are files of the data folder (`BlobFolder`); else they are in the store
-(`service.files.stored_blobs`). Both are `Blobs`.
+If the file store is a local folder, inputs are files in the data folder (`BlobFolder`). Otherwise they are objects of
+the file store (`service.files.stored_blobs`). Both implement `Blobs`.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from service.files.objects import ObjectStore
 from service.store.inputs import Inputs, check_offset
 from service.store.tables import BlobRow, UploadRow
 
-#: Files that no row refers to are removed at this age: a younger one's row may still be on its way.
+#: Age in seconds at which files without a row are removed: the row of a younger file may not have been written yet.
 _ORPHAN_SECONDS = 3600.0
-#: Folders of the store of files, and of the data folder where that is a local one; all others are those of jobs.
+#: Folders of the file store, and of the data folder if the file store is local; all other folders belong to jobs.
 BLOBS, UPLOADS = "blobs", "uploads"
-#: Inodes that a file system must have left: a request needs some, and the database too.
+#: Minimum number of free inodes: a request needs some, and so does the database.
 _MIN_FREE_INODES = 1000
 
 
 class Receiver:
-    """A file that is being received; it becomes a blob by `Blobs.keep`."""
+    """File that is being received; `Blobs.keep` makes it a blob."""
 
     def __init__(self, path: Path, limit: int, room: Callable[[int], None]) -> None:
         self.path = path
@@ -43,11 +43,11 @@ class Receiver:
         self._file = path.open("wb", buffering=0)
 
     def write(self, data: bytes) -> None:
-        """Take some bytes in.
+        """Append bytes to the file.
 
         Raises:
-            TooLargeError: they are more than allowed.
-            NoSpaceError: the disk is too full.
+            TooLargeError: If the file exceeds its size limit.
+            NoSpaceError: If the disk is too full.
         """
         self.size += len(data)
         if self.size > self._limit:
@@ -56,43 +56,43 @@ class Receiver:
         write_all(self._file, data)
 
     def close(self) -> None:
-        """Make the bytes durable."""
+        """Make the bytes durable and close the file."""
         os.fsync(self._file.fileno())
         self._file.close()
 
     def discard(self) -> None:
-        """Forget what has arrived."""
+        """Delete the received bytes."""
         self._file.close()
         self.path.unlink(missing_ok=True)
 
 
 class PartWriter(Protocol):
-    """Takes the next bytes of an upload in."""
+    """Writer of the next bytes of an upload."""
 
     def write(self, data: bytes) -> None:
-        """Take some bytes in. They are the writer's alone until `save`."""
+        """Append bytes; they are not part of the upload until `save`."""
 
     def save(self) -> float:
-        """Make what has come durable, and tell the store; returns when the upload expires now.
+        """Make the bytes durable, record them in the database, and return the upload's new expiry time.
 
         Raises:
-            ConflictError: another request has saved the same bytes meanwhile.
+            ConflictError: If another request has saved the same bytes meanwhile.
         """
 
     def discard(self) -> None:
-        """Forget what has come since the last `save`."""
+        """Drop the bytes written since the last `save`."""
 
     def close(self) -> None:
-        """Let go of it; what was not saved is lost."""
+        """Close the writer; unsaved bytes are lost."""
 
 
 class Blobs(ABC):
-    """All inputs; rows in the store say what there is.
+    """All inputs; the rows of the database list them.
 
     Args:
-        folder: of what is on its way in.
-        min_free: bytes of its disk below which nothing is taken in.
-        objects: Store of files that holds the blobs, below `BLOBS`.
+        folder: Folder of files that are being received.
+        min_free: Free bytes of its disk below which no data is accepted.
+        objects: File store that holds the blobs, under `BLOBS`.
     """
 
     def __init__(self, folder: Path, inputs: Inputs, min_free: int, objects: ObjectStore) -> None:
@@ -102,11 +102,11 @@ class Blobs(ABC):
         self._inputs, self._min_free = inputs, min_free
 
     def ensure_room(self, size: int) -> None:
-        """Raise NoSpaceError where `size` more bytes would leave too little of the disk."""
+        """Raise NoSpaceError if `size` more bytes would leave too little free disk space."""
         if shutil.disk_usage(self.incoming).free - size < self._min_free:
             raise NoSpaceError("The service's disk is too full to take this in. Try again later.")
         inodes = os.statvfs(self.incoming)
-        if inodes.f_files and inodes.f_favail < _MIN_FREE_INODES:  # file systems without a table of inodes say 0
+        if inodes.f_files and inodes.f_favail < _MIN_FREE_INODES:  # file systems without an inode table report 0
             raise NoSpaceError("The service's disk cannot hold more files. Try again later.")
 
     def receive(self, limit: int) -> Receiver:
@@ -116,54 +116,58 @@ class Blobs(ABC):
 
     @abstractmethod
     def keep(self, path: Path, upload_id: str | None = None) -> str:
-        """Make a received, durable file a blob, and return its SHA-256; the file is gone then.
+        """Turn a received, durable file into a blob and return its SHA-256; the file no longer exists afterwards.
 
-        What is hashed is the file that gets the name. A blob of the same content that was lost or damaged is replaced.
+        The digest is computed from the very file that becomes the blob. A lost or damaged blob of the same content is
+        replaced.
 
         Args:
             path: File that nobody writes to any more.
-            upload_id: Upload or receipt that holds the blob from then on.
+            upload_id: Upload or receipt that holds the blob from now on.
 
         Raises:
-            NotFoundError: The upload or receipt is gone.
+            NotFoundError: If the upload or receipt is gone.
         """
 
     @abstractmethod
     def remove(self, locations: Iterable[str]) -> None:
-        """Remove the files of blobs whose rows have been deleted; what cannot be removed now is collected later."""
+        """Remove the files of blobs whose rows have been deleted.
+
+        Files that cannot be removed now are collected later.
+        """
 
     @abstractmethod
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
-        """Return blobs as files of this machine, by digest, after comparing each with its digest.
+        """Return blobs as local files by digest, after verifying each.
 
         Args:
             rows: Blobs by digest.
-            folder: Folder for these files alone; they stay as long as it does.
+            folder: Folder for these files only; they exist as long as the folder.
 
         Raises:
-            LostFileError: The store of files does not have one.
-            DamagedFileError: One is not what its digest says.
-            StoreError: The store of files does not answer.
+            LostFileError: If the file store does not have a blob.
+            DamagedFileError: If a blob does not match its digest.
+            StoreError: If the file store does not respond.
         """
 
     def read(self, row: BlobRow, start: int, stop: int) -> Iterator[bytes]:
-        """Yield the bytes of a blob from `start` up to `stop`, straight from the store of files.
+        """Yield the bytes of a blob from `start` up to `stop`, directly from the file store.
 
         Raises:
-            FileNotFoundError: The blob has just been removed.
-            StoreError: The store of files does not answer.
+            FileNotFoundError: If the blob has just been removed.
+            StoreError: If the file store does not respond.
         """
         return self.objects.read(f"{BLOBS}/{row.location}", start, stop)
 
     @contextmanager
     def lent(self, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:
-        """As `bring`, for as long as the block takes."""
+        """Provide blobs as local files for the duration of the block, like `bring`."""
         with tempfile.TemporaryDirectory(dir=self.incoming) as folder:
             yield self.bring(rows, Path(folder))
 
     @abstractmethod
     def begin_upload(self, upload_id: str) -> None:
-        """Prepare for the bytes of an upload whose row has been made."""
+        """Prepare for the bytes of a new upload, whose row exists already."""
 
     @abstractmethod
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
@@ -171,33 +175,33 @@ class Blobs(ABC):
 
         Args:
             upload: Row of the upload.
-            seconds: Time after each `save` until the upload expires.
+            seconds: Time from each `save` until the upload expires.
 
         Raises:
-            NotFoundError: The bytes before them are gone.
-            ConflictError: The next byte is another one by now.
-            LockedError: Another writer of the upload is open, in this process or in another one.
+            NotFoundError: If the preceding bytes are gone.
+            ConflictError: If the upload's offset has changed.
+            LockedError: If this or another process has an open writer of the upload.
         """
 
     @abstractmethod
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Make an upload whose last byte has been saved a blob, and return the blob's SHA-256.
+        """Turn a completely saved upload into a blob and return the blob's SHA-256.
 
-        The upload's bytes stay until the database knows the blob: if the process dies before, this can be repeated.
+        The upload's bytes remain until the database knows the blob, so the call can be repeated after a crash.
 
         Raises:
-            NotFoundError: The upload's bytes are gone.
-            LockedError: Another request is doing the same.
+            NotFoundError: If the upload's bytes are gone.
+            LockedError: If another request is finishing the upload.
         """
 
     @abstractmethod
     def forget_upload(self, upload_id: str) -> None:
-        """Remove what has arrived of an upload whose row is gone."""
+        """Remove the received bytes of an upload whose row is gone."""
 
     def collect(self) -> int:
-        """Remove blobs that nobody needs, and what crashes have left behind; return how many files.
+        """Remove unused blobs and leftovers of crashes; return the number of removed files.
 
-        A database that has gone back in time does not know who needs what: then no blob is removed.
+        After a rollback of the database no blob is removed, because the database may not know who needs it.
         """
         for upload_id in self._inputs.expire_uploads():
             self.forget_upload(upload_id)
@@ -210,16 +214,16 @@ class Blobs(ABC):
         return removed
 
     def _expiry(self) -> float:
-        """Return the time by which files expire: neither their machine's clock alone decides, nor the database's."""
+        """Return the time by which files expire: the earlier of the clocks of this machine and of the database."""
         return min(time.time(), self._inputs.expiry())
 
     @abstractmethod
     def _collect_blobs(self) -> int:
-        """Remove blobs that nobody needs; returns how many files."""
+        """Remove unused blobs and return the number of removed files."""
 
 
 class BlobFolder(Blobs):
-    """Inputs as files of the data folder."""
+    """Inputs as files in the data folder."""
 
     def __init__(self, folder: Path, inputs: Inputs, min_free_bytes: int) -> None:
         super().__init__(folder, inputs, min_free_bytes, ObjectStore(f"file://{folder}"))
@@ -228,11 +232,12 @@ class BlobFolder(Blobs):
             path.mkdir(parents=True, exist_ok=True)
 
     def keep(self, path: Path, upload_id: str | None = None, *, leave: bool = False) -> str:
-        """Move a received file to its place, and return its SHA-256.
+        """Move or link a received file to its final path and return its SHA-256.
 
         Args:
             path: File that nobody writes to any more.
-            leave: Whether the file keeps its old name as well.
+            upload_id: Upload or receipt that holds the blob from now on.
+            leave: Whether to link the file, so that its old path remains.
         """
         path.chmod(0o400)
         size, sha256 = path.stat().st_size, file_digest(path)
@@ -249,34 +254,34 @@ class BlobFolder(Blobs):
             final.unlink()
             raise
         known = self._blobs / location
-        if known != final:  # it takes the place of a file of the same content, which may be lost or damaged
+        if known != final:  # replaces the known file of the same content, which may be lost or damaged
             known.parent.mkdir(exist_ok=True)
             final.replace(known)
-            final.unlink(missing_ok=True)  # two names of one file: the system renames nothing
+            final.unlink(missing_ok=True)  # renaming one of two hard links to the other is a no-op
             flush_folder(known.parent)
         return sha256
 
     def remove(self, locations: Iterable[str]) -> None:
-        """Remove their files."""
+        """Remove the files."""
         for location in locations:
             (self._blobs / location).unlink(missing_ok=True)
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (others need it)
-        """Return their places; nothing is put into `folder`."""
+        """Return the paths of the verified blobs; `folder` is not used."""
         for sha256, row in rows.items():
             self.objects.check(f"{BLOBS}/{row.location}", sha256)
         return {sha256: self._blobs / row.location for sha256, row in rows.items()}
 
     def begin_upload(self, upload_id: str) -> None:
-        """Create its file, empty."""
+        """Create an empty file for the upload."""
         self.upload_path(upload_id).touch()
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
-        """Write to the upload's file."""
+        """Return a writer to the upload's file."""
         return _FileWriter(self.upload_path(upload.id), self._inputs, upload, seconds)
 
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Link its file."""
+        """Link the upload's file as a blob."""
         path = self.upload_path(upload.id)
         try:
             with path.open("rb") as file:
@@ -290,14 +295,14 @@ class BlobFolder(Blobs):
                 self._inputs.finish_upload(upload.id, sha256, seconds)
                 path.unlink(missing_ok=True)
                 return sha256
-        except FileNotFoundError:  # unless another request has just finished it
+        except FileNotFoundError:  # missing also if another request has just finished the upload
             known = self._inputs.upload(upload.id, upload.owner).sha256
             if known is None:
                 raise gone(upload) from None
             return known
 
     def forget_upload(self, upload_id: str) -> None:
-        """Remove its file."""
+        """Remove the upload's file."""
         self.upload_path(upload_id).unlink(missing_ok=True)
 
     def _collect_blobs(self) -> int:
@@ -318,9 +323,9 @@ class BlobFolder(Blobs):
 
 
 class _FileWriter:
-    """Writer to the file of an unfinished upload, from the offset that the database has.
+    """Writer to the file of an unfinished upload, starting at the offset in the database.
 
-    Only one is open at a time, in whatever process: it holds a lock on the file, by the descriptor that it writes to.
+    Only one writer per upload is open at a time, across processes: it locks the file descriptor that it writes to.
     """
 
     def __init__(self, path: Path, inputs: Inputs, upload: UploadRow, seconds: float) -> None:
@@ -332,10 +337,12 @@ class _FileWriter:
             raise gone(upload) from None
         try:
             _lock(self._file)
-            check_offset(inputs.upload(upload.id, upload.owner), upload.offset)  # as it is now that nobody changes it
-            if os.fstat(self._file.fileno()).st_size < upload.offset:  # zeros would take the place of what is missing
+            # read again: under the lock nobody changes it
+            check_offset(inputs.upload(upload.id, upload.owner), upload.offset)
+            # seeking beyond the end would fill the gap with zeros
+            if os.fstat(self._file.fileno()).st_size < upload.offset:
                 raise gone(upload)
-            self._file.truncate(upload.offset)  # a crash may have left more, of which nothing is known
+            self._file.truncate(upload.offset)  # a crash may have left unrecorded bytes
             self._file.seek(upload.offset)
         except BaseException:
             self._file.close()
@@ -362,10 +369,10 @@ class _FileWriter:
 
 
 def _lock(file: IO[bytes]) -> None:
-    """Lock an upload's file until it is closed; the system lets go of a lock whose process dies.
+    """Lock an upload's file until it is closed; the system releases the lock if the process dies.
 
     Raises:
-        LockedError: Somebody else has it open like this.
+        LockedError: If another writer holds the lock.
     """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -374,12 +381,12 @@ def _lock(file: IO[bytes]) -> None:
 
 
 def gone(upload: UploadRow) -> NotFoundError:
-    """Return the error of an upload whose bytes are not there any more."""
+    """Return the error for an upload whose bytes are gone."""
     return NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.")
 
 
 def write_all(file: object, data: bytes) -> None:
-    """Write every byte to an unbuffered file; a full disk becomes NoSpaceError."""
+    """Write all bytes to an unbuffered file; any OSError becomes NoSpaceError."""
     view = memoryview(data)
     try:
         while view:
@@ -389,7 +396,7 @@ def write_all(file: object, data: bytes) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Make names in a folder durable."""
+    """Make the names in a folder durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -406,6 +413,6 @@ def _remove(path: Path) -> None:
 
 def _older(path: Path, before: float) -> bool:
     try:
-        return path.stat().st_ctime < before  # the time of the last change of its name, too
+        return path.stat().st_ctime < before  # ctime also changes when the file is renamed
     except OSError:
         return False

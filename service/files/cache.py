@@ -1,8 +1,9 @@
-"""A host's copies of files that are in the store: each fetched once, verified by its SHA-256, bounded in size.
+"""Cache of stored files on one host, verified by their SHA-256 and limited in total size.
 
-A file is named by its digest. Who wants one gets one more name for it (a hard link) in a folder of its own on the same
-file system: what has more than one name is in use, and is not evicted. Any number of processes may share a cache: files
-appear by renaming, each digest is fetched under a lock, and evicting a name takes nothing from those who have another.
+Each file is fetched once and named by its digest. A user of a file gets a hard link to it in a folder of its own on the
+same file system. A file with more than one link is in use and is not evicted. Any number of processes may share a
+cache: files appear atomically by renaming, each digest is fetched under a lock, and evicting a file leaves the links of
+its users intact.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from pathlib import Path
 from service.errors import DamagedFileError, LostFileError, NoSpaceError
 
 _CHUNK = 1 << 20
-#: Fetches of one file before what comes counts as damaged in the store itself.
+#: Number of fetches before a file counts as damaged in the store itself.
 _TRIES = 2
-#: Half files of processes that died are removed at this age: no fetch takes so long.
+#: Age in seconds at which partial files of dead processes are removed: no fetch takes that long.
 _HALF_SECONDS = 6 * 3600.0
-#: What the system says when there is no room left.
+#: Error numbers of a full disk.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 _log = logging.getLogger(__name__)
 
-#: Copies an object of the store to a file.
+#: Function that copies an object of the store to a file.
 Fetch = Callable[[Path], None]
 
 
@@ -44,11 +45,11 @@ class _Entry:
 
 
 class FileCache:
-    """The cache of a folder.
+    """Cache in a folder.
 
     Args:
-        folder: made where it is missing.
-        limit: bytes of all files together; what is in use stays, and may make it more.
+        folder: Folder of the cache; created if missing.
+        limit: Maximum total size in bytes; files in use are never evicted and may exceed it.
     """
 
     def __init__(self, folder: Path, limit: int) -> None:
@@ -58,17 +59,17 @@ class FileCache:
             path.mkdir(parents=True, exist_ok=True)
 
     def link(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
-        """Give a file one more name, after fetching it where it is not there, or damaged on this host's disk.
+        """Hard-link a file to `target`, after fetching it if it is not cached or its cached copy is damaged.
 
         Args:
-            target: on the file system of the cache; nothing is there yet.
-            fetch: brings it from the store.
+            target: New path on the cache's file system.
+            fetch: Function that copies the file from the store.
 
         Raises:
-            LostFileError: the store does not have it.
-            DamagedFileError: what came is not what was asked for.
-            StoreError: `fetch` raised it.
-            NoSpaceError: the disk is full, whatever was evicted.
+            LostFileError: If the store does not have the file.
+            DamagedFileError: If the fetched file does not match its digest.
+            StoreError: If `fetch` raises it.
+            NoSpaceError: If the disk is full even after evicting all unused files.
         """
         if self._linked(sha256, target):
             return
@@ -79,7 +80,7 @@ class FileCache:
         self.evict()
 
     def adopt(self, source: Path, sha256: str) -> None:
-        """Take a whole, verified file over as it is; where it is there already, `source` is removed."""
+        """Move a complete, verified file into the cache; if its content is already cached, `source` is deleted."""
         with self._locked(sha256[:2]):
             if self._path(sha256).exists():
                 source.unlink()
@@ -88,10 +89,10 @@ class FileCache:
         self.evict()
 
     def evict(self, wanted: int = 0) -> None:
-        """Remove what was used longest ago, as far as nobody uses it now.
+        """Evict the least recently used files that are not in use.
 
         Args:
-            wanted: bytes that are to be free below the limit.
+            wanted: Bytes to leave free below the limit.
         """
         if self._total() + wanted <= self._limit:
             return
@@ -107,7 +108,7 @@ class FileCache:
             self._remove_half_files()
 
     def free(self, size: int) -> None:
-        """Evict so many bytes, as far as they are not in use, for others who need the disk."""
+        """Evict up to `size` bytes of unused files when the disk space is needed elsewhere."""
         self.evict(self._limit - self._total() + size)
 
     def _fill(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
@@ -118,7 +119,7 @@ class FileCache:
                 self._fetch(half, fetch)
                 found = file_digest(half)
                 if found == sha256:
-                    os.link(half, target)  # before it can be evicted
+                    os.link(half, target)  # linked first, because an unused file could be evicted
                     self._keep(half, sha256)
                     return
         except FileNotFoundError as error:
@@ -129,7 +130,7 @@ class FileCache:
         raise DamagedFileError.of(sha256)
 
     def _fetch(self, half: Path, fetch: Fetch) -> None:
-        """Fetch; where the disk is full, evict all that is not in use, and fetch again."""
+        """Fetch a file; if the disk is full, evict all unused files and retry."""
         try:
             fetch(half)
             return
@@ -146,7 +147,10 @@ class FileCache:
             raise
 
     def _keep(self, source: Path, sha256: str) -> None:
-        """Give a file its place. Its time is by its content: the same on every host, and after every fetch."""
+        """Move a file into the cache.
+
+        Its modification time is derived from its content, so it is the same on every host and after every fetch.
+        """
         moment = int(sha256[:8], 16)
         source.chmod(0o400)
         os.utime(source, ns=(time.time_ns(), moment * 1_000_000_000))
@@ -158,7 +162,7 @@ class FileCache:
         path = self._path(sha256)
         try:
             os.link(path, target)
-            # the time of last use is kept here: file systems seldom keep it by themselves
+            # the time of last use is set explicitly, because most file systems do not track it reliably
             os.utime(target, ns=(time.time_ns(), target.stat().st_mtime_ns))
         except FileNotFoundError:
             return False
@@ -184,26 +188,26 @@ class FileCache:
     def _remove_half_files(self) -> None:
         for path in self._half.iterdir():
             with contextlib.suppress(FileNotFoundError):
-                # the inode's time: a whole one that is about to get its place has a time by its content already
+                # ctime, because a complete file has a synthetic modification time shortly before it is moved
                 if path.stat().st_ctime < time.time() - _HALF_SECONDS:
                     path.unlink()
 
     @contextlib.contextmanager
     def _locked(self, name: str) -> Iterator[None]:
-        """Keep other processes and threads out; the system lets go of a lock whose process dies."""
+        """Hold an exclusive lock against other processes and threads; the system releases it if the process dies."""
         with (self._locks / name).open("w") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def is_full(error: BaseException | None) -> bool:
-    """Whether an error says, itself or by its cause, that the disk is full."""
+    """Return whether an error, or one of its causes, reports a full disk."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in _NO_ROOM:
             return True

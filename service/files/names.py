@@ -1,6 +1,6 @@
-"""Names of results that more than one module knows."""
+"""Names of result files that several modules use."""
 
-#: The stylized scene; the other files of a job are named after it while it runs.
+#: Name of the stylized scene; the names of a job's other files are derived from it.
 RESULT = "stylized.ply"
-#: What an unfinished job goes on from; the dot keeps it from users' sight.
+#: Name of the checkpoint that an unfinished job resumes from; the leading dot hides it from users.
 CHECKPOINT = ".checkpoint"

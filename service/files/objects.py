@@ -1,7 +1,7 @@
-"""The store of files behind an fsspec URL: a local folder, an S3-compatible bucket, or what else fsspec knows.
+"""File store behind an fsspec URL: a local folder, an S3-compatible bucket, or any other file system of fsspec.
 
-Only whole objects: a name is written once, by one writer. What goes wrong with a remote store that is away, slow or
-broken is raised as `StoreError`; a local folder's errors are the system's own.
+Objects are written as a whole, and each name is written once. Failures of a remote store (unreachable, slow, broken)
+are raised as `StoreError`; errors of a local folder are raised unchanged.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from fsspec.implementations.local import LocalFileSystem
 
 from service.errors import DamagedFileError, LostFileError, StoreError
 
-#: Of S3: seconds to connect and for an answer, and tries. What answers 503 (SlowDown) is asked again after waits that
-#: double, by the client itself; together a store that is away is given up after half a minute.
+#: Limits for S3: timeouts of connecting and of responses in seconds, and numbers of tries. The S3 client itself retries
+#: 503 (SlowDown) with exponential backoff. In total, an unreachable store is given up after half a minute.
 _CONNECT_SECONDS, _ANSWER_SECONDS = 3.0, 30.0
 _CLIENT_TRIES, _TRIES = 3, 3
-#: Large objects travel to and from S3 in pieces of so many bytes, so many at a time: by default half a gigabyte of
-#: memory would be on its way.
+#: Size and concurrency of the chunks of large objects sent to and from S3: the defaults would keep half a gigabyte in
+#: memory.
 _PIECE_BYTES, _PIECES = 16 << 20, 3
-#: What S3 takes as a part of an object, at least but for the last one, and at most; and how many of them.
+#: Minimum and maximum size of an S3 object part in bytes (the last one may be smaller), and maximum number of parts.
 MIN_PART_BYTES, _MAX_PART_BYTES, _MAX_PARTS = 5 << 20, 5 << 30, 10_000
 _CHUNK = 1 << 20
-#: An unchanged file is hashed again before it is sent after this time, and the most recent ones are remembered.
+#: Time in seconds after which an unchanged file is hashed again before it is sent, and number of files remembered.
 _CHECKED_SECONDS, _MAX_CHECKED = 3600.0, 10_000
 
 _log = logging.getLogger(__name__)
 
-#: What an object's file system says of it that changes with its content: size, times, and inode or ETag.
+#: File system metadata that change with an object's content: size, times, and inode or ETag.
 Stamp = tuple[Any, ...]
 
 
 class TruncatedError(OSError):
-    """An object has fewer bytes than it should."""
+    """Object with fewer bytes than expected."""
 
 
 class ObjectStore:
-    """Objects below a URL, by names relative to it."""
+    """Objects below a URL, named relative to it."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -61,7 +61,7 @@ class ObjectStore:
         return (found,) if isinstance(found, str) else tuple(found)
 
     def put(self, source: Path, name: str) -> None:
-        """Bring a file in that nobody writes to; it is there as a whole or not at all."""
+        """Store a file that nobody writes to, atomically."""
         with self._told(name):
             options = {"chunksize": _PIECE_BYTES, "max_concurrency": _PIECES} if self._s3 else {}
             self._files.put_file(str(source), self._path(name), **options)
@@ -70,7 +70,7 @@ class ObjectStore:
         """Copy an object to a local file.
 
         Raises:
-            FileNotFoundError: there is none of that name.
+            FileNotFoundError: If there is no such object.
         """
         with self._told(name):
             if self._s3:
@@ -79,7 +79,7 @@ class ObjectStore:
                 self._files.get_file(self._path(name), str(target))
 
     def _get_pieces(self, path: str, target: Path) -> None:
-        """As `get`; a piece that is cut off is fetched again, and not the whole."""
+        """Copy an S3 object in chunks, so that only an interrupted chunk has to be fetched again."""
         size = self._files.size(path)
         starts = range(0, size, _PIECE_BYTES)
         with target.open("wb") as file:
@@ -90,11 +90,11 @@ class ObjectStore:
                     file.write(data)
 
     def read(self, name: str, start: int, stop: int) -> Iterator[bytes]:
-        """The bytes from `start` up to `stop`, in pieces.
+        """Yield the bytes from `start` up to `stop` in chunks.
 
         Raises:
-            FileNotFoundError: there is none of that name.
-            TruncatedError: it has fewer.
+            FileNotFoundError: If there is no such object.
+            TruncatedError: If the object ends before `stop`.
         """
         with self._told(name), self._files.open(self._path(name), "rb") as file:
             file.seek(start)
@@ -107,16 +107,16 @@ class ObjectStore:
                 yield data
 
     def exists(self, name: str) -> bool:
-        """Whether there is an object of that name, now."""
+        """Return whether the object exists, bypassing caches."""
         with self._told(name):
             self._files.invalidate_cache()
             return bool(self._files.isfile(self._path(name)))
 
     def stamp(self, name: str) -> Stamp:
-        """Return what changes when an object's content does.
+        """Return metadata that change when the object's content changes.
 
         Raises:
-            FileNotFoundError: There is no such object.
+            FileNotFoundError: If there is no such object.
         """
         with self._told(name):
             if self.local:
@@ -127,17 +127,17 @@ class ObjectStore:
             return entry["size"], _changed(entry), entry.get("ETag")
 
     def size(self, name: str) -> int:
-        """Return the size of an object in bytes; -1 where there is none."""
+        """Return the size of an object in bytes; -1 if it does not exist."""
         try:
             return int(self.stamp(name)[0])
         except FileNotFoundError:
             return -1
 
     def digest(self, name: str) -> str:
-        """Return the SHA-256 of an object, read as a whole.
+        """Return the SHA-256 of an object, which is read completely.
 
         Raises:
-            FileNotFoundError: There is no such object.
+            FileNotFoundError: If there is no such object.
         """
         with self._told(name), self._files.open(self._path(name), "rb") as file:
             digest = hashlib.sha256()
@@ -146,11 +146,11 @@ class ObjectStore:
             return digest.hexdigest()
 
     def check(self, name: str, sha256: str) -> None:
-        """Read an object, and raise where it is not the file that it should be.
+        """Read an object and verify its SHA-256.
 
         Raises:
-            LostFileError: There is no such object.
-            DamagedFileError: Its SHA-256 is another one.
+            LostFileError: If there is no such object.
+            DamagedFileError: If the SHA-256 differs.
         """
         fault = self.fault(name, sha256)
         if fault is not None:
@@ -158,7 +158,7 @@ class ObjectStore:
             raise LostFileError.of(sha256) if fault == "missing" else DamagedFileError.of(sha256)
 
     def fault(self, name: str, sha256: str) -> Literal["missing", "damaged"] | None:
-        """Return what is wrong with an object that should have a SHA-256; None for nothing."""
+        """Return the fault of an object that should have this SHA-256; None if it is intact."""
         try:
             before = self.stamp(name)
             found = self.digest(name)
@@ -182,42 +182,42 @@ class ObjectStore:
             return False
 
     def check_once(self, name: str, sha256: str) -> None:
-        """Do as `check`, unless `is_checked`."""
+        """Call `check` unless `is_checked`."""
         if not self.is_checked(name, sha256):
             self.check(name, sha256)
 
     def move(self, name: str, new_name: str) -> None:
-        """Give an object another name."""
+        """Rename an object."""
         with self._told(name):
             if self.local:
                 Path(self._path(new_name)).parent.mkdir(parents=True, exist_ok=True)
             self._files.mv(self._path(name), self._path(new_name))
 
     def remove(self, name: str) -> None:
-        """Remove an object, where it is still there."""
+        """Remove an object if it exists."""
         with self._told(name), contextlib.suppress(FileNotFoundError):
             self._files.rm_file(self._path(name))
 
     def remove_below(self, folder: str) -> None:
-        """Remove all objects whose names begin with a folder's."""
+        """Remove all objects in a folder."""
         with self._told(folder), contextlib.suppress(FileNotFoundError):
             self._files.invalidate_cache()
             self._files.rm(self._path(folder), recursive=True)
 
     def below(self, folder: str) -> dict[str, float]:
-        """Names of all objects below a folder, and when each was last changed: seconds since 1970, 0 if unknown."""
+        """Return the modification times of all objects in a folder by name, in seconds since 1970 (0 if unknown)."""
         with self._told(folder):
             self._files.invalidate_cache()
             found = self._files.find(self._path(folder), detail=True)
             return {path[len(self.root) + 1 :]: _changed(entry) for path, entry in found.items()}
 
     def can_join(self, sizes: list[int]) -> bool:
-        """Whether objects of these sizes, one behind the other, can become one without being sent again."""
+        """Return whether the store can concatenate objects of these sizes without uploading them again."""
         fit = all(size >= MIN_PART_BYTES for size in sizes[:-1]) and max(sizes, default=0) <= _MAX_PART_BYTES
         return self._s3 and 0 < len(sizes) <= _MAX_PARTS and fit
 
     def join(self, parts: list[str], name: str) -> None:
-        """Make objects one, in the store itself (S3's multipart upload by copies); see `can_join`."""
+        """Concatenate objects inside the store by S3's multipart upload with copied parts; see `can_join`."""
         with self._told(name):
             where = dict(zip(("Bucket", "Key"), self._path(name).split("/", 1), strict=True))
             begun = self._files.call_s3("create_multipart_upload", **where)
@@ -236,7 +236,7 @@ class ObjectStore:
             self._files.invalidate_cache()
 
     def abort_old_parts(self, before: float) -> int:
-        """Give up objects that were begun in parts before that time, and never finished; returns how many."""
+        """Abort multipart uploads that were started before `before` and never finished; return their number."""
         if not self._s3:
             return 0
         bucket, _, prefix = self.root.partition("/")
@@ -250,8 +250,8 @@ class ObjectStore:
             return len(old)
 
     def ping(self) -> None:
-        """Prove that the place can be reached; raises OSError or StoreError."""
-        # a prefix of a bucket is nothing that could be there before something is in it
+        """Raise OSError or StoreError if the store cannot be reached."""
+        # a prefix of a bucket does not exist before the first object in it
         place = self.root if self.local else self.root.partition("/")[0]
         with self._told(place):
             self._files.invalidate_cache()
@@ -259,7 +259,7 @@ class ObjectStore:
                 raise FileNotFoundError(f"The results' place {place!r} is not there, or cannot be reached.")
 
     def make_bucket(self) -> None:
-        """Create the bucket of an S3 store, unless it is there."""
+        """Create the bucket of an S3 store if it does not exist."""
         if self._s3:
             bucket = self.root.partition("/")[0]
             with self._told(bucket):
@@ -268,7 +268,7 @@ class ObjectStore:
                     self._files.mkdir(bucket)
 
     def make_folder(self) -> None:
-        """Create the place itself."""
+        """Create the root folder."""
         self._files.makedirs(self.root, exist_ok=True)
 
     def _path(self, name: str) -> str:
@@ -276,7 +276,7 @@ class ObjectStore:
 
     @contextlib.contextmanager
     def _told(self, name: str) -> Iterator[None]:
-        """Turn what goes wrong with a remote store, in whatever library, into `StoreError`."""
+        """Convert all errors of a remote store, whatever library raises them, to `StoreError`."""
         try:
             yield
         except (FileNotFoundError, TruncatedError, StoreError):
@@ -290,13 +290,13 @@ class ObjectStore:
 
 
 def _cause(name: str, error: Exception) -> Exception:
-    """An error with the name that it is about, for the operator's log."""
+    """Add the object's name to an error, for the operator's log."""
     error.add_note(f"store of files: {name}")
     return error
 
 
 def _options(url: str) -> dict[str, Any]:
-    """For fsspec, by the URL's protocol."""
+    """Return fsspec options for the protocol of a URL."""
     if not url.startswith(("s3://", "s3a://")):
         return {}
     retries = {"mode": "standard", "total_max_attempts": _CLIENT_TRIES}
@@ -305,9 +305,9 @@ def _options(url: str) -> dict[str, Any]:
 
 
 def _changed(entry: dict[str, Any]) -> float:
-    """When an object was last changed, by what its file system says of it."""
+    """Return the modification time of an object from its file system entry."""
     found = entry.get("LastModified") or entry.get("created")
-    if isinstance(found, float):  # a local file: its inode changes with its names, its content's time does not
+    if isinstance(found, float):  # local file: ctime changes with the file's links, mtime does not
         return max(found, float(entry.get("mtime", 0.0)))
     found = found or entry.get("mtime")
     return found.timestamp() if isinstance(found, datetime) else float(found or 0.0)

@@ -1,4 +1,4 @@
-"""The files of a job laid out as `sgsst stylize` wants them: one folder, links to the blobs, the users' own names."""
+"""Staging of a job's inputs as `sgsst stylize` expects them: a folder of links to the blobs under the users' names."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from worker.regions import MOST_REGIONS, RegionRequest
 from worker.styles import MOST_PICTURES
 
 ROLES = ("scene", "style", "cameras", "photos")
-#: Pictures of a job's own style, and as many again of its regions.
+#: Maximum number of style images: those of the job's own style, plus one for each region.
 MOST_STYLES = MOST_PICTURES + MOST_REGIONS
-#: A COLMAP model is at most cameras, images, points3D, rigs, frames; transforms.json may have a companion.
+#: Maximum number of camera files: a COLMAP model has at most cameras, images, points3D, rigs and frames, and a
+#: transforms.json may have a companion.
 MAX_CAMERA_FILES = 8
 _CAMERA_SUFFIXES = {".json", ".bin", ".txt"}
-_MAX_NAME, _MAX_DEPTH = 120, 8  # bytes of a part of a path: file systems take 255, and suffixes are still to come
+_MAX_NAME, _MAX_DEPTH = 120, 8  # bytes of a path component: file systems allow 255, and suffixes are added later
 
 
 @dataclass(frozen=True)
 class Staged:
-    """Where a job's files are, as paths relative to the folder: what a report names must not tell where that is."""
+    """Paths of a job's files relative to the staging folder, so that reports do not reveal where it is."""
 
     scene: Path
     styles: tuple[Path, ...]
@@ -31,7 +32,7 @@ class Staged:
     photos: Path | None
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON; `of_json` reads it."""
+        """Return the paths as JSON for `of_json`."""
         return {
             "scene": str(self.scene),
             "styles": [str(path) for path in self.styles],
@@ -41,15 +42,15 @@ class Staged:
 
     @staticmethod
     def of_json(values: Mapping[str, Any]) -> Staged:
-        """What `as_json` wrote."""
+        """Return the paths from the JSON of `as_json`."""
         cameras, photos = (None if values[role] is None else Path(values[role]) for role in ("cameras", "photos"))
         return Staged(Path(values["scene"]), tuple(map(Path, values["styles"])), cameras, photos)
 
 
 def clean_name(role: str, name: str, number: int) -> str:
-    """The name under which an input is kept: no way out of a folder, no characters that need care.
+    """Return a safe name for an input: inside its folder and without special characters.
 
-    Photos keep their folders, since cameras may name them; other files keep the last part only.
+    Photos keep their folders, because cameras may refer to them; other files keep only the last path component.
     """
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", ".")]
     plain = [_last_bytes(re.sub(r"[^\w .+@,=()-]+", "_", part)).strip() for part in parts]
@@ -65,7 +66,7 @@ def _last_bytes(part: str) -> str:
 
 
 def region_styles(regions: Sequence[RegionRequest]) -> list[str]:
-    """Names of the style files that regions have, as they are kept."""
+    """Return the cleaned names of the style files of regions."""
     return [clean_name("style", str(file.path), 0) for region in regions for file in region.styles]
 
 
@@ -76,15 +77,15 @@ def check_roles(
     weights: Sequence[float] | None = None,
     of_regions: Sequence[str] = (),
 ) -> None:
-    """Prove that a job has the files that it needs, and no others.
+    """Raise an error unless a job has exactly the files that it needs.
 
     Args:
-        orbit: there are no camera files then.
-        weights: one for each picture of the job's own style; None where they count alike.
-        of_regions: names of the style pictures that regions have.
+        orbit: Whether the cameras are on an orbit, which excludes camera files.
+        weights: Weights of the images of the job's own style; None for equal weights.
+        of_regions: Names of the style images of regions.
 
     Raises:
-        RefusedInputError: otherwise.
+        RefusedInputError: If a file is missing, superfluous or inconsistent with the parameters.
     """
     found = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
     for role, most in (("scene", 1), ("style", MOST_STYLES)):
@@ -125,7 +126,7 @@ def check_roles(
 
 
 def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int:
-    """Prove that regions' styles have been sent; returns how many are left for the job's own style."""
+    """Verify that the styles of regions have been sent, and return the number of images of the job's own style."""
     missing = next((name for name in of_regions if name not in names), None)
     if missing is not None:
         raise RefusedInputError(
@@ -152,7 +153,7 @@ def _first_duplicate(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None
 
 
 def _check_folders(photos: Sequence[Mapping[str, Any]]) -> None:
-    """A photo cannot lie in a folder that is another photo."""
+    """Refuse a photo whose name is also the folder of another photo."""
     names = {entry["name"] for entry in photos}
     for name in names:
         above = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in names), None)
@@ -174,10 +175,10 @@ def _check_camera_files(names: Sequence[str]) -> None:
 
 
 def layout(inputs: Sequence[Mapping[str, Any]]) -> tuple[Staged, list[tuple[Path, str]]]:
-    """Where a job's inputs belong: the paths by role, and the path of each file with the file's SHA-256.
+    """Return the staged paths by role, and the path and SHA-256 of each file.
 
     Args:
-        inputs: `role`, `name` (from `clean_name`) and `sha256` of each.
+        inputs: Inputs with `role`, `name` (from `clean_name`) and `sha256`.
     """
     scene = Path()
     styles: list[Path] = []
@@ -205,9 +206,9 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
     """Link a job's inputs into a folder.
 
     Args:
-        folder: which exists.
-        inputs: as for `layout`.
-        blobs: the files by digest.
+        folder: Existing folder.
+        inputs: Inputs as for `layout`.
+        blobs: Files by digest.
     """
     staged, files = layout(inputs)
     for path, sha256 in files:
@@ -219,7 +220,7 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
 
 
 def _camera_path(names: Sequence[str]) -> Path | None:
-    """A single file, a COLMAP model's folder, or the transforms.json that a companion lies beside."""
+    """Return the path of the cameras: the only file, a transforms.json with a companion, or a COLMAP model's folder."""
     jsons = [name for name in names if name.lower().endswith(".json") and name != "dataparser_transforms.json"]
     if not names:
         return None

@@ -1,4 +1,4 @@
-"""Inputs in the store of files, which all hosts share, and the cache through which this host reads them."""
+"""Inputs in the file store, which all hosts share, read through this host's cache."""
 
 from __future__ import annotations
 
@@ -26,37 +26,37 @@ from service.settings import ServiceSettings
 from service.store.inputs import Inputs
 from service.store.tables import BlobRow, UploadPartRow, UploadRow
 
-#: Objects that no row refers to are removed at this age: a younger one's row may still be on its way.
+#: Age in seconds at which objects without a row are removed: the row of a younger object may not have been written yet.
 _ORPHAN_SECONDS = 6 * 3600.0
-#: The store is looked through for these so often.
+#: Interval between searches of the store for such objects, in seconds.
 _LOOK_SECONDS = 3600.0
 
 _log = logging.getLogger(__name__)
 
 
 def open_blobs(settings: ServiceSettings, inputs: Inputs, artifacts: Artifacts) -> Blobs:
-    """The inputs: in the data folder where the store of files is a local folder, else in the store."""
+    """Return the inputs: in the data folder if the file store is a local folder, otherwise in the file store."""
     if artifacts.local:
         return BlobFolder(settings.folder, inputs, settings.min_free_bytes)
     return StoredBlobs(settings, inputs, artifacts.objects)
 
 
 def open_cache(settings: ServiceSettings) -> FileCache:
-    """This host's cache of files that are in the store."""
+    """Return this host's cache of stored files."""
     return FileCache(settings.folder / "cache", settings.file_cache_bytes)
 
 
 class StoredBlobs(Blobs):
-    """Inputs as objects of the store."""
+    """Inputs as objects of the file store."""
 
     def __init__(self, settings: ServiceSettings, inputs: Inputs, objects: ObjectStore) -> None:
         super().__init__(settings.folder, inputs, settings.min_free_bytes, objects)
         self._cache = open_cache(settings)
-        self._before = settings.folder / "blobs"  # of a service whose files were in a local folder
+        self._before = settings.folder / "blobs"  # inputs of a service that used a local folder earlier
         self._looked_at = float("-inf")
 
     def ensure_room(self, size: int) -> None:
-        """As for all, but what is only kept for later makes room first."""
+        """Raise NoSpaceError if `size` more bytes do not fit, even after evicting cached files."""
         try:
             super().ensure_room(size)
         except NoSpaceError:
@@ -64,7 +64,7 @@ class StoredBlobs(Blobs):
             super().ensure_room(size)
 
     def keep(self, path: Path, upload_id: str | None = None) -> str:
-        """Put a received file into the store, unless its content is there, and into the cache."""
+        """Upload a received file unless its content is already stored, and move it into the cache."""
         sha256, size = file_digest(path), path.stat().st_size
         location = self._inputs.hold_known(sha256, size, upload_id)
         if location is not None:
@@ -77,7 +77,7 @@ class StoredBlobs(Blobs):
         return sha256
 
     def remove(self, locations: Iterable[str]) -> None:
-        """Remove their objects."""
+        """Remove the objects."""
         for location in locations:
             try:
                 self.objects.remove(f"{BLOBS}/{location}")
@@ -85,7 +85,7 @@ class StoredBlobs(Blobs):
                 _log.warning("an unused input stays until the store is looked through: %s", error.__cause__)
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
-        """Links to this host's copies, in `folder`; what is not in the cache is fetched."""
+        """Return links in `folder` to this host's cached copies, after fetching missing ones."""
         place = folder / ".inputs"
         place.mkdir()
         found = {}
@@ -95,10 +95,10 @@ class StoredBlobs(Blobs):
         return found
 
     def _register(self, sha256: str, location: str, size: int, upload_id: str | None) -> str:
-        """Make an object a blob, and return the blob's location; an object whose content is there already goes.
+        """Register an object as a blob and return the blob's location; a duplicate object is removed.
 
         Raises:
-            NotFoundError: The upload or receipt that would hold it is gone; so is the object.
+            NotFoundError: If the upload or receipt that should hold the blob is gone; the object is removed.
         """
         try:
             known = self._inputs.add_blob(sha256, location, size, upload_id)
@@ -110,7 +110,7 @@ class StoredBlobs(Blobs):
         return known
 
     def _heal(self, location: str, sha256: str, path: Path) -> None:
-        """Put a file in the place of its blob where that is lost or damaged."""
+        """Replace a blob with this file if the blob is lost or damaged."""
         try:
             self.objects.check_once(f"{BLOBS}/{location}", sha256)
         except (LostFileError, DamagedFileError):
@@ -119,19 +119,19 @@ class StoredBlobs(Blobs):
     # --- uploads ---------------------------------------------------------------------------------------------------
 
     def begin_upload(self, upload_id: str) -> None:
-        """There is nothing to prepare."""
+        """Do nothing: no preparation is needed."""
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
-        """Write objects of the store, one at each `save`: any API process can go on behind them."""
+        """Return a writer that stores one object per `save`, so that any API process can continue the upload."""
         return _ObjectWriter(self.incoming, self.objects, self._inputs, upload, seconds)
 
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Join its parts in the store where that can, and fetch the whole once, for its digest and for the cache."""
+        """Join the parts, inside the store if possible, and fetch the result once for its digest and for the cache."""
         whole = self.incoming / f"{secrets.token_hex(12)}.part"
         try:
             try:
                 sha256 = self._finish(upload, whole)
-            except (FileNotFoundError, NotFoundError):  # unless another request has just finished it
+            except (FileNotFoundError, NotFoundError):  # missing also if another request has just finished the upload
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is None:
                     raise gone(upload) from None
@@ -143,14 +143,14 @@ class StoredBlobs(Blobs):
         return sha256
 
     def _finish(self, upload: UploadRow, whole: Path) -> str:
-        """Make an upload's bytes a blob and a file of the cache; return their SHA-256.
+        """Turn an upload's bytes into a blob and a cached file, and return their SHA-256.
 
         Args:
             upload: Row of the upload.
-            whole: Place for all bytes meanwhile.
+            whole: Temporary path for the complete file.
 
         Raises:
-            FileNotFoundError: A part is missing.
+            FileNotFoundError: If a part is missing.
         """
         parts = self._inputs.parts(upload.id)
         if sum(part.size for part in parts) != upload.length:
@@ -160,7 +160,7 @@ class StoredBlobs(Blobs):
         if joined is None:
             self._gather([part.location for part in parts], whole)
             return self.keep(whole, upload.id)
-        # what is hashed is the very object that becomes the blob
+        # hash the very object that becomes the blob
         self.objects.get(f"{BLOBS}/{joined}", whole)
         sha256 = file_digest(whole)
         location = self._register(sha256, joined, upload.length, upload.id)
@@ -170,7 +170,7 @@ class StoredBlobs(Blobs):
         return sha256
 
     def _join(self, upload_id: str, parts: Sequence[UploadPartRow]) -> str | None:
-        """Join parts to an object among the blobs, and return its location; None where the store cannot."""
+        """Join parts to an object among the blobs and return its location; None if the store cannot join them."""
         if not self.objects.can_join([part.size for part in parts]):
             return None
         location = f"joined/{upload_id}-{secrets.token_hex(4)}"
@@ -182,7 +182,7 @@ class StoredBlobs(Blobs):
         return location
 
     def _gather(self, locations: list[str], whole: Path) -> None:
-        """Fetch the parts of an upload, one behind the other."""
+        """Fetch the parts of an upload and concatenate them."""
         piece = whole.with_suffix(".piece")
         try:
             with whole.open("wb", buffering=0) as file:
@@ -195,7 +195,7 @@ class StoredBlobs(Blobs):
             piece.unlink(missing_ok=True)
 
     def forget_upload(self, upload_id: str) -> None:
-        """Remove its objects."""
+        """Remove the upload's objects."""
         self.objects.remove_below(f"{UPLOADS}/{upload_id}")
 
     # --- housekeeping ----------------------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ class StoredBlobs(Blobs):
         return removed
 
     def _collect_orphans(self) -> int:
-        """Remove objects that a process which died had put, without their rows."""
+        """Remove objects without rows, left behind by processes that died."""
         before = self._expiry() - _ORPHAN_SECONDS
         old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
         known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
@@ -225,7 +225,7 @@ class StoredBlobs(Blobs):
         return len(orphans)
 
     def _take_over(self) -> None:
-        """Bring what is left of a time when the store was a local folder into the store."""
+        """Upload inputs that remain from a time when the file store was a local folder."""
         known = self._inputs.locations() if self._before.is_dir() else set()
         for path in self._before.glob("*/*"):
             location = f"{path.parent.name}/{path.name}"
@@ -235,7 +235,7 @@ class StoredBlobs(Blobs):
 
 
 class _ObjectWriter:
-    """Bytes of an upload on their way into the store: a file of this host until they are saved."""
+    """Writer of an upload's bytes: a file on this host buffers them until they are saved to the store."""
 
     def __init__(self, folder: Path, objects: ObjectStore, inputs: Inputs, upload: UploadRow, seconds: float) -> None:
         self._objects, self._inputs, self._upload, self._seconds = objects, inputs, upload, seconds

@@ -1,1 +1,1 @@
-"""Checks of users' files in a process that may die of them."""
+"""Checks of users' files in a separate process, which a malicious file may crash."""

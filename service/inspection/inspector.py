@@ -1,4 +1,4 @@
-"""Asks `service.inspection.process` about users' files; the process that asks never reads them itself."""
+"""Client of `service.inspection.process`: checks users' files without reading them in the calling process."""
 
 from __future__ import annotations
 
@@ -30,45 +30,46 @@ from service.store.tables import BlobRow
 
 _log = logging.getLogger(__name__)
 
-#: What is wanted of the inspecting process: prove that a job's inputs can be used, or plan the job as well.
+#: Task of the inspecting process: validate a job's inputs, or plan the job as well.
 Work = Literal["validate", "plan"]
-#: Raised when validation changes, so that what older ones found does not count.
+#: Version of the validation; raising it invalidates stored findings.
 _VERSION = "3"
-#: Requests that wait for the inspecting process at most; more are told to come back.
+#: Maximum number of requests that wait for the inspecting process; further ones are rejected with `BusyError`.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
 LEFT_SECONDS = 3600.0
-#: What files add to the limits of their inspection, by their bytes. Processor seconds: the slowest readers, of text and
-#: of images, read 30 MB in a second and more; this allows 8. Memory: numbers of text become doubles of four times their
-#: size at most, since each has a digit and a space, and then float32 of twice; a binary file is mapped (once its size),
-#: and becomes float32 of four times its size where it has numbers of one byte.
+#: Additions to the limits of an inspection per byte of its files. CPU seconds: the slowest readers (text, images) read
+#: at least 30 MB/s; this allows 8 MB/s. Memory: numbers in text become float64 of at most four times the text's size,
+#: since each takes a digit and a space, and then float32 of twice its size; a binary file is mapped (once its size) and
+#: becomes float32 of four times its size if its numbers have one byte.
 _SECONDS_PER_BYTE = 120 / 1e9
 MEMORY_PER_BYTE = 6
-#: Of all memory, what that comes to at most.
+#: Maximum of the memory limit, as a fraction of the machine's memory.
 _MEMORY_SHARE = 0.8
-#: What planning may take on top of its own limit, in processor seconds: for each Gaussian and each pixel of each view.
-#: They take less than a third of it.
+#: Additions to the CPU time limit of planning, in seconds per Gaussian and view, and per pixel of each view. Actual use
+#: is less than a third of them.
 _PLAN_SECONDS_PER_GAUSSIAN = 5e-6
 _PLAN_SECONDS_PER_PIXEL = 5e-6
-#: Jobs with more bytes of files are checked by a process of their own: small ones do not wait for them.
+#: Jobs with more bytes of files have a process of their own, so that small jobs do not wait for them.
 _LARGE_BYTES = 64 << 20
 
-#: Variables that the inspecting process is given: where code, weights and kernels are, and how memory is allocated.
+#: Environment variables passed to the inspecting process: locations of code, weights and kernels, and memory
+#: allocation.
 _ENVIRONMENT = (
     *("HOME", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "PYTHONDONTWRITEBYTECODE", "PYTHONHOME", "PYTHONPATH"),
     *("SGSST_CACHE", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "GOMP_SPINCOUNT", "MALLOC_ARENA_MAX", "THP_MEM_ALLOC_ENABLE"),
 )
-#: Started without shell; tests start one whose readers are compromised.
+#: Command of the inspecting process, run without a shell; tests replace it by one with compromised readers.
 COMMAND: tuple[str, ...] = (sys.executable, "-m", "service.inspection.process")
 
 Show = Callable[[dict[str, Any]], None]
 
 
 class InspectionProcess:
-    """The process, started when it is first needed and again when it has died; one request at a time.
+    """Inspecting process that handles one request at a time; it is started on first use and restarted after it dies.
 
     Args:
-        threads: that it may compute with.
+        threads: Number of threads for computations.
     """
 
     def __init__(self, threads: int = 1) -> None:
@@ -78,10 +79,10 @@ class InspectionProcess:
         self._waiting = 0
 
     async def ask(self, request: dict[str, Any], show: Show = lambda now: None) -> dict[str, Any]:
-        """The answer to a request; `show` is told how far a plan is.
+        """Return the answer to a request; `show` receives the progress of planning.
 
         Raises:
-            BusyError: too many wait already, or the process died twice.
+            BusyError: If too many requests wait already, or the process died twice.
         """
         if self._waiting >= _MAX_WAITING:
             raise BusyError("Too many files are being checked. Try again later.", retry_after=10)
@@ -98,7 +99,7 @@ class InspectionProcess:
         raise BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10)
 
     async def warm(self) -> None:
-        """Start the process, so that its first request need not wait for that."""
+        """Start the process in advance, so that the first request does not wait for it."""
         async with self._lock:
             await self._started()
 
@@ -128,9 +129,9 @@ class InspectionProcess:
                 show(answer["planning"])
             return None
         except (OSError, ValueError):
-            await self.close()  # what else it has to say belongs to no later request
+            await self.close()  # further output must not be taken for an answer to a later request
             return None
-        except asyncio.CancelledError:  # its answer would be taken for that to the next request
+        except asyncio.CancelledError:  # the pending answer would be taken for that to the next request
             await self.close()
             raise
         finally:
@@ -138,16 +139,16 @@ class InspectionProcess:
                 await self.close()
 
     def _environment(self) -> dict[str, str]:
-        """Return what the process needs, and no secret: it reads hostile files.
+        """Return the environment of the process, without secrets because it reads hostile files.
 
-        Libraries that start threads as they are imported must not, since it forks.
+        Libraries must not start threads on import, because the process forks.
         """
         kept = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self._threads))
         return {**kept, **threads, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
 
     async def close(self) -> None:
-        """End the process, and with it the child that reads."""
+        """Kill the process, and with it the child that reads files."""
         process, self._process = self._process, None
         if process is not None and process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
@@ -156,12 +157,12 @@ class InspectionProcess:
 
 
 class Inspector:
-    """Validates and plans whole jobs, once for the same files and parameters."""
+    """Validator and planner of complete jobs; results are stored per files and parameters."""
 
     def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs) -> None:
         self._settings = settings
         self._store, self._blobs = store, blobs
-        # while one owner's files take their whole time in one lane, the other one is free for everybody else's
+        # two lanes: if one owner's files occupy a lane for its full time limit, the other one serves everybody else
         self._validating = Lanes([InspectionProcess(), InspectionProcess()])
         self._warming: asyncio.Task[None] | None = None
         self._validating_large = Lanes([InspectionProcess()])
@@ -170,7 +171,7 @@ class Inspector:
         self._folder.mkdir(parents=True, exist_ok=True)
         for lack in missing():
             _log.warning("files are read without %s", lack)
-        for left in self._folder.iterdir():  # by a process that was killed
+        for left in self._folder.iterdir():  # left behind by a killed process
             if time.time() - left.stat().st_mtime > LEFT_SECONDS:
                 shutil.rmtree(left, ignore_errors=True)
         self._limits = {
@@ -183,10 +184,10 @@ class Inspector:
     def recall(
         self, work: Work, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
     ) -> dict[str, Any] | None:
-        """What `inspect` found in the same files before; None where they are new.
+        """Return the stored finding of `inspect` for the same inputs; None if there is none.
 
         Raises:
-            RefusedInputError: they were found to be of no use.
+            RefusedInputError: If the stored finding is a refusal.
         """
         known = self._store.inputs.inspection(self._key(work, inputs, parameters))
         return None if known is None else found_or_refused(known)
@@ -203,32 +204,32 @@ class Inspector:
         """Return what `service.inspection.process` finds in a job's inputs.
 
         Args:
-            work: "plan" for what has been validated.
-            owner: Owner of the job; of those who wait, owners take turns.
+            work: Task; "plan" requires validated inputs.
+            owner: Owner of the job; waiting owners take turns.
             inputs: `role`, `name`, `sha256` and `size` of each file.
             rows: Files by digest.
             parameters: Parameters of the job.
-            show: Receives `step`, `total`, `fraction` and `eta_s` of a plan; its steps are views.
+            show: Callback that receives `step`, `total`, `fraction` and `eta_s` of planning; its steps are views.
 
         Raises:
-            RefusedInputError: they cannot be used.
-            BusyError: it cannot be told now.
+            RefusedInputError: If the inputs cannot be used.
+            BusyError: If the inputs cannot be checked now.
         """
         recalled = await asyncio.to_thread(self.recall, work, inputs, parameters)
         if recalled is not None:
             return recalled
-        if self._settings.keys_required and self._warming is None:  # without keys there is one owner
+        if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
             self._warming = asyncio.create_task(self._validating.places[1].warm())
         async with self._lanes(work, inputs).turn(owner) as process:
             answer = await self._ask_process(process, work, inputs, rows, parameters, show)
         passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
-        if not passing:  # another day it may be otherwise
+        if not passing:  # transient refusals are not stored: a later check may succeed
             key = self._key(work, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
         return found_or_refused(answer)
 
     def _lanes(self, work: Work, inputs: Sequence[Mapping[str, Any]]) -> Lanes[InspectionProcess]:
-        """Return the processes for a piece of work."""
+        """Return the lanes of processes for a task."""
         if work == "plan":
             return self._planning
         return self._validating_large if _size(inputs) > _LARGE_BYTES else self._validating
@@ -258,7 +259,7 @@ class Inspector:
             return await process.ask(request, show)
 
     def _seconds(self, work: Work, size: int, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> float:
-        """Processor time that a piece of work may take."""
+        """Return the CPU time limit of a task in seconds."""
         reading = self._settings.inspection_seconds + _SECONDS_PER_BYTE * size
         if work == "validate":
             return reading
@@ -268,7 +269,7 @@ class Inspector:
         return self._settings.dry_run_seconds + reading + looking
 
     def _memory(self, inputs: Sequence[Mapping[str, Any]]) -> int:
-        """Memory that reading may take; photos are read one after the other."""
+        """Return the memory limit of reading in bytes; photos do not add to it, because they are read one at a time."""
         size: int = sum(entry["size"] for entry in inputs if entry["role"] != "photos")
         least = self._settings.inspection_bytes
         most = max(least, int(_MEMORY_SHARE * psutil.virtual_memory().total))
@@ -277,13 +278,14 @@ class Inspector:
     def _key(self, work: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
         files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
         told = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
-        styles = [entry["name"] for entry in inputs if entry["role"] == "style"]  # whose order that of weights is
+        # weights follow the order of the styles
+        styles = [entry["name"] for entry in inputs if entry["role"] == "style"]
         order = styles if len(styles) > 1 else []
         text = json.dumps([_VERSION, work, files, order, told, self._limits], sort_keys=True)
         return f"{work}:{hashlib.sha256(text.encode()).hexdigest()}"
 
     async def close(self) -> None:
-        """End all processes."""
+        """Stop all processes."""
         for lanes in (self._validating, self._validating_large, self._planning):
             for process in lanes.places:
                 await process.close()
@@ -294,13 +296,17 @@ def _size(inputs: Sequence[Mapping[str, Any]]) -> int:
 
 
 def _threads_of_a_job(settings: ServiceSettings) -> int:
-    """Threads that a job of this machine computes with: its plan tells of as many."""
+    """Return the number of threads of a job on this machine; planning uses the same number, so that its times apply."""
     told = os.environ.get("OMP_NUM_THREADS", "")
     return int(told) if told.isdigit() and int(told) else max(1, (os.cpu_count() or 1) // (settings.parallel_jobs or 1))
 
 
 def found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:
-    """What the process found; raises RefusedInputError where that is an error."""
+    """Return what the process found.
+
+    Raises:
+        RefusedInputError: If the answer is an error.
+    """
     if "error" in answer:
         error = answer["error"]
         raise RefusedInputError(

@@ -1,4 +1,4 @@
-"""Turns of owners at a few places of work: whoever asks for much waits behind themselves, and nobody else does."""
+"""Fair scheduling of owners on a few slots: an owner with many requests delays only their own."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from typing import Generic, TypeVar
 
 from service.errors import BusyError
 
-#: Requests of one owner that wait at most; more are told to come back.
+#: Maximum number of waiting requests per owner; further ones are rejected with `BusyError`.
 MAX_WAITING = 64
 
 Place = TypeVar("Place")
 
 
 class Lanes(Generic[Place]):
-    """Places of which an owner has one at a time, and for which owners wait in turns.
+    """Slots that owners take turns on; each owner occupies at most one at a time.
 
     Args:
-        places: Places; the first free one is taken.
+        places: Slots; the first free one is assigned.
     """
 
     def __init__(self, places: Sequence[Place]) -> None:
         self.places = tuple(places)
         self._free = list(places)
         self._at_work: set[str] = set()
-        # the owner whose turn is next comes first; the end of a turn moves its owner to the end
+        # owners in the order of their turns; the owner of a finished turn moves to the end
         self._waiting: OrderedDict[str, deque[asyncio.Future[Place]]] = OrderedDict()
 
     @asynccontextmanager
     async def turn(self, owner: str) -> AsyncIterator[Place]:
-        """Wait for the owner's turn, and have a place for as long as the block takes.
+        """Wait for the owner's turn and occupy a slot for the duration of the block.
 
         Raises:
-            BusyError: too many requests of this owner wait already.
+            BusyError: If too many requests of this owner wait already.
         """
         mine = self._waiting.setdefault(owner, deque())
         if len(mine) >= MAX_WAITING:

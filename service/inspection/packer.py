@@ -1,6 +1,6 @@
-"""Results in packed forms: made once, when somebody asks for them, and kept beside the PLY.
+"""Results in compressed formats, created on the first request and stored beside the PLY.
 
-They are made by `service.inspection.process`, in a child with limits: the API's process never reads a scene.
+`service.inspection.process` creates them in a child with resource limits, so the API process never reads a scene.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from service.store.leases import Published
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.scene_headers import PackedForm, packed_name
 
-#: Processor seconds for each byte of a result, on top of those that its inspection may take: it is read, sorted and
-#: compressed, and rendered some times. That takes less than a fifth.
+#: Additional CPU seconds per byte of a result, for reading, sorting, compressing, and rendering it several times.
+#: Actual use is less than a fifth.
 _SECONDS_PER_BYTE = 600 / 1e9
 
 
 class Packer:
-    """Makes packed results, one after the other; those who ask for the same wait for the same."""
+    """Compressor of results, one at a time; concurrent requests for the same result share one task."""
 
     def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
@@ -41,17 +41,17 @@ class Packer:
         self._making: dict[tuple[str, str], asyncio.Task[None]] = {}
         self._folder = settings.folder / "packing"
         self._folder.mkdir(parents=True, exist_ok=True)
-        for left in self._folder.iterdir():  # by a process that was killed
+        for left in self._folder.iterdir():  # left behind by a killed process
             if time.time() - left.stat().st_mtime > LEFT_SECONDS:
                 shutil.rmtree(left, ignore_errors=True)
 
     async def packed(self, job: JobRow, form: PackedForm) -> ArtifactRow:
-        """A job's result in a packed form; beside it lies what that loses, as JSON.
+        """Return a job's result in a compressed format; its loss is stored beside it as JSON.
 
         Raises:
-            NotFoundError: the job has no result (yet), or it is gone.
-            RefusedInputError: the form cannot hold it, or making it takes more than allowed.
-            BusyError, NoSpaceError: it cannot be made now.
+            NotFoundError: If the job has no result yet, or the result is gone.
+            RefusedInputError: If the format cannot represent the result, or compressing exceeds the limits.
+            BusyError, NoSpaceError: If the result cannot be compressed now.
         """
         name = packed_name(RESULT, form)
         result = await asyncio.to_thread(self._store.jobs.artifact, job.id, RESULT)
@@ -71,7 +71,7 @@ class Packer:
         return found
 
     async def _make(self, job: JobRow, result: ArtifactRow, name: str) -> None:
-        """Pack, put the files to their place, and make them visible."""
+        """Compress the result, store the files, and make them visible."""
         self._blobs.ensure_room(3 * result.size)
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
             staged = await asyncio.to_thread(self._stage, Path(folder), job, result)
@@ -88,7 +88,7 @@ class Packer:
             await asyncio.to_thread(self._publish, Path(folder), job, result, name, loss)
 
     def _stage(self, folder: Path, job: JobRow, result: ArtifactRow) -> Staged:
-        """The job's inputs, and the result in the scene's place."""
+        """Stage the job's inputs, with the result in place of the scene."""
         rows = self._store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
         staged = stage(folder, job.inputs, self._blobs.bring(rows, folder))
         self._artifacts.fetch(result.location, folder / RESULT, result.sha256)
@@ -97,7 +97,7 @@ class Packer:
     def _publish(self, folder: Path, job: JobRow, result: ArtifactRow, name: str, loss: dict[str, Any]) -> None:
         loss_file = folder / "loss.json"
         loss_file.write_text(json.dumps(loss, indent=1) + "\n")
-        # behind the last lease's epoch, so that no sweep takes them for what an attempt has left
+        # later than the last lease's epoch, so that no sweep takes the files for leftovers of an attempt
         epoch = job.lease_epoch + 1
         files: list[Published] = [
             self._artifacts.put(job.id, epoch, f"{name}.json", loss_file, final=True),
@@ -107,5 +107,5 @@ class Packer:
             self._artifacts.remove(location)
 
     async def close(self) -> None:
-        """End what is being made."""
+        """Stop the process, and with it any compression in progress."""
         await self._process.close()

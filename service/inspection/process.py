@@ -1,9 +1,9 @@
-"""The process that looks into users' files, and packs results: `python -m service.inspection.process`.
+"""Process that reads users' files and compresses results: `python -m service.inspection.process`.
 
-It imports what takes long once, then forks for each request a child with limits on time and memory, which reads the
-files and dies. The child is confined (`service.inspection.sandbox`): a hostile file that takes it over can falsify the
-answer to its own request, and nothing else. Requests and answers are lines of
-JSON on stdin and stdout, one at a time; before the answer to a plan come lines of how far it is, `{"planning": ...}`.
+It imports the slow modules once. For each request it forks a child with limits on time and memory, which reads the
+files and exits. The child is confined (`service.inspection.sandbox`): a hostile file that takes it over can falsify the
+answer to its own request, and nothing else. Requests and answers are lines of JSON on stdin and stdout, one request at
+a time. Lines of progress, `{"planning": ...}`, precede the answer to a plan.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ from worker.inputs import check_something_in_view, load_styles, read_cameras_of,
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
 
-#: Bytes of an answer.
+#: Maximum size of an answer in bytes.
 MAX_ANSWER = 64 << 20
-#: Address space that each thread reserves and hardly uses: its stack, and an arena of the C library.
+#: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
 
 
 class RefusedError(Exception):
-    """An input beyond the service's own limits; code and message for the user."""
+    """Input that exceeds the service's own limits, with a code and a message for the user."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -74,7 +74,11 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True)
 class _Read:
-    """What was read of a job: `orbit` is that which the cameras are of, where they are."""
+    """Inputs of a job in memory.
+
+    Attributes:
+        orbit: Orbit of the cameras; None if they were read from files.
+    """
 
     scene: Scene
     cameras: list[Camera]
@@ -84,19 +88,19 @@ class _Read:
 
 
 def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
-    """Read every input of a job as the job would; nothing is rendered.
+    """Read every input of a job as the job would, without rendering.
 
     Returns:
         `gaussians`, `dropped`, `sh_degree`, `views`, `pixels` (of all views), `style` (width, height), `photos`.
 
     Raises:
-        RefusedError, InvalidInputError: an input that cannot be used, with `part`, the role that it has.
+        RefusedError, InvalidInputError: If an input cannot be used; the attribute `part` is its role.
     """
     return _read_inputs(staged, parameters, limits)[0]
 
 
 def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> tuple[dict[str, Any], _Read]:
-    """What `validate` finds, and what it has read."""
+    """Return the findings of `validate` and the inputs themselves."""
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
@@ -149,12 +153,12 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
 
 
 def _once(settings: Settings) -> str:
-    """Beside a number of Gaussians that counts those of a refined scene."""
+    """Return the suffix of a number of Gaussians that counts those of the refined scene."""
     return f" once it is refined to at most {settings.refine:g} times as many" if settings.refine > 1 else ""
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
-    """What a job would do: what `validate` finds, and the plan of `sgsst plan`; `show` is told how far it is."""
+    """Return the findings of `validate` and the plan of `sgsst plan`; `show` receives the progress."""
     found, read = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
@@ -187,10 +191,10 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
 
 
 def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]:
-    """Write a job's result, staged in the place of its scene, to a file whose name's ending tells the form.
+    """Compress a job's result, staged in place of its scene, into a file whose suffix determines the format.
 
     Returns:
-        What that loses: `PackedLoss` as JSON.
+        Loss of the compression: `PackedLoss` as JSON.
     """
     source, settings = scene_request(staged, parameters), parameters.settings()
     scene = read_scene(source.scene).scene
@@ -208,7 +212,7 @@ WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], 
 
 
 class _ErrorsOf:
-    """Marks errors with the part of the request that they are about."""
+    """Context manager that marks errors with the part of the request that they concern."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -237,14 +241,16 @@ def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
 
 
 def _check_frames_have_sizes(path: Path) -> None:
-    """Refuse frames of a transforms.json that leave their size to an image: its path may lead anywhere on this machine,
-    and the answer would tell what is there.
+    """Refuse frames of a transforms.json without sizes.
+
+    The size would be read from the image, whose path may lead anywhere on this machine, and the answer would reveal
+    what is there.
     """
     for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
         try:
             content = json.loads(file.read_text(encoding="utf-8-sig"))
         except (ValueError, RecursionError):
-            continue  # the reader says what is wrong with it
+            continue  # the reader reports the fault
         frames = content.get("frames") if isinstance(content, dict) else None
         for index, frame in enumerate(frames if isinstance(frames, list) else []):
             if isinstance(frame, dict) and not {"w", "h"} <= {**content, **frame}.keys():
@@ -255,7 +261,7 @@ def _check_frames_have_sizes(path: Path) -> None:
 
 
 def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
-    """What a child writes at last: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
+    """Return the final answer of a child: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
         os.chdir(request["folder"])
         staged = Staged.of_json(request["staged"])
@@ -267,7 +273,7 @@ def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
         return _refusal("inspection-limit", "Reading it takes more memory than allowed.", getattr(error, "part", None))
     except SgsstError as error:
         return _refusal(error.code, str(error), getattr(error, "part", None))
-    except Exception as error:  # a reader that broke on it is the file's fault until shown otherwise
+    except Exception as error:  # a crash of a reader is attributed to the file
         if "memory" in str(error).lower():
             return _refusal("inspection-limit", "Reading it takes more memory than allowed.", None)
         refusal = _refusal("invalid-input", "The files cannot be read.", getattr(error, "part", None))
@@ -286,10 +292,10 @@ def _limit_resources(seconds: float, size: int) -> None:
 
 
 def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
-    """Fork, confine, answer: yield the lines that the child sends through a pipe.
+    """Fork a confined child and yield the lines that it sends through a pipe.
 
-    A child that ends without an answer hit a limit, of which it has three: processor time of each thread, memory, and
-    twice that time on the clock.
+    A child that ends without an answer has hit one of three limits: CPU time of all threads, memory, or twice that time
+    on the clock.
     """
     reading, writing = os.pipe()
     child = os.fork()
@@ -306,9 +312,9 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
             yield json.dumps(line).encode()
     finally:
         os.close(reading)
-        os.kill(child, signal.SIGKILL)  # a child that has said everything may be gone, but is not forgotten yet
+        os.kill(child, signal.SIGKILL)  # an exited child stays a zombie until waitpid, so its id is still valid
         _, status = os.waitpid(child, 0)
-    # only now, when nothing can change the files behind the answer any more
+    # the child is dead: nothing can change the files behind the answer any more
     if answer is None:
         answer = {**_refusal("inspection-limit", _limit_text(request), None), "log": f"wait status {status}, no answer"}
     if answer.pop("compiled", False):
@@ -319,15 +325,15 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
 
 
 def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
-    """Answer a request and end. Nothing of the process that was forked is touched."""
+    """Answer a request and exit, without touching the state of the forked process."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
-        die_with_parent()  # a fork does not take that over
+        die_with_parent()  # the setting is not inherited across a fork
         _close_descriptors(writing)
-        if request["threads"] > 1:  # no thread has been started yet, so that none is missing here
+        if request["threads"] > 1:  # the parent has not started threads, so the fork misses none
             torch.set_num_threads(request["threads"])
         _die_first()
-        # each thread takes processor time while it waits for the others
+        # every thread uses CPU time while it waits for the others
         _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _beside_reading(request))
         with os.fdopen(writing, "w") as file:
 
@@ -348,7 +354,7 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
 
 
 def _close_descriptors(kept: int = 2) -> None:
-    """Close all but one: answers to other requests and the log go through those that a fork takes over."""
+    """Close all descriptors but one: the inherited ones carry answers to other requests and the log."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for descriptor in range(3):
         os.dup2(nothing, descriptor)
@@ -357,10 +363,10 @@ def _close_descriptors(kept: int = 2) -> None:
 
 
 def _confine(request: dict[str, Any]) -> list[None]:
-    """Let this child read its job's files and the installation, and write the packed result that it was asked for.
+    """Allow this child to read its job's files and the installation, and to write the requested compressed result.
 
     Returns:
-        A list that grows with each kernel that has to be compiled.
+        A list that gains an entry for each kernel that has to be compiled.
     """
     folder = Path(request["folder"])
     links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
@@ -369,7 +375,7 @@ def _confine(request: dict[str, Any]) -> list[None]:
     if request["work"] == "pack":
         result = folder / request["limits"]["name"]
         result.touch()
-        most_bytes = (folder / request["staged"]["scene"]).stat().st_size + (1 << 20)  # a packed scene is smaller
+        most_bytes = (folder / request["staged"]["scene"]).stat().st_size + (1 << 20)  # a compressed scene is smaller
     missed: list[None] = []
     keep_in_memory(lambda: missed.append(None))
     confine([folder, *linked, cache_folder(), *kernel_folders(), *installation()], result, most_bytes)
@@ -378,9 +384,10 @@ def _confine(request: dict[str, Any]) -> list[None]:
 
 @functools.cache
 def _compile_kernels() -> None:
-    """Start to plan a small scene of our own in a child that keeps its kernels on disk: confined ones cannot.
+    """Plan a small built-in scene in a child that stores its kernels on disk, which confined children cannot do.
 
-    Once: a child that is not trusted asks for it. Nothing waits for it, and it dies with this process.
+    This happens at most once, because an untrusted child requests it. Nothing waits for that child, and it dies with
+    this process.
     """
     if os.fork():
         return
@@ -400,13 +407,13 @@ def _compile_kernels() -> None:
 
 
 def _die_first() -> None:
-    """Where the machine's memory runs out, let the system end this process rather than a job."""
+    """Make the system kill this process rather than a job if the machine runs out of memory."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500")
 
 
 def _beside_reading(request: dict[str, Any]) -> int:
-    """Memory that is not taken for what the files hold: that of threads, and that which a plan measures with."""
+    """Return the memory limit in bytes beyond reading: for threads, and for what planning or compressing computes."""
     threads: int = request["threads"] * _THREAD_BYTES
     if request["work"] == "validate":
         return threads
@@ -421,7 +428,7 @@ def _limit_text(request: dict[str, Any]) -> str:
 
 
 def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
-    """Yield answers until the other end closes, sends what is no answer, or the deadline is over."""
+    """Yield answers until the other end closes, sends an invalid answer, or the deadline passes."""
     begun = b""
     while (left := deadline - time.monotonic()) > 0 and len(begun) < MAX_ANSWER:
         if not select.select([descriptor], [], [], left)[0]:
@@ -441,7 +448,7 @@ def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
 
 
 def _is_answer(answer: Any) -> bool:
-    """Whether a child that is not trusted says what the asking process can take."""
+    """Return whether the message of an untrusted child has the format that the calling process accepts."""
     if not isinstance(answer, dict) or not answer.keys() & {"planning", "found", "error"}:
         return False
     planning = answer.get("planning", {})
@@ -456,7 +463,7 @@ def _is_answer(answer: Any) -> bool:
 
 def main() -> None:
     """Answer requests until stdin closes."""
-    torch.set_num_threads(1)  # a forked child of a process with threads could wait for them for ever
+    torch.set_num_threads(1)  # a child forked from a process with threads could wait for them forever
     die_with_parent()
     for line in sys.stdin.buffer:
         for said in _inspect_in_child(json.loads(line)):

@@ -1,7 +1,7 @@
-"""Confinement of a process that reads hostile files: what it may read and write, and ask of the kernel.
+"""Confinement of a process that reads hostile files: limits on files, network, processes and system calls.
 
-Linux alone, by two kernel features that need no privileges: Landlock for files (5.13 or newer) and a seccomp filter for
-everything else: network, other processes, attributes of files, and parts of the kernel that no reader needs.
+Linux only, with two kernel features that need no privileges. Landlock (5.13 or newer) restricts files. A seccomp filter
+restricts everything else: network, other processes, attributes of files, and parts of the kernel that no reader needs.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from pathlib import Path
 
 _PR_GET_SECCOMP, _PR_SET_SECCOMP, _PR_SET_NO_NEW_PRIVS = 21, 22, 38
 _FILTER_MODE = 2
-_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # on every architecture
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # the same on every architecture
 _RULE_PATH_BENEATH = 1
 _WRITE_FILE, _READ_FILE, _READ_DIR, _TRUNCATE = 1 << 1, 1 << 2, 1 << 3, 1 << 14
-#: How many rights on files Landlock knows, by its version: all are taken, and few are given back.
+#: Number of file access rights by Landlock version; all of them are handled, and few are granted.
 _FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15}
 _LATEST_FILE_RIGHTS = 16
-#: Since version 4: rights to bind and connect TCP sockets. Since version 6: abstract sockets, and signals.
+#: Version 4 and later: rights to bind and connect TCP sockets. Version 6 and later: scopes of abstract sockets and
+#: signals.
 _TCP_RIGHTS, _SCOPES = 0b11, 0b11
 
 _SYSTEM = (
@@ -36,9 +37,9 @@ _SYSTEM = (
 
 #: System calls that are refused, by number on x86_64 and aarch64; aarch64 lacks some.
 _REFUSED: dict[str, tuple[int, int | None]] = {
-    # network, which no descriptor is inherited from
+    # network; no network descriptor is inherited either
     "socket": (41, 198), "socketpair": (53, 199), "io_uring_setup": (425, 425),
-    # new programs and processes; `clone` makes threads only
+    # new programs and processes; `clone` may only create threads
     "fork": (57, None), "vfork": (58, None), "execve": (59, 221), "execveat": (322, 281), "unshare": (272, 97),
     "setns": (308, 268),
     # other processes
@@ -47,10 +48,10 @@ _REFUSED: dict[str, tuple[int, int | None]] = {
     "pidfd_send_signal": (424, 424), "pidfd_getfd": (438, 438), "process_madvise": (440, 440),
     "process_mrelease": (448, 448), "setpriority": (141, 140), "ioprio_set": (251, 30), "migrate_pages": (256, 238),
     "move_pages": (279, 239), "setpgid": (109, 154),
-    # memory that outlives a process, or belongs to none
+    # memory that outlives a process or belongs to none
     "shmget": (29, 194), "semget": (64, 190), "msgget": (68, 186), "mq_open": (240, 180), "memfd_create": (319, 279),
     "add_key": (248, 217), "request_key": (249, 218), "keyctl": (250, 219),
-    # what Landlock leaves open about files
+    # file operations that Landlock does not cover
     "chmod": (90, None), "fchmod": (91, 52), "fchmodat": (268, 53), "fchmodat2": (452, 452), "chown": (92, None),
     "fchown": (93, 55), "lchown": (94, None), "fchownat": (260, 54), "utime": (132, None), "utimes": (235, None),
     "futimesat": (261, None), "utimensat": (280, 88), "setxattr": (188, 5), "lsetxattr": (189, 6),
@@ -68,7 +69,7 @@ _REFUSED: dict[str, tuple[int, int | None]] = {
     "adjtimex": (159, 171), "clock_adjtime": (305, 266), "sethostname": (170, 161), "setdomainname": (171, 162),
     "iopl": (172, None), "ioperm": (173, None),
 }  # fmt: skip
-#: Refused unless the first argument names the caller itself: its process id, and 0 where that means the same.
+#: System calls that are refused unless the first argument is the caller's own process id, or 0 if that means the same.
 _OWN_ONLY: dict[str, tuple[int, int, bool]] = {
     "kill": (62, 129, False), "tgkill": (234, 131, False), "prlimit64": (302, 261, True),
     "sched_setaffinity": (203, 122, True), "sched_setscheduler": (144, 119, True), "sched_setparam": (142, 118, True),
@@ -76,7 +77,7 @@ _OWN_ONLY: dict[str, tuple[int, int, bool]] = {
 }  # fmt: skip
 _CLONE, _CLONE3 = (56, 220), 435
 _CLONE_THREAD = 0x10000
-#: The newest system call that was considered here; newer ones answer that they are not there.
+#: Newest system call considered here; newer ones fail with ENOSYS.
 _NEWEST = 462
 _ARCHITECTURES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
 
@@ -86,7 +87,7 @@ _NUMBER_AT, _ARCHITECTURE_AT, _FIRST_ARGUMENT_AT = 0, 4, 16
 
 
 def missing() -> list[str]:
-    """List what this kernel lacks to confine a process, for the operator; empty where it has everything."""
+    """Return what this kernel lacks to confine a process, as messages for the operator; empty if nothing."""
     found = []
     if _landlock_version() < 1:
         found.append("Landlock (Linux 5.13): a reader that is taken over can read what this user can read")
@@ -96,15 +97,15 @@ def missing() -> list[str]:
 
 
 def confine(readable: Iterable[Path], writable: Path | None, most_bytes: int) -> None:
-    """Confine this process, which has a single thread, for good, as far as the kernel can: see `missing`.
+    """Confine this single-threaded process permanently, as far as the kernel supports it (see `missing`).
 
     Args:
-        readable: Files and folders that may be read, with everything below them; those that do not exist are skipped.
-        writable: The only file that may be written to; it exists. None for no file at all.
-        most_bytes: Size up to which it may grow.
+        readable: Files and folders that may be read recursively; missing ones are skipped.
+        writable: The only file that may be written to; it must exist. None for no file.
+        most_bytes: Maximum size of that file.
 
     Raises:
-        OSError: The kernel refuses what it is able to do.
+        OSError: If the kernel rejects a restriction that it supports.
     """
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
@@ -120,7 +121,7 @@ def confine(readable: Iterable[Path], writable: Path | None, most_bytes: int) ->
 
 
 def installation() -> list[Path]:
-    """List what a process reads of the machine itself: code, libraries, and what the kernel says of the hardware."""
+    """Return the paths of the machine that a process needs to read: code, libraries, and hardware information."""
     packages = [entry for entry in sys.path if Path(entry).name in ("site-packages", "dist-packages", "lib-dynload")]
     library = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
     own = [Path(__file__).parents[2] / name for name in ("sgsst_core", "worker", "service")]
@@ -128,7 +129,7 @@ def installation() -> list[Path]:
 
 
 def _limit_processes() -> None:
-    """Bound this user's processes and threads by those of the whole machine now, and 512 more."""
+    """Limit this user's processes and threads to the current number on the whole machine plus 512."""
     entities = int(Path("/proc/loadavg").read_text().split("/")[1].split()[0])
     _, hard = resource.getrlimit(resource.RLIMIT_NPROC)
     most = entities + 512 if hard == resource.RLIM_INFINITY else min(hard, entities + 512)
@@ -139,7 +140,7 @@ def _limit_processes() -> None:
 
 
 def _landlock_version() -> int:
-    """Return the version of the kernel's Landlock; 0 where there is none."""
+    """Return the version of the kernel's Landlock; 0 if it has none."""
     if not sys.platform.startswith("linux"):
         return 0
     return max(0, int(ctypes.CDLL(None).syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), ctypes.c_uint32(1))))
@@ -175,7 +176,10 @@ def _allow(libc: ctypes.CDLL, ruleset: int, path: Path, rights: int) -> None:
 
 
 def _has_seccomp() -> bool:
-    """Whether a filter could be installed: without one, the kernel complains of its address rather than of the mode."""
+    """Return whether the kernel supports filters.
+
+    If it does, an attempt with a null filter fails because of the address (EFAULT), not because of the mode.
+    """
     if not sys.platform.startswith("linux") or platform.machine() not in _ARCHITECTURES:
         return False
     libc = ctypes.CDLL(None, use_errno=True)
@@ -191,17 +195,17 @@ def _restrict_calls(libc: ctypes.CDLL) -> None:
 
 
 def seccomp_program(machine: str, process: int) -> bytes:
-    """Assemble the filter of a process, in classic BPF: every system call is allowed unless it is listed above."""
+    """Assemble the classic BPF filter of a process: every system call is allowed unless it is listed above."""
     column, architecture = _ARCHITECTURES[machine]
     refuse, absent = _ERRNO | errno.EPERM, _ERRNO | errno.ENOSYS
     code = [
         (_LOAD, 0, 0, _ARCHITECTURE_AT),
         (_EQUAL, 1, 0, architecture),
-        (_RETURN, 0, 0, refuse),  # the 32-bit calls have other numbers
+        (_RETURN, 0, 0, refuse),  # 32-bit calls have different numbers
         (_LOAD, 0, 0, _NUMBER_AT),
-        (_GREATER, 0, 1, _NEWEST),  # also those of x32
+        (_GREATER, 0, 1, _NEWEST),  # includes x32 calls
         (_RETURN, 0, 0, absent),
-        (_EQUAL, 0, 1, _CLONE3),  # its flags are in memory, which no filter sees: the C library falls back to clone
+        (_EQUAL, 0, 1, _CLONE3),  # flags are in memory, which a filter cannot read; the C library falls back to clone
         (_RETURN, 0, 0, absent),
         (_EQUAL, 0, 4, _CLONE[column]),
         (_LOAD, 0, 0, _FIRST_ARGUMENT_AT),

@@ -1,1 +1,1 @@
-"""Which job runs when and where, and what follows from how it ends."""
+"""Scheduling of jobs: which one runs when and where, and what follows from how it ends."""

@@ -1,8 +1,8 @@
-"""One attempt at one job, in a process of its own: `python -m service.scheduling.attempt_process FOLDER`.
+"""Process of one attempt at a job: `python -m service.scheduling.attempt_process FOLDER`.
 
-The folder holds the staged inputs and `task.json`; results go to its `out`. What happens is told in lines of JSON on
-stdout (`Message`), what people may want to read on stderr. SIGTERM lets the step in hand finish and saves a checkpoint.
-The process dies with the dispatcher that started it, and takes what it started along.
+The folder contains the staged inputs and `task.json`; results go to its subfolder `out`. The process reports events as
+lines of JSON on stdout (`Message`), and logs for people on stderr. On SIGTERM it finishes the current step and saves a
+checkpoint. It dies with the dispatcher that started it, and so do the processes that it has started.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ if TYPE_CHECKING:
     from worker.execute import Result
     from worker.request import StylizeRequest
 
-#: A job takes every core for as long as it runs. Where that is the service's machine, requests go first; alone on its
-#: cores, a job loses nothing by it.
+#: Niceness of a job that uses all cores. On the service's own machine, requests take precedence; on a machine of its
+#: own, a job loses nothing.
 _NICENESS = 5
-#: Of previews, in the attempt's folder.
+#: Folder of previews, relative to the attempt's folder.
 _PREVIEWS = Path("out", "previews")
 
 
 @dataclass(frozen=True)
 class Task:
-    """`task.json`.
+    """Content of `task.json`.
 
     Attributes:
-        staged: paths of the inputs, relative to the folder.
-        parameters: of the job.
-        workers: ranks to run it on at most; 1 for this process alone.
-        cluster: run even one rank on the Ray cluster.
-        resume: go on from the checkpoint in `out`, or in the workplace, where it can be used.
-        checkpoint_seconds, preview_seconds: see the settings.
-        workplace: of ranks on machines that share no folder with this one; None where they do.
+        staged: Paths of the inputs, relative to the folder.
+        parameters: Parameters of the job.
+        workers: Maximum number of ranks; 1 runs the job in this process alone.
+        cluster: Whether to run even a single rank on the Ray cluster.
+        resume: Whether to resume from the checkpoint in `out` or in the workplace if it is usable.
+        checkpoint_seconds, preview_seconds: Intervals as in the settings.
+        workplace: Workplace of ranks on machines that share no folder with this one; None if they do.
     """
 
     staged: Staged
@@ -65,14 +65,14 @@ class Task:
     workplace: StoreWorkplace | None = None
 
     def save(self, folder: Path) -> None:
-        """Write it for `load`."""
+        """Write the task for `load`."""
         values = {**vars(self), "staged": self.staged.as_json(), "parameters": self.parameters.model_dump(mode="json")}
         values["workplace"] = self.workplace and self.workplace.as_json()
         (folder / "task.json").write_text(json.dumps(values))
 
     @staticmethod
     def load(folder: Path) -> Task:
-        """Read what `save` wrote."""
+        """Read a task written by `save`."""
         values = json.loads((folder / "task.json").read_text())
         staged = Staged.of_json(values.pop("staged"))
         if values["workplace"] is not None:
@@ -81,14 +81,14 @@ class Task:
 
 
 class AttemptProcess:
-    """An attempt, in the process that makes it."""
+    """Attempt at a job, inside its own process."""
 
     def __init__(self, task: Task) -> None:
         self._task = task
         self._stopping = threading.Event()
 
     def run(self) -> None:
-        """Run to the end, whatever it is, and tell how it was."""
+        """Run the attempt and report how it ended, whatever the reason."""
         signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
         tell({"kind": "stage", "stage": "reading"})
         try:
@@ -96,7 +96,7 @@ class AttemptProcess:
         except Exception as error:
             tell(failure(error))
             if is_outage(error):
-                log(OUTAGE["message"])  # what is known of it is the operator's
+                log(OUTAGE["message"])  # the details are for the operator only
             else:
                 traceback.print_exc()
             return
@@ -158,7 +158,7 @@ class AttemptProcess:
 
 
 def tell_planning(now: PlanningProgress) -> None:
-    """How far the survey of the views has come; its steps are views."""
+    """Report the progress of the survey; its steps are views."""
     tell(
         {
             "kind": "stage",
@@ -171,14 +171,14 @@ def tell_planning(now: PlanningProgress) -> None:
 
 
 def tell_prepared(prepared: Prepared) -> None:
-    """What was decided, for the log, and where the steps begin."""
+    """Log the decisions of the plan and report the first step."""
     for heading, line in prepared.lines:
         log(f"{heading}: {line}")
     tell({"kind": "prepared", "step": prepared.step, "total": prepared.total})
 
 
 def tell_progress(now: Progress) -> None:
-    """A step."""
+    """Report a step."""
     tell(
         {
             "kind": "progress",
@@ -194,22 +194,22 @@ def tell_progress(now: Progress) -> None:
 
 
 def tell_left_out(gpus: Sequence[str]) -> None:
-    """GPUs that the plan does without."""
+    """Report GPUs that the plan does not use."""
     tell({"kind": "left-out", "gpus": list(gpus)})
 
 
 def tell_stored(file: Published) -> None:
-    """A file that a rank has put into the store of files."""
+    """Report a file that a rank has put into the file store."""
     tell({"kind": "stored", "file": asdict(file)})
 
 
 def tell_preview(path: Path) -> None:
-    """A picture of the running job."""
+    """Report a preview image of the running job."""
     tell({"kind": "preview", "path": str(path)})
 
 
 def summary(result: Result) -> dict[str, Any]:
-    """What a job's record says about its end; the report has the rest."""
+    """Return the result for the job's record; the report has the details."""
     before, after = result.losses
     return {
         "stopped": result.stopped,
@@ -221,7 +221,7 @@ def summary(result: Result) -> dict[str, Any]:
 
 
 def failure(error: Exception) -> Message:
-    """An error as it is told: whether the same would happen again decides whether the job is tried again."""
+    """Return the message for an error; the error is permanent if a retry would fail in the same way."""
     from sgsst_core.errors import DivergedError, InvalidInputError, SgsstError
 
     if is_outage(error):
@@ -241,25 +241,25 @@ def _out_of_memory(error: Exception) -> bool:
 
 
 def log(line: str) -> None:
-    """A line for people."""
+    """Write a line to the log for people."""
     print(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}", file=sys.stderr, flush=True)
 
 
 def tell(message: Message) -> None:
-    """A line for the dispatcher."""
+    """Send a message to the dispatcher."""
     _channel.write(json.dumps(message) + "\n")
     _channel.flush()
 
 
-#: Messages go through the stdout that the process was given; what libraries print goes to stderr from then on.
+#: Channel to the dispatcher: the process' original stdout. Output of libraries is redirected to stderr.
 _channel = sys.stdout
 
 
 def main() -> None:
-    """Run the task of the folder that the command line names."""
+    """Run the task in the folder given on the command line."""
     global _channel
     die_with_parent()
-    if not os.environ.get("CUDA_VISIBLE_DEVICES"):  # a GPU's work is not in the way, and must not wait
+    if not os.environ.get("CUDA_VISIBLE_DEVICES"):  # GPU jobs need little CPU time and must not be delayed
         os.nice(_NICENESS)
     _channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)

@@ -1,10 +1,10 @@
-"""What may run in the room that is kept for a big job, until that job can begin.
+"""Backfilling: short jobs run on capacity that is reserved for a large job, until that job can start.
 
-A job that needs more of a machine than is free has room kept for it, or smaller ones would overtake it for ever. Until
-the last of those before it ends, what is free already would stand idle: on a fleet that is asked for all it has, one
-GPU in ten. So jobs that will have ended by then are let in (EASY backfilling: D. Lifka, "The ANL/IBM SP scheduling
-system", 1995). How long a job takes is an estimate from its record, times the pace at which this machine does such
-jobs; nothing is let in before a pace is known.
+Capacity is reserved for a job that needs more of a machine than is free, because otherwise smaller jobs would overtake
+it forever. Without backfilling, the free part would be idle until the last of the preceding jobs ends: one GPU in ten
+on a fully loaded fleet. Jobs that are expected to end by then are therefore started (EASY backfilling: D. Lifka, "The
+ANL/IBM SP scheduling system", 1995). The duration of a job is estimated from its record and scaled by the measured pace
+of this machine; nothing is backfilled before a pace is known.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from service.scheduling.job_size import estimated_seconds
 from service.scheduling.packing import Grant, Room
 from service.store.tables import JobRow
 
-#: What a job is expected to take at most, over its estimate: jobs of one size differ by a third (standard deviation).
+#: Safety factor on the estimated duration: jobs of equal size differ by a third (standard deviation).
 _CAUTION = 1.5
-#: Seconds that are not worth a look at the queue: no job is started, planned and ended in fewer.
+#: Minimum gap in seconds that is worth backfilling: no job starts, plans and ends in less time.
 _LEAST_GAP = 20.0
 
 
 @dataclass(frozen=True)
 class Holding:
-    """What a running job has of a machine, and until when.
+    """Capacity that a running job occupies, and its expected end.
 
     Attributes:
-        grant: what it has.
-        until: when it is expected to end, by the store's clock; None where it does not tell.
-        pace: seconds that it takes over those estimated; None where it does not tell.
+        grant: Capacity that the job occupies.
+        until: Expected end by the store's clock; None if unknown.
+        pace: Actual duration divided by the estimated one; None if unknown.
     """
 
     grant: Grant
@@ -40,10 +40,10 @@ class Holding:
 
 
 class Backfill:
-    """Decides which jobs may go before the one that room is kept for.
+    """Selection of the jobs that may run before the one that capacity is reserved for.
 
     Args:
-        room: of the machine.
+        room: Capacity of the machine.
     """
 
     def __init__(self, room: Room) -> None:
@@ -52,15 +52,16 @@ class Backfill:
         self._kept, self._begins = "", -math.inf
 
     def learn(self, held: Sequence[Holding]) -> None:
-        """Take in how fast jobs are on this machine."""
+        """Update the pace of jobs on this machine."""
         if paces := [each.pace for each in held if each.pace is not None]:
             self._pace = median(paces)
 
     def is_near(self, job: JobRow, held: Sequence[Holding], waiting: int, now: float) -> bool:
-        """Whether room is to be kept here for a job that other machines might have room for sooner.
+        """Return whether to reserve capacity here for a job that may fit on another machine sooner.
 
-        Nobody knows what the others foresee. So a job has to have waited for as long as it would have to wait here: the
-        machine that has room first is the first to keep it.
+        Dispatchers do not know each other's forecasts. Capacity is therefore reserved only once the job has already
+        waited for at least as long as it would still have to wait here. The machine with the shortest wait is thus the
+        first to reserve it.
         """
         begins = self._foreseen(job, held, waiting)
         return job.id == self._kept or begins is None or begins - now <= now - job.queued_at
@@ -68,15 +69,15 @@ class Backfill:
     def before(
         self, kept: JobRow, held: Sequence[Holding], waiting: int, now: float
     ) -> Callable[[JobRow], Grant | None] | None:
-        """What a job gets that would have ended before the `kept` one can begin; None where none would.
+        """Return a function that grants capacity to jobs expected to end before `kept` can start; None if no job would.
 
-        The moment that was foreseen first counts and never a later one, so that the kept job waits no longer than it
-        would have but for jobs that take much more than their estimate.
+        The earliest forecast of that start is used, never a later one. The `kept` job is thus delayed only by jobs that
+        exceed their estimates by far.
 
         Args:
-            held: what running jobs have.
-            waiting: jobs that this machine could start now.
-            now: by the store's clock.
+            held: Capacity of running jobs.
+            waiting: Number of jobs that this machine could start now.
+            now: Current time by the store's clock.
         """
         begins, pace = self._foreseen(kept, held, waiting), self._pace
         if pace is None or begins is None:
@@ -97,7 +98,10 @@ class Backfill:
         return grant
 
     def _foreseen(self, kept: JobRow, held: Sequence[Holding], waiting: int) -> float | None:
-        """When enough running jobs have ended for the kept one; those that do not tell may end at any time."""
+        """Return when enough running jobs will have ended for the kept one; None if unknown.
+
+        Jobs with unknown ends count as the first to end.
+        """
         by_end = sorted(held, key=_end)
         for number, each in enumerate(by_end, 1):
             left = [later.grant for later in by_end[number:]]

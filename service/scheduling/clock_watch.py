@@ -1,4 +1,4 @@
-"""What a dispatcher believes of times that other machines have written, by its own monotonic clock."""
+"""Plausibility checks of times written by other machines, based on the dispatcher's monotonic clock."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from service.store import Store
 from service.store.leases import RUN_OUT
 from service.store.tables import JobRow
 
-#: Seconds that clocks of machines which work together may differ.
+#: Tolerated difference between the clocks of cooperating machines, in seconds.
 _TOLERANCE = 60.0
 
 _log = logging.getLogger(__name__)
 
 
 class ClockWatch:
-    """A dispatcher's doubts about clocks.
+    """Checks of other machines' clocks.
 
-    On PostgreSQL all times are those of the server. On SQLite each process writes those of its own machine, and one of
-    them may be wrong. So a lease that has run out by this clock is not lost yet: it is once it has not been renewed for
-    another lease's time of the monotonic clock, in which its holder would have renewed it several times. And nothing is
-    deleted while another dispatcher sends heartbeats whose times do not agree with this clock.
+    On PostgreSQL all times come from the server. On SQLite each process writes times of its own machine, whose clock
+    may be wrong. A lease that has expired by this machine's clock is therefore not lost yet. It is lost if it is not
+    renewed for another lease duration of the monotonic clock, in which its holder would have renewed it several times.
+    Nothing is deleted while another dispatcher sends heartbeats whose times disagree with this machine's clock.
 
     Args:
-        lease_seconds: Seconds that a lease holds.
+        lease_seconds: Duration of a lease.
         monotonic: Monotonic clock.
     """
 
@@ -36,7 +36,7 @@ class ClockWatch:
         self._heard_at: float | None = None
 
     def is_lost(self, job: JobRow) -> bool:
-        """Return whether a job whose lease has run out, by the database's times, may be taken over."""
+        """Return whether a job whose lease has expired by the database's times may be taken over."""
         expires, database = job.lease_expires_at, self._store.database
         if expires is None or expires == RUN_OUT:
             return True
@@ -52,11 +52,11 @@ class ClockWatch:
         return False
 
     def confirm(self) -> bool:
-        """Move the expiry time on if no live dispatcher contradicts this clock; returns whether things may be deleted.
+        """Advance the expiry time unless a live dispatcher contradicts this clock; return whether deleting is allowed.
 
-        A heartbeat that has come since the last call was sent in the time since then, this dispatcher's own included:
-        so a clock that has just been changed is noticed as well. Heartbeats that have not changed are of dispatchers
-        that may be dead, and say nothing.
+        A new heartbeat was sent since the last call. That includes the heartbeats of this dispatcher itself, so a clock
+        that was just changed is detected too. Heartbeats that have not changed may come from dead dispatchers and are
+        ignored.
         """
         before, now = self._heard_at, self._monotonic()
         since = 0.0 if before is None else now - before

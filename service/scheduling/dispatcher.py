@@ -1,8 +1,8 @@
-"""The dispatcher: leases jobs from the store and runs them, each attempt in a process of its own.
+"""Dispatcher: leases jobs from the store and runs each attempt in a process of its own.
 
-`python -m service.scheduling.dispatcher` is one. Any number of them may work on one store; who dies loses its leases.
-Ray is started by the process of an attempt that has more than one rank, on that process' main thread, and ends with it:
-so neither a job nor Ray can take the dispatcher along.
+`python -m service.scheduling.dispatcher` starts one. Any number of dispatchers may share a store; a dispatcher that
+dies loses its leases. The process of an attempt with more than one rank starts Ray on its main thread, and Ray ends
+with that process. Neither a job nor Ray can therefore crash the dispatcher.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ from service.store.states import JobStatus
 from service.store.tables import JobRow
 from service.weights import check_weights
 
-#: Seconds between two looks for what has expired or was left behind.
+#: Interval between searches for expired and leftover data, in seconds.
 _HOUSEKEEPING_SECONDS = 60.0
-#: And for what nothing refers to.
+#: Interval between searches for files that nothing refers to, in seconds.
 _STRAYS_SECONDS = 3600.0
-#: Seconds that housekeeping may take to end with the dispatcher.
+#: Time that housekeeping has to stop with the dispatcher, in seconds.
 _LAST_SECONDS = 5.0
-#: Jobs that are swept at a time.
+#: Maximum number of jobs swept per round.
 _SWEEPS = 20
-#: Of a lease's time that passes before it is renewed, and before jobs are ended whose lease could not be: others may
-#: have them when it has run out, and the clocks of machines differ.
+#: Fractions of a lease's duration: after the first it is renewed, after the second a job is killed if renewing has
+#: failed. The second is below 1 because others may take an expired lease and clocks differ.
 _RENEW_SHARE, _ABANDON_SHARE = 1 / 3, 3 / 4
 
 _log = logging.getLogger(__name__)
 
 
 class Dispatcher:
-    """Runs jobs until it is told to stop, side by side as long as there is room (`service.scheduling.packing`).
+    """Dispatcher that runs jobs concurrently within the machine's capacity (`service.scheduling.packing`).
 
     Args:
-        machine: what there is to run them on; None finds out.
+        machine: Machine to run jobs on; None detects it.
     """
 
     def __init__(self, settings: ServiceSettings, store: Store, machine: Machine | None = None) -> None:
@@ -79,11 +79,11 @@ class Dispatcher:
         self._deliverer = Deliverer(settings, store)
 
     def stop(self) -> None:
-        """Let `run` end: running jobs save their state and go back into the queue."""
+        """Make `run` return: running jobs save their state and return to the queue."""
         self._stop.set()
 
     def run(self) -> None:
-        """Work until `stop`."""
+        """Run jobs until `stop`."""
         self._take_over_from_the_dead()
         self._work.mkdir(parents=True, exist_ok=True)
         self._deliverer.start()
@@ -94,14 +94,14 @@ class Dispatcher:
         while not self._stop.is_set():
             try:
                 self._work_once()
-            except (DatabaseUnavailableError, OSError):  # the database is away or locked; leases run out if it stays so
+            except (DatabaseUnavailableError, OSError):  # the database is down or locked; if it stays so, leases expire
                 _log.exception("the store cannot be reached")
                 self._stop.wait(2.0)
             self._stop.wait(self._settings.poll_seconds)
         self._shut_down()
 
     def _take_over_from_the_dead(self) -> None:
-        """Of dispatchers that ran on this machine and are gone, nothing needs to be waited for."""
+        """Expire the leases of dead dispatchers of this machine at once, and delete their work folders."""
         known = {row.name for row in self._store.operations.dispatchers()}
         for name in sorted(known.union(self._store.leases.holders())):
             if is_dead(name):
@@ -126,25 +126,25 @@ class Dispatcher:
         while not self._stop.is_set() and (found := self.next_job(self._held())) is not None:
             self._start_attempt(*found)
 
-    # --- room ------------------------------------------------------------------------------------------------------
+    # --- capacity --------------------------------------------------------------------------------------------------
 
     def _held(self) -> list[Holding]:
         return [attempt.holding for attempt in self._running.values()]
 
     def next_job(self, held: Sequence[Holding]) -> tuple[Lease, Grant] | None:
-        """Lease the next job of the queue, and decide what it gets; None where there is none, or no room for it.
+        """Lease the next job of the queue that fits; None if there is none.
 
         Args:
-            held: what running jobs have.
+            held: Capacity of running jobs.
         """
         self._backfill.learn(held)
         grants = [each.grant for each in held]
-        if self._room.free(grants) < 1:  # nothing is asked, and no row is locked that others want
+        if self._room.free(grants) < 1:  # skips the query, which would lock rows that other dispatchers want
             return None
         dispatchers = max(1, self._store.operations.alive())
         if not (waiting := self._store.leases.waiting(self._room.size * dispatchers)):
             return None
-        share = -(-waiting // dispatchers)  # others take their part of the queue
+        share = -(-waiting // dispatchers)  # other dispatchers take their portion of the queue
         grant: Grant | None = None
 
         def fits(job: JobRow) -> bool:
@@ -181,7 +181,7 @@ class Dispatcher:
     # --- leases ----------------------------------------------------------------------------------------------------
 
     def _announce_alive(self) -> None:
-        """Let everybody know that this dispatcher is alive."""
+        """Send a heartbeat if it is due."""
         if time.monotonic() - self._announced_at >= _RENEW_SHARE * self._settings.lease_seconds:
             self._store.operations.beat(
                 self.name, self._room.size, self._room.free([each.grant for each in self._held()])
@@ -189,8 +189,8 @@ class Dispatcher:
             self._announced_at = time.monotonic()
 
     def _renew_leases(self) -> None:
-        """Hold the leases of all running attempts, and see which of their jobs are to be canceled or are lost."""
-        now = time.monotonic()  # a lease counts from before the request for it
+        """Renew the leases of all running attempts, and handle jobs that are canceled or lost."""
+        now = time.monotonic()  # a lease counts from before the request
         if not self._running:
             self._renewed_at = now
             return
@@ -208,8 +208,10 @@ class Dispatcher:
                 attempt.cancel()
 
     def _abandon_late(self) -> None:
-        """End jobs whose leases could not be renewed, before these run out: in a thread of its own, since the one that
-        renews them may wait for a database that does not answer.
+        """Abandon jobs whose leases could not be renewed, before the leases expire.
+
+        This runs in a thread of its own, because the thread that renews leases may wait for a database that does not
+        respond.
         """
         limit = _ABANDON_SHARE * self._settings.lease_seconds
         while not self._ended.wait(_RENEW_SHARE * (self._settings.lease_seconds - limit)):
@@ -238,7 +240,7 @@ class Dispatcher:
     # --- housekeeping ----------------------------------------------------------------------------------------------
 
     def _keep_house_now_and_then(self) -> None:
-        """In a thread of its own: leases are renewed meanwhile, however slow the store of files is."""
+        """Run housekeeping in its own thread, so that leases are renewed however slow the file store is."""
         while not self._ended.is_set():
             self._keep_house()
             self._ended.wait(_HOUSEKEEPING_SECONDS)
@@ -255,7 +257,7 @@ class Dispatcher:
             if time.monotonic() - self._strays_at > _STRAYS_SECONDS:
                 self._strays_at = time.monotonic()
                 remove_strays(self._store, self._artifacts)
-        except Exception:  # stores of files raise what they like; running jobs are not to suffer
+        except Exception:  # file stores raise arbitrary errors; running jobs must not suffer
             _log.exception("not everything that is no longer needed could be removed; this is tried again")
 
 

@@ -1,4 +1,4 @@
-"""How an attempt has ended, decided from what its process told, how it exited, and what was wanted of it. Pure."""
+"""Pure functions that decide how an attempt ended: from its process' messages, its exit code, and external requests."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
 
 
 class Wish(StrEnum):
-    """What somebody wants of an attempt that would go on by itself."""
+    """External request to end a running attempt."""
 
-    #: Its user wants the job to end.
+    #: The user has canceled the job.
     CANCEL = "cancel"
-    #: Its dispatcher is to end: the job's state is saved, and the job given back.
+    #: The dispatcher is shutting down: save the job's state and return the job to the queue.
     RELEASE = "release"
     #: Another dispatcher has the job: nothing more may be written.
     ABANDON = "abandon"
 
 
-#: What a job's user is told where a machine, a network or the store of files has failed.
+#: Error shown to the job's user if a machine, a network or the file store has failed.
 OUTAGE = {
     "code": InfrastructureError.code,
     "message": "A machine of the service, its network or its store of files has failed. The job is tried again.",
 }
-#: What the system says when the fault is a machine's: a full, broken or read-only disk, a file system that is away.
+#: Error numbers of machine faults: a full, broken or read-only disk, or an unreachable file system.
 _MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.ENOTCONN, errno.ENODEV)
 
 
 def is_outage(error: BaseException) -> bool:
-    """Whether an error is that of a machine, a network or a store: nothing is wrong with the job.
+    """Return whether an error is the fault of a machine, a network or a store rather than of the job.
 
-    What cannot be written is, since jobs write to folders of the service; so are networks that are not installed, which
-    nothing but an operator can change.
+    Output errors count, because jobs write to folders of the service. Missing network weights count too, because only
+    an operator can install them.
     """
     if isinstance(error, OSError):
         return error.errno in _MACHINE_ERRORS
@@ -46,13 +46,13 @@ def is_outage(error: BaseException) -> bool:
 
 @dataclass(frozen=True)
 class Ending:
-    """How an attempt has ended.
+    """End of an attempt.
 
     Attributes:
-        outcome: for its record; SUCCEEDED, CANCELED, RELEASED or FAILED.
-        error: of a failure: `code`, `message` and what else there is to know.
-        permanent: another attempt would fail the same way.
-        detail: of a failure, for the operator alone.
+        outcome: Outcome for the record: SUCCEEDED, CANCELED, RELEASED or FAILED.
+        error: Error of a failure: `code`, `message` and further members.
+        permanent: Whether another attempt would fail in the same way.
+        detail: Details of a failure for the operator only.
     """
 
     outcome: AttemptOutcome
@@ -70,16 +70,16 @@ def attempt_ending(
     has_result: bool,
     cluster: bool = False,
 ) -> Ending:
-    """How an attempt has ended whose process is gone.
+    """Return how an attempt ended whose process has exited.
 
     Args:
-        wish: CANCEL or RELEASE where somebody wanted the end; it may have come too late.
-        last: the process' last word: `done`, `failed` or `interrupted`; None where it had none.
-        exit_code: of the process; negative for the signal that ended it.
-        log_tail: what its log ends with; None where there is no log.
-        has_result: whether the stylized scene is there.
-        cluster: the process only watches over ranks on a Ray cluster. Ray ends it, with a code and without a word, when
-            the cluster's head or the machine's own node dies: that is an outage.
+        wish: CANCEL or RELEASE if the end was requested, possibly too late; None otherwise.
+        last: Final message of the process, `done`, `failed` or `interrupted`; None if it sent none.
+        exit_code: Exit code of the process; negative for the signal that killed it.
+        log_tail: End of its log; None if there is no log.
+        has_result: Whether the stylized scene exists.
+        cluster: Whether the process only supervises ranks on a Ray cluster. Ray terminates it with an exit code and
+            without a message if the cluster's head or the machine's own node dies; that counts as an outage.
     """
     if last is not None and last["kind"] == "done":
         if has_result:
@@ -100,7 +100,7 @@ def attempt_ending(
 
 
 def _crash_error(exit_code: int, log_tail: str | None) -> dict[str, Any]:
-    """What to say of a process that ended without a word."""
+    """Return the error of a process that ended without a final message."""
     if exit_code == -signal.SIGKILL:
         message = "The process that ran the job was killed; perhaps the machine had run out of memory."
     elif exit_code < 0:

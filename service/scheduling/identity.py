@@ -1,4 +1,4 @@
-"""Names of dispatchers, by which others tell whether one still runs."""
+"""Names of dispatchers, which reveal to other processes whether a dispatcher still runs."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from worker.processes import ProcessId, home
 
 
 def own_name() -> str:
-    """Names this process for good: where it runs, its number there, and when it started."""
+    """Return the unique name of this process: its host, its process id, and its start time."""
     own = ProcessId.of_this()
     return f"{socket.gethostname()[:40]}-{_home_digest()}-{own.number}-{int(own.started)}"
 
 
 def is_dead(name: str) -> bool:
-    """Whether a dispatcher of that name ran where this process can see it, and is gone."""
+    """Return whether the dispatcher ran in this process' process namespace and has exited."""
     parts = name.rsplit("-", 3)
     if not is_of_this_machine(name) or not (parts[2] + parts[3]).isdigit():
         return False
@@ -23,7 +23,7 @@ def is_dead(name: str) -> bool:
 
 
 def is_of_this_machine(name: str) -> bool:
-    """Whether a dispatcher of that name runs, or ran, where this process can see it."""
+    """Return whether the dispatcher runs or ran in this process' process namespace."""
     parts = name.rsplit("-", 3)
     return len(parts) == 4 and parts[1] == _home_digest()
 

@@ -1,8 +1,8 @@
-"""How many GPUs a job is worth, from what its record tells: before anybody has read its files or planned it.
+"""Estimate of how many GPUs a job is worth from its record, before its files are read or planned.
 
-The plan of a job, made with measured times, has the last word, and GPUs that it leaves out go back. Until then the job
-holds what it was given, so that one of a few seconds should not be given eight. Everything here is an estimate for one
-H200, made from `benchmarks.forecast`; where a machine is slower, all jobs are worth more than this says.
+The job's plan, made with measured times, has the final say, and GPUs that it does not use are returned. Until then the
+job holds what it was given, so a job of a few seconds should not be given eight GPUs. All estimates are for one H200
+and come from `benchmarks.forecast`; on slower machines all jobs are worth more GPUs than estimated here.
 """
 
 from __future__ import annotations
@@ -15,33 +15,35 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.settings import Settings, make_settings
 from worker.ranks.host_memory import GAUSSIAN_BYTES, scene_bytes
 
-#: Bytes of a pixel of a photo as cameras save them (JPEG, 3 bits).
+#: Bytes per pixel of a photo as cameras save it (JPEG, 3 bits).
 _PHOTO_BYTES = 0.35
-#: Longer side of views of which nothing is known, and height to width of those of which only that is known.
+#: Default longer side of views, and default ratio of height to width.
 _LONGER_SIDE, _ASPECT = 1600, 0.625
-#: Seconds of a step: a pixel through the network forth and back by precision, a Gaussian, launches of the host.
+#: Seconds per step: per pixel forward and backward through the network by precision, per Gaussian, and per step for
+#: launches from the host.
 _PIXEL_SECONDS = {"float32": 5.5e-8, "tf32": 1.6e-8, "bfloat16": 9e-9}
 _GAUSSIAN_SECONDS, _FIXED_SECONDS = 2e-9, 2.1e-3
-#: A step of phase 1, on the coarsest scale alone: what it takes of a pixel of the whole view.
+#: Cost of a pixel of the full view in phase 1, which optimizes only the coarsest scale, relative to phase 2.
 _COARSE_SHARE = 0.1
-#: What ranks tell each other: bytes a second that one sends, seconds of a message from one to the next.
+#: Communication between ranks: bytes per second that one rank sends, and seconds of latency per message.
 _LINK_BYTES, _LINK_SECONDS = 3e11, 1e-5
-#: Of what a GPU could do, the least that it does where it is worth having; and seconds of steps that are not worth
-#: dividing further: a job takes as long to start. Cautious on either side, since the plan gives back what is too much.
+#: Minimum efficiency of a GPU that is worth adding, and minimum seconds of steps per GPU: starting a job takes as long.
+#: Both err toward too many GPUs, since the plan returns superfluous ones.
 _LEAST_SHARE, _LEAST_SECONDS = 0.6, 10.0
-#: Seconds before a job's first step: process, CUDA, network and plan; bytes of its files a second from the store.
+#: Seconds before a job's first step (process, CUDA, network and plan), and bytes per second at which its files are
+#: staged.
 _START_SECONDS, _STAGING_BYTES = 18.0, 1e9
 
 
 @dataclass(frozen=True)
 class JobSize:
-    """What a job will have to do, as far as its record tells.
+    """Amount of work of a job, estimated from its record.
 
     Attributes:
-        gaussians: of the scene.
-        pixels: of a view.
-        steps_coarse, steps_sos: of its phases; every view of a step counts.
-        precision: of the feature network.
+        gaussians: Number of Gaussians of the scene.
+        pixels: Number of pixels per view.
+        steps_coarse, steps_sos: Steps of the two phases, times views per step.
+        precision: Precision of the feature network.
     """
 
     gaussians: float
@@ -51,7 +53,7 @@ class JobSize:
     precision: str = "float32"
 
     def seconds(self, gpus: int = 1) -> float:
-        """Of all steps, on so many GPUs."""
+        """Return the duration of all steps on this number of GPUs, in seconds."""
         raster = _GAUSSIAN_SECONDS * self.gaussians
         network = _PIXEL_SECONDS[self.precision] * self.pixels
         beside = _FIXED_SECONDS + self._talking(gpus)
@@ -59,16 +61,14 @@ class JobSize:
         return self.steps_coarse * coarse + self.steps_sos * ((raster + network) / gpus + beside)
 
     def _talking(self, gpus: int) -> float:
-        """Seconds of a step in which GPUs wait for each other: the image there and its gradient back, the colors'
-        gradient, statistics.
-        """
+        """Return the communication time per step in seconds: images, gradients of images and colors, and statistics."""
         if gpus == 1:
             return 0.0
         moved = 2 * 12 * (self.pixels + self.gaussians)
         return 6 * (gpus - 1) * _LINK_SECONDS + moved / _LINK_BYTES
 
     def gpus(self, most: int) -> int:
-        """How many it is worth having: at least one, at most so many."""
+        """Return the number of GPUs that the job is worth, between 1 and `most`."""
         alone, found = self.seconds(), 1
         for gpus in range(2, most + 1):
             seconds = self.seconds(gpus)
@@ -79,10 +79,10 @@ class JobSize:
 
 
 def estimated_size(parameters: Mapping[str, Any], inputs: Sequence[Mapping[str, Any]]) -> JobSize:
-    """The size of a job by its record.
+    """Return the size of a job, estimated from its record.
 
     Args:
-        parameters: as they were stored.
+        parameters: Stored parameters.
         inputs: `role`, `name` and `size` of each file.
     """
     settings = _settings(parameters)
@@ -98,7 +98,7 @@ def estimated_size(parameters: Mapping[str, Any], inputs: Sequence[Mapping[str, 
 
 
 def estimated_seconds(parameters: Mapping[str, Any], inputs: Sequence[Mapping[str, Any]], gpus: int = 1) -> float:
-    """From a job's start to its end, by its record; as `estimated_size` otherwise."""
+    """Return the duration of a job from start to end in seconds, estimated from its record as by `estimated_size`."""
     staging = float(sum(entry["size"] for entry in inputs)) / _STAGING_BYTES
     return _START_SECONDS + staging + estimated_size(parameters, inputs).seconds(max(gpus, 1))
 
@@ -109,7 +109,7 @@ def _settings(parameters: Mapping[str, Any]) -> Settings:
     preset = parameters.get("preset", "standard")
     try:
         return make_settings(preset, **given)
-    except (SettingsError, TypeError):  # stored by another version: the attempt will say what is wrong
+    except (SettingsError, TypeError):  # stored by another version: the attempt reports the fault
         return make_settings()
 
 

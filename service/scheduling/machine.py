@@ -1,4 +1,4 @@
-"""What there is to run jobs on, found without importing PyTorch or Ray."""
+"""Detection of the hardware for jobs, without importing PyTorch or Ray."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from service.settings import ServiceSettings
 
 @dataclass(frozen=True)
 class Machine:
-    """What a dispatcher has to give to jobs.
+    """Hardware that a dispatcher assigns to jobs.
 
     Attributes:
-        gpus: names of GPUs, as CUDA_VISIBLE_DEVICES takes them; of a cluster, just numbers.
-        cores: of the processor.
-        memory: bytes, all of it.
-        cluster: jobs run on a Ray cluster, which has the GPUs and gives them out itself.
+        gpus: Names of GPUs for CUDA_VISIBLE_DEVICES; consecutive numbers on a cluster.
+        cores: Number of CPU cores.
+        memory: Total memory in bytes.
+        cluster: Whether jobs run on a Ray cluster, which assigns its GPUs itself.
     """
 
     gpus: tuple[str, ...]
@@ -29,14 +29,14 @@ class Machine:
 
     @staticmethod
     def find(settings: ServiceSettings) -> Machine:
-        """This machine, or the part of the cluster at RAY_ADDRESS that the settings name."""
+        """Return this machine, or the portion of the cluster at RAY_ADDRESS that the settings name."""
         cluster = bool(os.environ.get("RAY_ADDRESS"))
         gpus = tuple(str(number) for number in range(settings.cluster_gpus)) if cluster else _own_gpus()
         return Machine(gpus, os.cpu_count() or 1, psutil.virtual_memory().total, cluster)
 
 
 def _own_gpus() -> tuple[str, ...]:
-    """NVIDIA GPUs that this process may use; none where there is no driver."""
+    """Return the NVIDIA GPUs that this process may use; none without a driver."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
         return tuple(part.strip() for part in visible.split(",") if part.strip() not in ("", "-1"))

@@ -1,4 +1,4 @@
-"""What the process of an attempt tells its dispatcher, as lines of JSON."""
+"""Messages from the process of an attempt to its dispatcher, as lines of JSON."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, Literal, TypedDict
 
 
 class Message(TypedDict, total=False):
-    """What the process tells: `kind` and what belongs to it."""
+    """Message with its `kind` and the fields of that kind."""
 
     kind: Literal["stage", "prepared", "left-out", "stored", "progress", "preview", "done", "interrupted", "failed"]
     stage: str

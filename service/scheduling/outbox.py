@@ -1,4 +1,4 @@
-"""What of the folder that an attempt writes to goes into the store of files, as it appears there."""
+"""Upload of files from the folder of an attempt to the file store as they appear."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.files.names import CHECKPOINT, RESULT
 from service.store.leases import Published
 
 _STEM = Path(RESULT).stem
-#: What there is once a job has ended, by the endings of the files' names.
+#: Result files of an ended job by artifact name.
 _RESULTS = {
     "report.json": f"{_STEM}.report.json",
     "report.html": f"{_STEM}.report.html",
@@ -23,15 +23,15 @@ _RESULTS = {
     "loss.png": f"{_STEM}.loss.png",
     "colors.f16": f"{_STEM}.colors.f16",
 }
-#: Names of files that become visible with the job's end, and not before.
+#: Names of files that become visible only when the job ends.
 RESULTS = frozenset((RESULT, *_RESULTS))
 
 
 class Outbox:
-    """Puts files under names of an attempt's epoch into the store; rows make them visible later.
+    """Uploader that stores files under an attempt's epoch; rows make them visible later.
 
     Args:
-        out: the folder that the attempt writes to.
+        out: Folder that the attempt writes to.
     """
 
     def __init__(self, job_id: str, epoch: int, out: Path, artifacts: Artifacts) -> None:
@@ -40,7 +40,7 @@ class Outbox:
         self._put: dict[str, tuple[int, int]] = {}
 
     def unfinished(self) -> dict[str, Path]:
-        """What may be looked at while the job runs, whether it is there or not."""
+        """Return the files that are visible while the job runs, whether they exist or not."""
         files = {
             "plan.json": self._out / f"{_STEM}.plan.json",
             "views.jpg": self._out / f"{_STEM}.views.jpg",
@@ -52,12 +52,12 @@ class Outbox:
         return files
 
     def results(self) -> dict[str, Path]:
-        """What a job that has ended has made."""
+        """Return the result files of an ended job."""
         files = {RESULT: self._out / RESULT} | {name: self._out / file for name, file in _RESULTS.items()}
         return {name: path for name, path in files.items() if path.is_file()}
 
     def put(self, files: Mapping[str, Path]) -> tuple[list[Published], StoreError | None]:
-        """Put those files that are new or have changed; returns them, and what kept the others from being put."""
+        """Upload new and changed files; return them, and the error that stopped the upload (None for no error)."""
         done = []
         for name, path in files.items():
             with contextlib.suppress(FileNotFoundError):
@@ -74,16 +74,16 @@ class Outbox:
 
     def _put_file(self, name: str, path: Path) -> Published:
         step = _saved_step(path) if name == CHECKPOINT else None
-        # a later checkpoint takes the name of this one, and leaves its bytes; nobody writes to results any more
+        # a later checkpoint replaces the file instead of overwriting its bytes, and results are never rewritten
         final = name == CHECKPOINT or name in RESULTS
         return replace(self._artifacts.put(self._job_id, self._epoch, name, path, final=final), step=step)
 
 
 def _saved_step(checkpoint: Path) -> int | None:
-    """The step that a checkpoint was saved at; None for one that is damaged, which the next attempt will find out.
+    """Return the step of a checkpoint; None if it is damaged, which the next attempt detects.
 
     Raises:
-        FileNotFoundError: it has just been removed.
+        FileNotFoundError: If the checkpoint has just been removed.
     """
     try:
         with safe_open(checkpoint, "np") as file:

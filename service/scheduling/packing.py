@@ -1,13 +1,14 @@
-"""How jobs share a machine: what the next one gets of it, or that it has to wait. Decides, and does nothing.
+"""Packing of jobs on a machine: pure decisions about what the next job gets, or whether it has to wait.
 
-On GPUs a job has its GPUs to itself. One that names no number of `workers` is offered its part of those that are free,
-all of them where no other job waits, one where many do, but never more than a job of its size is worth
-(`service.scheduling.job_size`). The plan, made with measured times, then takes as many as make the job faster, and the
-rest are given back (see `service.scheduling.running`). Memory of the machine is counted too: a job waits where those
-that run leave too little for its scene. On a Ray cluster Ray counts it, machine by machine (`worker.ranks.placement`).
+Jobs do not share GPUs. A job that does not specify `workers` is offered its portion of the free ones: all of them if no
+other job waits, one if many do, but never more than a job of its size is worth (`service.scheduling.job_size`). The
+plan, made with measured times, then uses as many as make the job faster, and the rest are returned
+(`service.scheduling.running`). The machine's memory is counted too: a job waits if the running ones leave too little
+for its scene. On a Ray cluster, Ray counts it per machine (`worker.ranks.placement`).
 
-Without GPUs, places stand for parts of the processor and of the memory. There is one, unless the operator wants several
-jobs side by side: one job uses all cores well. A job that needs more memory than a place has takes several.
+Without GPUs, slots stand for fractions of the CPU and of the memory. There is one slot unless the operator wants
+several concurrent jobs, because one job uses all cores well. A job that needs more memory than one slot has takes
+several.
 """
 
 from __future__ import annotations
@@ -21,27 +22,27 @@ from service.scheduling.machine import Machine
 from service.store.tables import JobRow
 from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 
-#: Of all memory, what jobs side by side plan with together at most, and what one of them does: as a job that is alone
-#: plans (`sgsst_core.budget`), so that it rounds the same beside another one.
+#: Fractions of the machine's memory: maximum planned by all concurrent jobs together, and by one of them. The latter
+#: equals what a job on its own plans with (`sgsst_core.budget`), so that it rounds in the same way.
 _MEMORY_SHARE, _JOB_SHARE = 0.8, 0.4
-#: What a job needs at least beside its scene, and how often the bytes of the scene: as it was read, as it is
-#: rendered, and twice for what the views and the optimizer keep of each Gaussian. A job of 4 million Gaussians (1 GB)
-#: had 5.8 GB at its peak, one of 50,000 had 0.95 GB.
+#: Minimum memory of a job besides its scene, and number of copies of the scene: as read, as rendered, and twice for
+#: what the views and the optimizer store per Gaussian. Measured peaks: 5.8 GB for 4 million Gaussians (1 GB), 0.95 GB
+#: for 50,000.
 _LEAST_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4
 
 
 @dataclass(frozen=True)
 class Grant:
-    """What a job gets.
+    """Capacity that a job gets.
 
     Attributes:
-        ranks: at most; the plan may do with fewer.
-        gpus: their names; empty where there are none.
-        places: of those for jobs side by side.
-        threads: of the processor; None for all.
-        memory: bytes to plan with; None for what a job that is alone takes.
-        scene: bytes of its scene, once it is read.
+        ranks: Maximum number of ranks; the plan may use fewer.
+        gpus: Names of GPUs; empty without GPUs.
+        places: Number of slots.
+        threads: Number of CPU threads; None for all.
+        memory: Memory to plan with in bytes; None for the default of a job on its own.
+        scene: Size of its scene in memory in bytes.
     """
 
     ranks: int
@@ -58,11 +59,11 @@ class Grant:
 
 
 class Room:
-    """A machine and what is free of it.
+    """Capacity of a machine.
 
     Args:
-        machine: all that there is.
-        parallel_jobs: side by side at most; None for one on each GPU, or one.
+        machine: Total hardware.
+        parallel_jobs: Maximum number of concurrent jobs; None for one per GPU, or one without GPUs.
     """
 
     def __init__(self, machine: Machine, parallel_jobs: int | None) -> None:
@@ -71,20 +72,20 @@ class Room:
 
     @property
     def size(self) -> int:
-        """GPUs; places where there are none."""
+        """Number of GPUs, or of slots without GPUs."""
         return len(self._machine.gpus) or self._places
 
     def free(self, held: Iterable[Grant]) -> int:
-        """What is left of `size`."""
+        """Return the free portion of `size`."""
         held = list(held)
         return len(self._free_gpus(held)) if self._machine.gpus else self._free_places(held)
 
     def grant(self, job: JobRow, held: Iterable[Grant], waiting: int) -> Grant | None:
-        """What a job gets beside those that hold something; None where it has to wait.
+        """Return what a job gets besides the running ones; None if it has to wait.
 
         Args:
-            held: what running jobs have.
-            waiting: jobs that this machine could start now, this one included.
+            held: Capacity of running jobs.
+            waiting: Number of jobs that this machine could start now, including this one.
         """
         held = list(held)
         places = self._free_places(held)
@@ -112,7 +113,7 @@ class Room:
         if ranks > len(free):
             return None
         grant = Grant(ranks, tuple(free[:ranks]), scene=_scene_bytes(job))
-        if not held or self._machine.cluster:  # one that is alone may try
+        if not held or self._machine.cluster:  # a job on its own may try
             return grant
         together = sum(each.beside_gpus for each in (grant, *held))
         return grant if together <= _MEMORY_SHARE * self._machine.memory else None
@@ -132,7 +133,7 @@ class Room:
 
 
 def _scene_bytes(job: JobRow) -> int:
-    """Of its scene, once it is read and refined."""
+    """Return the size of a job's scene in bytes, once it is read and refined."""
     files = [entry for entry in job.inputs if entry["role"] == "scene"]
     growth = job.parameters.get("refine")
     size = sum(scene_bytes(str(entry.get("name", "")), entry["size"]) for entry in files)
@@ -140,8 +141,9 @@ def _scene_bytes(job: JobRow) -> int:
 
 
 def _asked(job: JobRow, name: str) -> int:
-    """A number that a job was told; 0 without one. What is none was stored by an earlier version: the attempt refuses
-    it, and needs no room for that.
+    """Return an integer parameter of a job; 0 if it is missing.
+
+    Other types were stored by an earlier version. The attempt rejects them, so they need no capacity.
     """
     value = job.parameters.get(name)
     return max(value, 0) if isinstance(value, int) else 0

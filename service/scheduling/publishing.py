@@ -1,4 +1,4 @@
-"""What attempts have made becomes visible: while they run, and the results at their end. By the dispatcher alone."""
+"""Publication of an attempt's files by the dispatcher: some while the attempt runs, the results at its end."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from service.scheduling.outbox import RESULTS, Outbox
 from service.store import Store
 from service.store.leases import Lease, Published
 
-#: The end of a log that the error of a crash carries.
+#: Length of the log's end in the error of a crash, in bytes.
 _LOG_TAIL = 2000
-#: Seconds between two tries to put what the store of files did not take, and for results until the attempt is given up:
-#: a store that restarts must not cost a job that has just ended.
+#: Delay in seconds before files that the store rejected are uploaded again, and time after which the attempt is given
+#: up if results cannot be stored: a restart of the store must not lose a job that has just ended.
 _AGAIN_SECONDS, PATIENCE_SECONDS = 5.0, 600.0
 
 _log = logging.getLogger(__name__)
 
 
 class Publisher:
-    """Puts the files of one attempt to their places, and makes them visible under its lease.
+    """Publisher of one attempt's files, which makes them visible under its lease.
 
     Args:
-        folder: of the attempt.
-        log_seconds: between two copies of a log that grows.
+        folder: Folder of the attempt.
+        log_seconds: Interval between copies of a growing log.
     """
 
     def __init__(self, lease: Lease, folder: Path, store: Store, artifacts: Artifacts, log_seconds: float) -> None:
@@ -41,15 +41,15 @@ class Publisher:
         self._log_copied_at = self._refused_at = float("-inf")
         self._results: dict[str, Published] = {}
 
-    # --- while it runs ---------------------------------------------------------------------------------------------
+    # --- during the attempt ---------------------------------------------------------------------------------------
 
     def publish_unfinished(self, *, whole_log: bool = False) -> None:
-        """Publish what may be looked at while the job runs, as far as it is new or has changed.
+        """Publish new and changed files that are visible while the job runs.
 
-        Where the store of files does not take it, the job goes on, and this is tried again later.
+        If the file store rejects them, the job continues and the upload is repeated later.
 
         Args:
-            whole_log: take the log as it is now, even if it has just been copied.
+            whole_log: Whether to publish the current log even if it has just been copied.
         """
         if time.monotonic() - self._refused_at < _AGAIN_SECONDS and not whole_log:
             return
@@ -60,14 +60,14 @@ class Publisher:
             _log.warning("%s: not everything could be stored: %s", self._lease.job_id, _reason(refused))
 
     def publish(self, files: Sequence[Published]) -> None:
-        """Make files visible that are in the store of files; results are kept for the end."""
+        """Make stored files visible; results are held back until the end."""
         self._results |= {file.name: file for file in files if file.name in RESULTS}
         now = [file for file in files if file.name not in RESULTS]
         if now:
             self._remove(self._store.leases.publish(self._lease, now))
 
     def _remove(self, locations: Sequence[str]) -> None:
-        """Remove what nothing refers to now; what stays is swept when the job has ended."""
+        """Remove replaced files; those that remain are swept when the job has ended."""
         try:
             for location in locations:
                 self._artifacts.remove(location)
@@ -75,7 +75,7 @@ class Publisher:
             _log.warning("%s: what was replaced stays for now: %s", self._lease.job_id, _reason(error))
 
     def _grown_log(self, *, now: bool) -> dict[str, Path]:
-        """A copy of the log as far as it is, once in a while: the process goes on writing to the log itself."""
+        """Return a copy of the log if one is due, because the process keeps writing to the log itself."""
         log, copy = self._folder / "log.txt", self._folder / "log-so-far.txt"
         moment = time.monotonic()
         if not now and moment - self._log_copied_at < self._log_seconds:
@@ -85,33 +85,33 @@ class Publisher:
             shutil.copyfile(log, copy)
         return {"log.txt": copy}
 
-    # --- at its end ------------------------------------------------------------------------------------------------
+    # --- at the end of the attempt --------------------------------------------------------------------------------
 
     def has_result(self) -> bool:
-        """Whether the stylized scene is there."""
+        """Return whether the stylized scene exists."""
         return RESULT in self._results or RESULT in self._outbox.results()
 
     def succeed(self, result: dict[str, Any], given_up: Callable[[], bool] = lambda: False) -> None:
-        """End the job with its results.
+        """Mark the job as succeeded and publish its results.
 
         Args:
-            given_up: asked while the store of files is away: whether to wait no longer.
+            given_up: Callback that returns whether to stop waiting; it is called while the file store is unreachable.
 
         Raises:
-            StoreError: it was away for too long.
+            StoreError: If the store was unreachable for too long.
         """
         self.publish(put_patiently(self._outbox, given_up))
         self._store.leases.succeed(self._lease, list(self._results.values()), result)
 
     def sweep(self) -> None:
-        """Remove what attempts at the job, which has ended, have left behind; housekeeping does what this cannot."""
+        """Remove leftovers of all attempts at the ended job; housekeeping repeats it if it fails."""
         try:
             sweep(self._store, self._artifacts, self._lease.job_id, self._lease.epoch)
         except StoreError as error:
             _log.warning("%s: could not be swept: %s", self._lease.job_id, _reason(error))
 
     def log_tail(self) -> str | None:
-        """The end of the log; None where there is none."""
+        """Return the end of the log; None if there is no log."""
         try:
             return (self._folder / "log.txt").read_bytes()[-_LOG_TAIL:].decode(errors="replace")
         except OSError:
@@ -119,10 +119,10 @@ class Publisher:
 
 
 def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Published]:
-    """Put a job's results, which would be lost otherwise: as often as it takes.
+    """Upload a job's results, retrying because they would be lost otherwise.
 
     Raises:
-        StoreError: the store of files was away for too long, or `given_up` said so.
+        StoreError: If the file store was unreachable for too long, or `given_up` returned true.
     """
     started = time.monotonic()
     done: list[Published] = []
@@ -138,16 +138,16 @@ def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Publishe
 
 
 def _reason(error: StoreError) -> str:
-    """What is behind it, for the operator."""
+    """Return an error with its cause, for the operator."""
     cause = error.__cause__
     return f"{error} ({type(cause).__name__}: {cause})" if cause is not None else str(error)
 
 
 def sweep(store: Store, artifacts: Artifacts, job_id: str, epoch: int) -> None:
-    """Remove what attempts at a job that has ended have left behind.
+    """Remove leftovers of all attempts at an ended job.
 
     Args:
-        epoch: of the job's last lease.
+        epoch: Epoch of the job's last lease.
     """
     if store.database.rolled_back:
         return

@@ -1,4 +1,4 @@
-"""One attempt as the dispatcher sees it: a folder, a process, what it tells, and how it ends."""
+"""Attempt as seen by the dispatcher: its folder, its process, the messages, and how it ends."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ from service.store.states import AttemptOutcome
 from service.store.tables import ArtifactRow, BlobRow
 from sgsst_core.errors import SettingsError
 
-#: Seconds between two writes of progress: in the first minute, and of a job that has run for long. More would be writes
-#: that nobody sees, and on a large fleet they are most of what the database has to do.
+#: Seconds between writes of progress: in the first minute, and for long-running jobs. More frequent writes would go
+#: unnoticed, and on a large fleet they are most of the database's load.
 _PROGRESS_SECONDS = (1.0, 5.0)
-#: A job that is canceled has so long to end its step.
+#: Time that a canceled job has to finish its step, in seconds.
 _CANCEL_SECONDS = 8.0
-#: Variables that say how many threads a process computes with; what the operator sets goes first.
+#: Variables that set a process' number of threads; values set by the operator take precedence.
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 _log = logging.getLogger(__name__)
 
 
 class RunningAttempt:
-    """An attempt that runs in a thread of its own from `start` on; the dispatcher's loop only asks and tells."""
+    """Attempt that runs in its own thread; the dispatcher's loop queries and controls it."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class RunningAttempt:
         cluster: bool,
     ) -> None:
         self.lease = lease
-        #: What the attempt has of the machine; it becomes less when the plan does not need everything.
+        #: Capacity of the attempt; it is reduced if the plan needs less.
         self.grant = grant
         self._cluster = cluster
         self._folder = folder
@@ -83,44 +83,44 @@ class RunningAttempt:
 
     @property
     def alive(self) -> bool:
-        """Whether there is still something to do."""
+        """Whether the attempt's thread is running."""
         return self._thread.is_alive()
 
     @property
     def abandoned(self) -> bool:
-        """Whether it has ended, or was told to at once."""
+        """Whether the attempt has ended or was told to end at once."""
         return self._wish == Wish.ABANDON or not self.alive
 
     @property
     def holding(self) -> Holding:
-        """What it has of the machine, and until when by what its process told last."""
+        """Capacity of the attempt, and its expected end according to the last progress message."""
         ends_at, grant, job = self._ends_at, self.grant, self.lease.job
         if ends_at is None:
             return Holding(grant)
         until = self._store.database.clock() + ends_at - time.monotonic()
-        if job.attempt > 1:  # it may have gone on from a checkpoint
+        if job.attempt > 1:  # it may have resumed from a checkpoint, so its pace is unknown
             return Holding(grant, until)
         pace = (ends_at - self._begun_at) / estimated_seconds(job.parameters, job.inputs, grant.ranks)
         return Holding(grant, until, pace)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the attempt."""
         self._thread.start()
 
     def cancel(self) -> None:
-        """End the job at its user's wish."""
+        """Cancel the job on behalf of its user."""
         self._wish = self._wish or Wish.CANCEL
 
     def release(self) -> None:
-        """Save the job's state and give it back: the dispatcher is to end."""
+        """Save the job's state and return it to the queue, because the dispatcher is shutting down."""
         self._wish = self._wish or Wish.RELEASE
 
     def abandon(self) -> None:
-        """Another dispatcher has the job, or may have it soon: end everything at once, and write nothing more."""
+        """End everything at once and write nothing more: another dispatcher has the job or may get it soon."""
         self._wish = Wish.ABANDON
-        self._kill()  # the attempt's own thread may wait for a database that does not answer
+        self._kill()  # the attempt's own thread may be waiting for a database that does not respond
 
-    # --- in its thread ---------------------------------------------------------------------------------------------
+    # --- in the attempt's thread ----------------------------------------------------------------------------------
 
     def _run(self) -> None:
         try:
@@ -166,7 +166,7 @@ class RunningAttempt:
         self._conclude(found, {} if last is None else last.get("result", {}))
 
     def _conclude(self, ending: Ending, result: dict[str, Any]) -> None:
-        """Write an attempt's end into the store."""
+        """Record the end of an attempt in the store."""
         if ending.outcome == AttemptOutcome.SUCCEEDED:
             self._publisher.succeed(result, lambda: self._wish == Wish.ABANDON)
             self._publisher.sweep()
@@ -197,7 +197,7 @@ class RunningAttempt:
         Task(staged, parameters, ranks, self._cluster, resume, *seconds, workplace).save(self._folder)
 
     def _stage_here(self, checkpoint: ArtifactRow | None) -> Staged:
-        """Lay the job's files out in the attempt's folder."""
+        """Stage the job's files in the attempt's folder."""
         if checkpoint is not None:
             target = self._folder / "out" / f"{Path(RESULT).stem}.checkpoint.safetensors"
             try:
@@ -210,7 +210,7 @@ class RunningAttempt:
         return self._store.inputs.blobs(sorted({entry["sha256"] for entry in self.lease.job.inputs}))
 
     def _workplace(self, checkpoint: ArtifactRow | None) -> StoreWorkplace:
-        """What ranks on other machines need to lay the job's files out there."""
+        """Return what ranks on other machines need to stage the job's files."""
         job = self.lease.job
         files = [StoredFile(f"{BLOBS}/{row.location}", row.sha256, row.size) for row in self._input_rows().values()]
         saved = StoredFile(checkpoint.location, checkpoint.sha256, checkpoint.size) if checkpoint is not None else None
@@ -220,7 +220,7 @@ class RunningAttempt:
         )
 
     def _launch(self) -> None:
-        # a process without GPUs of its own must not see any
+        # a process without assigned GPUs must not see any
         environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "" if self._cluster else ",".join(self.grant.gpus)}
         if self.grant.threads is not None:
             environment = dict.fromkeys(_THREADS, str(self.grant.threads)) | environment
@@ -245,7 +245,7 @@ class RunningAttempt:
         self._messages.put(None)
 
     def _watch(self) -> Message | None:
-        """Pass on what the process tells until it ends; returns its last word, or None where it had none."""
+        """Handle messages until the process ends; return the final message, or None if there is none."""
         last: Message | None = None
         ended = False
         while not ended:
@@ -270,7 +270,7 @@ class RunningAttempt:
         return last
 
     def _take_in(self, message: Message) -> None:
-        """Act on what the process tells, but for its last word."""
+        """Handle a message other than the final one."""
         if message["kind"] == "left-out":
             self._give_back(message["gpus"])
         if message["kind"] == "stored":
@@ -283,12 +283,12 @@ class RunningAttempt:
             self._pending = progress_record(message, self.lease.job.attempt)
 
     def _count_gpus(self) -> None:
-        """What the attempt holds is counted for the job's owner."""
+        """Record the attempt's GPUs, which are charged to the job's owner."""
         if self.grant.gpus:
             self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
 
     def _give_back(self, gpus: list[str]) -> None:
-        """Leave GPUs that the plan does without to other jobs; on a cluster it is only their number that counts."""
+        """Return GPUs that the plan does not use; on a cluster only their number matters."""
         left = len(self.grant.gpus) - len(gpus)
         kept = self.grant.gpus[:left] if self._cluster else tuple(x for x in self.grant.gpus if x not in gpus)
         self.grant = replace(self.grant, ranks=len(kept), gpus=kept)
@@ -304,7 +304,7 @@ class RunningAttempt:
             self._pending, self._progress_at = None, moment
 
     def _stop_as_asked(self) -> None:
-        """Ask the process to stop, once, and end it where it takes too long."""
+        """Ask the process once to stop, and kill it if that takes too long."""
         process = self._process
         assert process is not None
         if self._wish is None:
@@ -319,7 +319,7 @@ class RunningAttempt:
             self._kill()
 
     def _kill(self) -> None:
-        """End the process and all that it has started."""
+        """Kill the process and all processes that it has started."""
         process = self._process
         if process is None:
             return
@@ -339,13 +339,13 @@ class RunningAttempt:
 
 
 def progress_seconds(elapsed: float) -> float:
-    """Seconds between two writes of progress, of an attempt that has run for so long."""
+    """Return the interval between writes of progress, in seconds, for an attempt that has run this long."""
     least, most = _PROGRESS_SECONDS
     return min(max(elapsed / 60, least), most)
 
 
 def progress_record(message: Message, attempt: int) -> dict[str, Any]:
-    """The progress of a job as its record has it, by what its process tells; steps of `planning` are views."""
+    """Return the progress for a job's record from a message; steps of `planning` are views."""
     step, total = message.get("step", 0), message.get("total", 0)
     return {
         "stage": message.get("stage", "coarse" if message["kind"] == "progress" else "starting"),

@@ -1,4 +1,4 @@
-"""Weights of the feature networks in the store of files, by digest: machines that compute need none of their own."""
+"""Weights of feature networks in the file store by digest, so that compute machines need not install them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _FOLDER = "weights"
 
 
 def store_weights(objects: ObjectStore) -> dict[str, StoredFile]:
-    """Put what this machine has installed into the store, unless it is there; returns it by the names of the files.
+    """Upload this machine's installed weights unless they are stored already; return them by file name.
 
     Raises:
-        StoreError: the store cannot be reached.
+        StoreError: If the store cannot be reached.
     """
     found = {}
     for path in sorted(cache_folder().glob("*.safetensors")):

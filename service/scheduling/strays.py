@@ -1,7 +1,7 @@
-"""Files of jobs that nothing refers to, found by looking through the store of files itself.
+"""Search of the file store for stray files: files of jobs that nothing refers to.
 
-Attempts that fail are swept when their job ends. What is left are files of those that were cut off, and put one more
-when the job had ended elsewhere already.
+Files of failed attempts are swept when their job ends. Strays come from interrupted attempts that stored another file
+after the job had already ended elsewhere.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from service.files.artifacts import Artifacts
 from service.store import Store
 from service.store.states import UNFINISHED
 
-#: A younger file's row may still be on its way.
+#: Minimum age of a stray in seconds: the row of a younger file may not have been written yet.
 _STRAY_SECONDS = 6 * 3600.0
 _PREFIX = "job_"
 
 
 def remove_strays(store: Store, artifacts: Artifacts) -> int:
-    """Delete stray files, and return how many; a database that has gone back in time cannot tell which these are."""
+    """Delete stray files and return their number; after a rollback of the database they cannot be identified."""
     if store.database.rolled_back:
         return 0
     before = min(time.time(), store.database.expiry()) - _STRAY_SECONDS
@@ -37,7 +37,7 @@ def remove_strays(store: Store, artifacts: Artifacts) -> int:
 
 
 def strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
-    """Return those of a job's files that nothing refers to, nor will."""
+    """Return the files of a job that nothing refers to or will refer to."""
     try:
         job = store.jobs.get(job_id, None)
     except NotFoundError:
@@ -46,5 +46,5 @@ def strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
     unknown = [name for name in names if name not in kept]
     if job.status not in UNFINISHED:
         return unknown
-    # the attempt that runs may have rows to write; those before it have not
+    # the running attempt may still write rows; earlier ones cannot
     return [name for name in unknown if int(name.split("/")[1]) < job.lease_epoch]

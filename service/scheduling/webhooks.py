@@ -1,7 +1,7 @@
-"""Webhooks: messages to other servers about finished jobs, signed by Standard Webhooks (https://www.standardwebhooks.com).
+"""Webhooks: signed messages about finished jobs (Standard Webhooks, https://www.standardwebhooks.com).
 
-Receivers are not trusted. Each message is sent on its own, from the lookup of the name to the head of the answer within
-one deadline, to an address that was checked; of the answer only the status is read.
+Receivers are not trusted. Each message is sent on its own to a verified address. One deadline covers everything from
+the name lookup to the head of the response, and only the status of the response is read.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from service.settings import ServiceSettings
 from service.store import Store
 from service.store.operations import Delivery
 
-#: Waits before further attempts, seconds: the schedule that the convention suggests, up to a day.
+#: Delays before further attempts in seconds: the schedule that Standard Webhooks suggests, up to a day.
 _WAITS = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0)
-#: Seconds for one attempt: lookup, connection, TLS, request and the head of the answer together.
+#: Time limit of one attempt in seconds: lookup, connection, TLS, request and the head of the response together.
 _DEADLINE = 15.0
-#: Seconds for which no other dispatcher takes a message that is being sent: several deadlines.
+#: Time in seconds during which no other dispatcher takes a message that is being sent: several deadlines.
 _HOLD_SECONDS = 4 * _DEADLINE
-#: Messages that are sent at the same time: in total, to the owner of one key's jobs, and to one URL.
+#: Maximum number of messages sent at the same time: in total, for the jobs of one key, and to one URL.
 _MAX_TOTAL, _MAX_PER_OWNER, _MAX_PER_URL = 32, 8, 2
 _ROUND_SECONDS = 2.0
 _MAX_URL = 2000
-#: Characters of a reason in the log: it may hold what a receiver sent.
+#: Maximum length of a logged reason, which may contain text from a receiver.
 _MAX_REASON = 300
-#: A host name as DNS has it; `_` is no part of host names but in use.
+#: Host name as in DNS; `_` is not allowed in host names but is in use.
 _NAME = re.compile(r"(?=.{1,253}$)[a-z0-9_-]{1,63}(\.[a-z0-9_-]{1,63})*\.?", re.ASCII)
 #: The only part of IPv6 that is assigned for global unicast.
 _GLOBAL_UNICAST = ipaddress.IPv6Network("2000::/3")
-#: IETF protocol assignments, with the metadata service of a cloud; older versions of Python take most of it for public.
+#: IETF protocol assignments, including a cloud's metadata service; older versions of Python consider most of it public.
 _PROTOCOL_ASSIGNMENTS = ipaddress.IPv4Network("192.0.0.0/24")
 #: Prefix under which NAT64 translates to IPv4 (RFC 6052).
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
@@ -60,10 +60,10 @@ def signature(secret: str, message_id: str, timestamp: int, body: bytes) -> str:
 
 
 def check_url(url: str, settings: ServiceSettings) -> None:
-    """Check that a job may name a URL as its webhook. Addresses are checked at each delivery.
+    """Check that a job may name a URL as its webhook; its addresses are checked at each delivery.
 
     Raises:
-        RefusedInputError: Webhooks are off, or the URL cannot be called.
+        RefusedInputError: If webhooks are off or the URL cannot be called.
     """
     if not settings.webhooks:
         raise RefusedInputError("Webhooks are switched off on this service.", "webhooks-off", input="webhook")
@@ -78,10 +78,10 @@ def check_url(url: str, settings: ServiceSettings) -> None:
 
 
 def parse_url(url: str) -> httpx.URL:
-    """Parse the URL of a webhook as the client that sends the message does.
+    """Parse the URL of a webhook in the same way as the client that sends the message.
 
     Raises:
-        ValueError: The URL cannot be called; the message is the reason.
+        ValueError: If the URL cannot be called; the message is the reason.
     """
     if len(url) > _MAX_URL:
         raise ValueError(f"it has {len(url):,} characters, at most {_MAX_URL:,} are allowed")
@@ -97,13 +97,13 @@ def parse_url(url: str) -> httpx.URL:
         raise ValueError("it holds a user name or password")
     if port is not None and not 0 < port < 65536:
         raise ValueError("its port must be between 1 and 65535")
-    if "%" in host or not (_NAME.fullmatch(host) or ":" in host):  # httpx has checked what is in brackets
+    if "%" in host or not (_NAME.fullmatch(host) or ":" in host):  # httpx has checked bracketed hosts
         raise ValueError("it has no valid host name")
     return parsed
 
 
 def is_public(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
-    """Return whether an address is reachable on the public internet; an IPv4 address inside an IPv6 one decides."""
+    """Return whether an address is public; an IPv6 address with an embedded IPv4 address counts as the latter."""
     if isinstance(address, ipaddress.IPv6Address):
         embedded = address.ipv4_mapped or address.sixtofour
         if address in _NAT64:
@@ -116,8 +116,10 @@ def is_public(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
 
 
 def _look_up(host: str, port: int) -> Future[list[str]]:
-    """Look up the addresses of a host on a daemon thread: the resolver cannot be interrupted, and an executor's thread
-    would hold up the end of the process. A thread that outlives its delivery ends with the resolver's own timeout.
+    """Look up the addresses of a host on a daemon thread.
+
+    The resolver cannot be interrupted, and the thread of an executor would delay the exit of the process. A thread that
+    outlives its delivery ends with the resolver's own timeout.
     """
     future: Future[list[str]] = Future()
     future.set_running_or_notify_cancel()
@@ -135,11 +137,11 @@ def _look_up(host: str, port: int) -> Future[list[str]]:
 
 
 async def checked_address(host: str, port: int, *, private_allowed: bool) -> str:
-    """Return an address of a host that may be called. The caller connects to this address, not to the name.
+    """Return an address of a host that may be called; callers connect to this address, not to the name.
 
     Raises:
-        PermissionError: An address of the host is private; names that lead to both kinds are refused too.
-        OSError: The name is not known.
+        PermissionError: If any address of the host is private.
+        OSError: If the name is unknown.
     """
     found = [address.partition("%")[0] for address in await asyncio.wrap_future(_look_up(host, port))]
     if not private_allowed:
@@ -150,10 +152,10 @@ async def checked_address(host: str, port: int, *, private_allowed: bool) -> str
 
 
 class Deliverer:
-    """Sends due messages from its own thread.
+    """Sender of due messages, with its own thread.
 
     Args:
-        tls: Certificates that receivers are verified with; None for the public ones.
+        tls: Certificates for verifying receivers; None for the public ones.
     """
 
     def __init__(self, settings: ServiceSettings, store: Store, tls: ssl.SSLContext | None = None) -> None:
@@ -168,18 +170,18 @@ class Deliverer:
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop soon; messages that are not delivered by then stay due."""
+        """Stop soon; undelivered messages stay due."""
         self._stop.set()
 
     def _run(self) -> None:
         while not self._stop.wait(_ROUND_SECONDS):
             try:
                 self.deliver_due()
-            except Exception:  # the database may be away; the thread must continue
+            except Exception:  # the database may be down; the thread must continue
                 _log.exception("webhooks could not be delivered")
 
     def deliver_due(self) -> None:
-        """Send due messages until none is due and none is being sent."""
+        """Send due messages until none is due or being sent."""
         asyncio.run(self._deliver_due())
 
     async def _deliver_due(self) -> None:
@@ -199,7 +201,7 @@ class Deliverer:
         )
 
     async def _deliver(self, delivery: Delivery) -> None:
-        """Send one message and record the outcome; whatever goes wrong stays with this message."""
+        """Send one message and record the outcome; errors concern this message only."""
         try:
             async with asyncio.timeout(_DEADLINE):
                 error = await self._send(delivery)
@@ -215,11 +217,11 @@ class Deliverer:
             )
         try:
             await asyncio.to_thread(self._store.operations.settle_delivery, delivery.id, wait)
-        except Exception:  # it is due again once its hold is over
+        except Exception:  # due again when the hold expires
             _log.exception("the outcome of a webhook could not be stored", extra={"job": delivery.job_id})
 
     async def _send(self, delivery: Delivery) -> str | None:
-        """Send one message; return what went wrong."""
+        """Send one message and return the error; None for success."""
         url = parse_url(delivery.url)
         host, port = url.raw_host.decode(), url.port or (443 if url.scheme == "https" else 80)
         address = await checked_address(host, port, private_allowed=self._settings.webhook_private_addresses)
@@ -233,7 +235,7 @@ class Deliverer:
             "webhook-signature": signature(await asyncio.to_thread(lambda: self._secret), delivery.id, timestamp, body),
         }
         async with (
-            # one client for each message: a kept connection to an address would be used for other names as well
+            # one client per message: a pooled connection to an address would be reused for other names
             httpx.AsyncClient(verify=self._tls, timeout=None, follow_redirects=False, trust_env=False) as client,
             client.stream(
                 "POST",

@@ -1,7 +1,7 @@
-"""A job's files on a machine that shares nothing with the dispatcher's but the store of files (`worker.workplace`).
+"""Staging of a job's files on a machine that shares only the file store with the dispatcher (`worker.workplace`).
 
-Settings are those of the machine itself: the Ray node's environment says where its folder is (`SGSST_DATA`; a temporary
-one by default), how large its cache may be, and how the store knows it.
+Settings come from the machine itself: the environment of its Ray node defines the data folder (`SGSST_DATA`, a
+temporary folder by default), the size of the cache, and the credentials of the store.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from worker.ranks import sweeper
 from worker.ranks.host_memory import scene_bytes
 from worker.workplace import Stored
 
-#: Seconds between two looks for what a job has made.
+#: Interval between checks for new files of the job, in seconds.
 _LOOK_SECONDS = 0.5
-#: What the store did not take is put again after so long.
+#: Delay in seconds before files that the store rejected are uploaded again.
 _AGAIN_SECONDS = 5.0
 
 _log = logging.getLogger(__name__)
@@ -48,11 +48,11 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of the store.
+    """File in the store.
 
     Attributes:
-        name: of the object.
-        sha256, size: of its content.
+        name: Name of the object.
+        sha256, size: Digest and size of its content.
     """
 
     name: str
@@ -62,15 +62,15 @@ class StoredFile:
 
 @dataclass(frozen=True)
 class StoreWorkplace:
-    """What a rank needs to know of its job's files.
+    """Description of a job's files for its ranks.
 
     Attributes:
-        url: of the store.
-        job_id, epoch: under which the job's files are stored.
-        inputs: `role`, `name`, `sha256` and `size` of each, for `stage`.
-        files: the inputs by digest.
-        checkpoint: to go on from; None for none.
-        weights: of feature networks, by the names of their files; empty for those that the machine has itself.
+        url: URL of the store.
+        job_id, epoch: Prefix of the job's stored files.
+        inputs: `role`, `name`, `sha256` and `size` of each input, for `stage`.
+        files: Input files in the store.
+        checkpoint: Checkpoint to resume from; None for none.
+        weights: Feature network weights by file name; empty to use the machine's own.
     """
 
     url: str
@@ -82,12 +82,12 @@ class StoreWorkplace:
     weights: dict[str, StoredFile]
 
     def as_json(self) -> dict[str, Any]:
-        """For `from_json`."""
+        """Return the description as JSON for `from_json`."""
         return asdict(self)
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> StoreWorkplace:
-        """What `as_json` gave."""
+        """Return the description from the JSON of `as_json`."""
         checkpoint = values["checkpoint"]
         return StoreWorkplace(
             values["url"],
@@ -101,15 +101,17 @@ class StoreWorkplace:
 
     @property
     def scene_bytes(self) -> int:
-        """Bytes of the scene, once it is read."""
+        """Size of the scene in bytes, once it is read."""
         files = [entry for entry in self.inputs if entry["role"] == "scene"]
         return sum(scene_bytes(entry["name"], entry["size"]) for entry in files)
 
     def open(self, rank: int, stored: Stored) -> RankFolder:
-        """Fetch what is not in this machine's cache, and link the rest: once for all ranks of a machine.
+        """Stage the job's files for a rank.
+
+        Missing files are fetched once into the machine's cache, which all its ranks share.
 
         Raises:
-            InfrastructureError: the store is away or has lost a file, or the disk is full.
+            InfrastructureError: If the store is unreachable or has lost a file, or the disk is full.
         """
         try:
             return RankFolder(self, rank, stored)
@@ -117,21 +119,21 @@ class StoreWorkplace:
             raise InfrastructureError(f"The job's files cannot be laid out here: {error}.") from error
 
     def after(self, stored: Sequence[Published]) -> StoreWorkplace:
-        """With the last checkpoint of these files."""
+        """Return the description with the last checkpoint among these files."""
         found = [file for file in stored if file.name == CHECKPOINT]
         if not found:
             return self
         return replace(self, checkpoint=StoredFile(found[-1].location, found[-1].sha256, found[-1].size))
 
     def tidy(self) -> None:
-        """Remove the folders of ranks of this machine that are no more."""
+        """Remove folders of dead ranks on this machine."""
         _remove_left(_ranks_folder(node_settings()))
 
 
 class RankFolder:
-    """A rank's folder: it is locked as long as the rank lives, so that others can tell what was left behind.
+    """Folder of a rank, locked while the rank lives, so that others can recognize leftover folders.
 
-    A process beside it removes it when the rank is killed; others do so where that one was killed, too.
+    A helper process removes it if the rank is killed. If that process is killed too, other ranks remove the folder.
     """
 
     def __init__(self, workplace: StoreWorkplace, rank: int, stored: Stored) -> None:
@@ -141,7 +143,7 @@ class RankFolder:
         above.mkdir(parents=True, exist_ok=True)
         _remove_left(above)
         self._above = above / f"{workplace.job_id}-{workplace.epoch}-{rank}-{secrets.token_hex(4)}"
-        with _locked(above / "all"):  # or it would be taken for one that was left
+        with _locked(above / "all"):  # an unlocked folder would be taken for a leftover
             self._above.mkdir()
             self._lock = (self._above / "lock").open("w")
             fcntl.flock(self._lock, fcntl.LOCK_EX)
@@ -172,7 +174,7 @@ class RankFolder:
         try:
             for name, file in workplace.weights.items():
                 link(file, weights / name)
-        except (LostFileError, DamagedFileError) as error:  # nothing that the job's user has sent, or could send again
+        except (LostFileError, DamagedFileError) as error:  # not the user's fault, and the user cannot send it again
             raise StoreError("The network's weights in the store of files cannot be used.") from error
         if workplace.weights:
             os.environ["SGSST_CACHE"] = str(weights)
@@ -180,10 +182,10 @@ class RankFolder:
             _fetch_checkpoint(objects, workplace.checkpoint, out / f"{Path(RESULT).stem}.checkpoint.safetensors")
 
     def finish(self, *, done: bool) -> None:
-        """Store what is left: a checkpoint, or the results.
+        """Store the remaining files: a checkpoint, or the results.
 
         Raises:
-            StoreError: the store was away for too long.
+            StoreError: If the store was unreachable for too long.
         """
         if self._shipper is not None:
             self._shipper.finish(done=done)
@@ -198,7 +200,7 @@ class RankFolder:
 
 
 class _Shipper:
-    """Stores what a job makes while it makes it, in a thread of its own: steps do not wait for the store."""
+    """Uploader of a job's files in its own thread, so that steps do not wait for the store."""
 
     def __init__(self, outbox: Outbox, stored: Stored) -> None:
         self._outbox, self._stored = outbox, stored
@@ -210,7 +212,7 @@ class _Shipper:
         while not self._stop.wait(_LOOK_SECONDS):
             try:
                 refused = self._ship()
-            except Exception:  # whatever it is, the job goes on
+            except Exception:  # the job continues whatever the error is
                 _log.exception("what the job has made could not be stored")
                 refused = None
             if refused is not None:
@@ -244,7 +246,7 @@ class _Shipper:
 
 
 def node_settings() -> ServiceSettings:
-    """Settings of this machine, whose folder is a temporary one unless its environment names another."""
+    """Return the settings of this machine; the data folder is temporary unless the environment defines one."""
     if os.environ.get("SGSST_DATA"):
         return ServiceSettings()
     return ServiceSettings(data=Path(tempfile.gettempdir()) / f"sgsst-{os.getuid()}")
@@ -255,7 +257,7 @@ def _ranks_folder(settings: ServiceSettings) -> Path:
 
 
 def _remove_left(above: Path) -> None:
-    """Remove folders whose locks nobody holds."""
+    """Remove folders that nobody holds a lock on."""
     if not above.is_dir():
         return
     with _locked(above / "all"):
@@ -275,7 +277,7 @@ def _locked(path: Path) -> Any:
 
 
 def _fetch_checkpoint(objects: ObjectStore, checkpoint: StoredFile, target: Path) -> None:
-    """Bring a checkpoint; without one that was replaced meanwhile, or is damaged, the job starts again."""
+    """Fetch a checkpoint; if it has been replaced meanwhile or is damaged, the job starts again."""
     try:
         objects.get(checkpoint.name, target)
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The durable store: jobs, inputs, keys, in SQLite or PostgreSQL behind the same code."""
+"""Durable store of jobs, inputs and keys, in SQLite or PostgreSQL with the same code."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from service.store.retention import Retention
 from service.store.retries import RetryPolicy
 from service.store.sessions import Sessions
 
-#: Between two questions to a database that is not there yet.
+#: Interval between attempts to connect to an unavailable database, in seconds.
 _ASK_AGAIN_SECONDS = 1.0
 
 _log = logging.getLogger(__name__)
 
 
 class Store:
-    """All parts of the store on one database; for `clock` and `answer_seconds` see `Database`."""
+    """All parts of the store on one database; `clock` and `answer_seconds` are those of `Database`."""
 
     def __init__(
         self, settings: ServiceSettings, clock: Clock | None = None, answer_seconds: float = ANSWER_SECONDS
@@ -53,14 +53,13 @@ def open_store(
     patience: float = 0.0,
     answer_seconds: float = ANSWER_SECONDS,
 ) -> Store:
-    """The store, with its tables created or brought up to date.
+    """Open the store, and create its tables or migrate them to the current version.
 
     Args:
-        patience: seconds for which a database server that does not answer is asked again: of services that are started
-            together, some are ready before it.
+        patience: Time in seconds to wait for a database server that does not respond: services may start before it.
 
     Raises:
-        DatabaseUnavailableError: It does not answer.
+        DatabaseUnavailableError: If the database does not respond.
     """
     store = Store(settings, clock, answer_seconds)
     until = time.monotonic() + (0.0 if store.database.sqlite else patience)

@@ -1,4 +1,7 @@
-"""Changes of a job's rows that users and dispatchers share: its state, its events, its end. Within a transaction."""
+"""Changes to a job's rows that users and dispatchers share: its status, its events, and its end.
+
+All functions run within the caller's transaction.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +19,20 @@ _EVENTS = Base.metadata.tables[EventRow.__tablename__]
 
 
 def move(session: Session, job: JobRow, transition: Transition, now: float) -> None:
-    """Bring a job to another state, and let its watchers know.
+    """Change a job's status and add an event for its watchers.
 
     Raises:
-        TransitionError: there is no such way out of its state.
+        TransitionError: If the job's status does not allow the transition.
     """
     job.status = next_status(job.status, transition)
     add_status_event(session, job, now)
 
 
 def end(session: Session, job: JobRow, transition: Transition, now: float, retention: float) -> None:
-    """Bring a job to its end.
+    """End a job.
 
     Args:
-        retention: seconds that its results are kept.
+        retention: Time in seconds until its results expire.
     """
     status = next_status(job.status, transition)
     job.finished_at, job.expires_at = now, kept_until(session, now, retention)
@@ -41,14 +44,14 @@ def end(session: Session, job: JobRow, transition: Transition, now: float, reten
 
 
 def _delivery(job: JobRow, url: str, status: JobStatus, now: float) -> DeliveryRow:
-    """The message that tells a job's webhook of its end."""
+    """Return the message that notifies a job's webhook of its end."""
     data = {"id": job.id, "name": job.name, "status": status, "error": job.error}
     body = {"type": f"job.{status}", "timestamp": now, "data": data}
     return DeliveryRow(id=new_id("msg", now), job_id=job.id, url=url, body=body, tries=0, next_at=now)
 
 
 def add_status_event(session: Session, job: JobRow, now: float) -> None:
-    """Let watchers know of a job's state."""
+    """Add an event about a job's status."""
     data: dict[str, Any] = {"status": job.status, "attempt": job.attempt}
     if job.error:
         data["error"] = job.error
@@ -56,23 +59,24 @@ def add_status_event(session: Session, job: JobRow, now: float) -> None:
 
 
 def add_event(session: Session, job_id: str, kind: str, data: dict[str, Any], now: float) -> None:
-    """Let watchers know of something that happened to a job."""
+    """Add an event to a job."""
     session.execute(insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
 
 
 def release_inputs(session: Session, job_id: str) -> None:
-    """Let go of a job's inputs; blobs that nobody else holds are collected later."""
+    """Release a job's inputs; blobs without other holders are collected later."""
     session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job_id)))
 
 
 def release_blobs(session: Session, holder: str) -> list[str]:
-    """Let go of a holder's blobs, and delete the rows of those that nobody else holds.
+    """Release a holder's blobs and delete the rows of those without other holders.
 
     Returns:
-        Locations of the deleted ones: their files are the caller's to remove once the transaction is committed.
+        Locations of the deleted blobs. The caller removes their files once the transaction is committed.
     """
     held = select(BlobUseRow.sha256).where(BlobUseRow.holder == holder)
-    # locked in one order, and before the uses go: of two holders that let go at once, the second sees that it is last
+    # locked in a fixed order before the uses are deleted: of two concurrent releases, the second sees that it is the
+    # last
     rows = session.scalars(
         select(BlobRow).where(BlobRow.sha256.in_(held)).order_by(BlobRow.sha256).with_for_update()
     ).all()
@@ -86,12 +90,12 @@ def release_blobs(session: Session, holder: str) -> list[str]:
 
 
 def holder_name(job_id: str) -> str:
-    """The name under which a job holds its inputs."""
+    """Return the holder name of a job's inputs."""
     return f"job:{job_id}"
 
 
 def forget(session: Session, job: JobRow) -> list[str]:
-    """Delete a job's rows; return the locations of inputs that nobody needs any more, as `release_blobs`."""
+    """Delete a job's rows and return the locations of unused inputs, as `release_blobs` does."""
     unused = release_blobs(session, holder_name(job.id))
-    session.delete(job)  # its attempts, events and artifacts go with it
+    session.delete(job)  # deletes attempts, events and artifacts by cascade
     return unused

@@ -1,14 +1,18 @@
-"""The time that the store works with: which clock it comes from, and which time things expire by.
+"""Time of the store: the clock that it uses, and the time by which data expire.
 
-On PostgreSQL all processes use the server's clock. SQLite has none: its processes use their machine's. That may be
-wrong, and what it deletes is gone. Deletion therefore has a time of its own, the *expiry time*, a number in the
-database. It is never ahead of the clock, and a dispatcher moves it toward the clock at most `CATCH_UP` times as fast as
-the dispatcher's monotonic clock runs. So a clock that is 31 days ahead has to stay wrong for 31 hours of work before
-the first result is deleted too early, and then deletes the oldest and not everything; a machine that was off for 40
-days deletes what is due within 40 hours of work; one that works for an hour a day keeps up. A dispatcher whose clock
-disagrees with the heartbeats of another one that is alive does not move it and deletes nothing
-(`service.scheduling.clock_watch`), since nobody knows which of the two is right. The expiry time never goes back, so
-that a clock that was behind for a while delays nothing afterwards.
+On PostgreSQL all processes use the server's clock. SQLite has no clock, so its processes use their machine's. That
+clock may be wrong, and deleted data are lost. Deletion therefore has its own *expiry time*, a number in the database.
+It is never ahead of the clock. A dispatcher advances it toward the clock at most `CATCH_UP` times as fast as its
+monotonic clock runs:
+
+- A clock that is 31 days ahead has to stay wrong for 31 hours of work before the first result is deleted too early, and
+  then the oldest results go first.
+- A machine that was off for 40 days deletes overdue data within 40 hours of work.
+- A machine that works for an hour a day keeps up.
+
+A dispatcher whose clock disagrees with the heartbeats of another live one neither advances the expiry time nor deletes
+anything (`service.scheduling.clock_watch`), because it is unknown which clock is right. The expiry time never goes
+back, so a clock that was temporarily behind delays nothing later.
 """
 
 from __future__ import annotations
@@ -24,22 +28,22 @@ from service.store.tables import CounterRow, JobRow
 
 Clock = Callable[[], float]
 
-#: Upper bound of the expiry time's speed, in seconds for each second of a dispatcher's work.
+#: Maximum speed of the expiry time, in seconds per second of a dispatcher's work.
 CATCH_UP = 24.0
-#: Seconds between two questions for the server's time.
+#: Interval between queries of the server's time, in seconds.
 _ASK_SECONDS = 10.0
-#: Name of the counter that holds the expiry time.
+#: Name of the counter that stores the expiry time.
 _NAME = "sgsst_expiry_time"
 _EXPIRY = select(CounterRow.value).where(CounterRow.name == _NAME, CounterRow.labels == "")
 
 
 class ServerClock:
-    """The database server's clock: its offset from the monotonic clock, measured every few seconds.
+    """Clock of the database server, computed from the monotonic clock and an offset that is measured every few seconds.
 
-    It is never ahead of the server's, and behind by no more than a question takes.
+    It is never ahead of the server's clock, and behind by at most the duration of a query.
 
     Args:
-        ask: Asks the server for its time, in seconds since 1970.
+        ask: Function that queries the server's time in seconds since 1970.
     """
 
     def __init__(self, ask: Clock) -> None:
@@ -62,14 +66,15 @@ class ServerClock:
 
 
 def expiry_time(connection: Connection | Session, now: float) -> float:
-    """Return the time by which things expire; the clock's if no dispatcher has ever kept one."""
+    """Return the time by which data expire; it equals the clock if no dispatcher has advanced it yet."""
     return min(now, _stored_time(connection, now))
 
 
 def kept_until(connection: Connection | Session, now: float, seconds: float) -> float:
-    """Return when something expires that is to be kept for so long.
+    """Return the expiry of something that is kept for `seconds`.
 
-    By a clock that is behind alone, it would expire as soon as the clock is right again.
+    The expiry time is taken into account: by a slow clock alone, the data would expire as soon as the clock is
+    corrected.
     """
     return max(now, _stored_time(connection, now)) + seconds
 
@@ -80,14 +85,16 @@ def _stored_time(connection: Connection | Session, now: float) -> float:
 
 
 def advance_expiry_time(session: Session, now: float, seconds: float) -> None:
-    """Move the expiry time toward the clock.
+    """Advance the expiry time toward the clock.
 
     Args:
-        now: Time of the clock.
-        seconds: Time that a dispatcher has worked since it moved it last, by its monotonic clock.
+        now: Current time of the clock.
+        seconds: Working time of the dispatcher since its last call, by its monotonic clock.
     """
     row = session.get(CounterRow, (_NAME, ""), with_for_update=True)
-    if row is None:  # jobs are created by others: heartbeats may be those of a wrong clock that has just started
+    # limited by the newest job, which others created: heartbeats may come from a dispatcher that has just started with
+    # a wrong clock
+    if row is None:
         newest = session.scalar(select(func.max(JobRow.created_at)))
         session.add(CounterRow(name=_NAME, labels="", value=now if newest is None else min(now, newest)))
     else:

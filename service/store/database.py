@@ -1,4 +1,4 @@
-"""One way to SQLite and PostgreSQL: engine, transactions, migrations."""
+"""Common access to SQLite and PostgreSQL: engine, transactions and migrations."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from service.store.outages import Gate, busy, impatient_connection, translated
 from service.store.rollback import NEWEST_EVENT, Marker
 from service.store.tables import Base, CounterRow, IdempotencyRow
 
-#: The newest migration; a database that says so needs no look at the migrations themselves.
+#: Version of the newest migration; a database with this version is opened without loading the migrations.
 SCHEMA = "0006"
 MIGRATIONS = Path(__file__).with_name("migrations")
-#: Seconds that a transaction waits by default: for its turn, for a connection, for each answer. All are short.
+#: Default timeout of a transaction in seconds, for its turn, for a connection, and for each response; all are short.
 ANSWER_SECONDS = 30.0
-#: Seconds that health checks wait, and those who ask the server for its time: on connections of their own.
+#: Timeout of health checks and of queries of the server's time, on separate connections, in seconds.
 _ASIDE_SECONDS = 2.0
-#: Of PostgreSQL's connections: a server that is cut off is noticed within some seconds, and not when TCP gives up.
+#: Connection options for PostgreSQL: an unreachable server is detected within seconds rather than by TCP's own timeout.
 _LOST_AFTER = {
     "connect_timeout": 5,
     "keepalives_idle": 5,
@@ -39,24 +39,24 @@ _LOST_AFTER = {
     "keepalives_count": 3,
     "tcp_user_timeout": 10_000,
 }
-#: Seconds that an Idempotency-Key is remembered at least: housekeeping forgets it.
+#: Minimum lifetime of an Idempotency-Key in seconds; housekeeping deletes it later.
 IDEMPOTENCY_SECONDS = 86_400.0
-#: Number of an advisory lock that nothing else in a PostgreSQL database is likely to use.
+#: Number of the advisory lock, unlikely to be used by anything else in a PostgreSQL database.
 _LOCK = 7_347_758
 _SERVER_TIME = text("SELECT extract(epoch FROM clock_timestamp())")
-#: Upper bounds of a histogram's buckets, seconds: from a click to a day.
+#: Upper bounds of histogram buckets in seconds, from a click to a day.
 BUCKETS = (1, 5, 15, 60, 300, 900, 1800, 3600, 7200, 14400, 43200, 86400)
 
 
 class Database:
-    """Transactions on the store's database, and the clock that its times come from.
+    """Transactions on the store's database, and the clock of its times.
 
-    Every transaction raises `DatabaseUnavailableError` if the database is away, or locked for too long.
+    Every transaction raises `DatabaseUnavailableError` if the database is down or locked for too long.
 
     Args:
-        url: URL of the database, as SQLAlchemy has it.
-        clock: Clock to use; None for the server's, or this machine's for SQLite.
-        answer_seconds: Seconds that a transaction waits for its turn, for a connection, and for each answer.
+        url: SQLAlchemy URL of the database.
+        clock: Clock to use; None for the server's clock, or this machine's with SQLite.
+        answer_seconds: Timeout of a transaction in seconds, for its turn, for a connection, and for each response.
     """
 
     def __init__(self, url: str, clock: Clock | None = None, answer_seconds: float = ANSWER_SECONDS) -> None:
@@ -70,12 +70,12 @@ class Database:
         self._writer = self.engine.execution_options(sgsst_writes=True)
         self._marker = Marker(Path(self.url.database)) if self.sqlite and self.url.database else None
         self._aside = self._make_engine(_ASIDE_SECONDS, pool_size=2, max_overflow=0)
-        # SQLite's writers wait by sleeping and asking again; those of one process need not
+        # SQLite's writers wait by polling, which the writers of one process can avoid
         self._turn = threading.Lock() if self.sqlite else None
         self._reads, self._writes = Gate(), Gate()
 
     def _make_engine(self, seconds: float | None, **pool: int) -> Engine:
-        """Return an engine whose transactions wait for so many seconds; None for no bound (SQLite always has one)."""
+        """Return an engine with this timeout for transactions in seconds; None for no limit (SQLite always has one)."""
         bound = ANSWER_SECONDS if seconds is None else seconds
         options: dict[str, Any] = {**pool, "pool_use_lifo": True, "pool_timeout": bound}
         if self.sqlite:
@@ -92,7 +92,7 @@ class Database:
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
-        """A transaction that is committed at the end of the block; on SQLite it is the only writer from the start."""
+        """Provide a transaction that is committed at the end of the block; on SQLite it is the only writer."""
         with (
             self._writes.guarded(),
             self._taking_turns(),
@@ -106,7 +106,7 @@ class Database:
 
     @contextmanager
     def _taking_turns(self) -> Iterator[None]:
-        """Be the only writer of this process on SQLite."""
+        """Hold this process' turn as the only writer on SQLite."""
         if self._turn is None:
             yield
             return
@@ -119,24 +119,27 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
-        """A transaction that sees one state of the database, and never waits for a writer."""
+        """Provide a transaction that sees one snapshot of the database and never waits for a writer."""
         with self._reads.guarded(), Session(self.engine, expire_on_commit=False) as session:
             yield session
 
     @contextmanager
     def reading_rows(self) -> Iterator[Connection]:
-        """As `reading`, for plain rows: a third of the work, for what is asked hundreds of times a second."""
+        """Provide a connection as `reading` does, but without the ORM.
+
+        It takes a third of the work, for queries that run hundreds of times a second.
+        """
         with self._reads.guarded(), self.engine.connect() as connection:
             yield connection
 
     @contextmanager
     def aside(self) -> Iterator[Connection]:
-        """As `reading_rows`, on one of two connections that are kept for this, and with a shorter wait."""
+        """Provide one of two reserved connections, as `reading_rows` does but with a shorter timeout."""
         with translated(), self._aside.connect() as connection:
             yield connection
 
     def expiry(self) -> float:
-        """Return the time by which things expire (`service.store.clocks`): never ahead of the clock."""
+        """Return the time by which data expire (`service.store.clocks`); it is never ahead of the clock."""
         now = self.clock()
         with self.reading_rows() as connection:
             return expiry_time(connection, now)
@@ -146,14 +149,14 @@ class Database:
             return float(connection.execute(_SERVER_TIME).scalar_one())
 
     def upgrade(self) -> None:
-        """Bring the tables to this version; of several processes that start at once one does it.
+        """Migrate the tables to this version; of several processes that start at once, one does it.
 
-        Tables of a later version are used as they are: its migrations only add, so that this version's processes go on,
-        and start, while they are replaced one by one.
+        Tables of a later version are used as they are. Its migrations only add to the schema, so processes of this
+        version keep working, and can be restarted, while they are replaced one by one.
         """
         if self.is_up_to_date():
             return
-        engine = self._make_engine(None)  # an index may take its time
+        engine = self._make_engine(None)  # creating an index may take long
         try:
             with translated(), self._upgrading(engine):
                 if not self.is_up_to_date():
@@ -162,7 +165,7 @@ class Database:
             engine.dispose()
 
     def look_back(self) -> None:
-        """Find out whether an SQLite database has gone back in time; `rolled_back` says so from then on."""
+        """Detect whether an SQLite database was rolled back to an earlier state, and set `rolled_back` if so."""
         if self._marker is not None:
             with self._upgrading(self.engine):
                 marked = self._marker.read()
@@ -172,12 +175,12 @@ class Database:
 
     @property
     def rolled_back(self) -> bool:
-        """Whether there may be files that this database should know and does not."""
+        """Whether files may exist that the database has lost its rows of."""
         return self._marker is not None and self._marker.note.exists()
 
     def is_up_to_date(self) -> bool:
-        """Whether the tables are those of this version, or of a later one."""
-        return (self._version() or "") >= SCHEMA  # numbers of four digits, in the order of the migrations
+        """Return whether the tables have this version or a later one."""
+        return (self._version() or "") >= SCHEMA  # versions have four digits and sort in the order of the migrations
 
     def close(self) -> None:
         """Close all connections."""
@@ -219,12 +222,12 @@ def _migrate(engine: Engine) -> None:
 
 
 def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:
-    """Connect to PostgreSQL."""
+    """Connect to PostgreSQL with bounded waits."""
     return impatient_connection(seconds).connect(*arguments, **options)
 
 
 def _set_pragmas(connection: Any, _record: Any, *, busy_seconds: float) -> None:
-    connection.isolation_level = None  # else the driver begins transactions by itself, and too late
+    connection.isolation_level = None  # otherwise the driver starts transactions itself, and too late
     cursor = connection.cursor()
     for pragma in (
         "journal_mode=WAL",
@@ -237,26 +240,30 @@ def _set_pragmas(connection: Any, _record: Any, *, busy_seconds: float) -> None:
 
 
 def _begin(connection: Connection) -> None:
-    """A transaction that reads first and writes later could fail halfway on SQLite: writers take the lock at once."""
+    """Start a transaction.
+
+    On SQLite, a transaction that reads first and writes later could fail halfway. Writers therefore take the lock at
+    once.
+    """
     writes = connection.get_execution_options().get("sgsst_writes")
     if writes:
         connection.exec_driver_sql("BEGIN IMMEDIATE")
-    else:  # waits for nobody, so that it has no errors which SQLAlchemy would have to name
+    else:  # never waits, so it has no errors that SQLAlchemy would have to translate
         connection.connection.cursor().execute("BEGIN")
 
 
 def new_id(prefix: str, now: float) -> str:
-    """An id that sorts by time and cannot be guessed: milliseconds, then 80 random bits."""
+    """Return an id that sorts by time and cannot be guessed: milliseconds, then 80 random bits."""
     return f"{prefix}_{int(now * 1000):011x}{secrets.token_hex(10)}"
 
 
 def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, now: float) -> IdempotencyRow:
-    """The row of an Idempotency-Key: with a `created_id` where it was used before, for that request.
+    """Return the row of an Idempotency-Key; its `created_id` is set if the key was already used for the same request.
 
     Raises:
-        IdempotencyError: it was used for another request.
+        IdempotencyError: If the key was used for a different request.
     """
-    # of two requests at once, the second waits here for the end of the first, on every database
+    # of two concurrent requests, the second waits here for the first, on every database
     insert = upsert(session)(IdempotencyRow).values(
         owner=owner, key=key, fingerprint=fingerprint, created_id="", created_at=now
     )
@@ -268,20 +275,21 @@ def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, no
 
 
 def count(session: Session, name: str, labels: str = "", amount: float = 1.0) -> None:
-    """Add to a counter, within the transaction of what is counted."""
+    """Add to a counter within the caller's transaction."""
     statement = _add_statement(session.get_bind().dialect.name)
     session.execute(statement, {"name": name, "labels": labels, "value": amount})
 
 
 def observe(session: Session, name: str, seconds: float) -> None:
-    """Add to a histogram, as `count`: to its sum, its number, and the one bucket that the value lies in.
+    """Add a value to a histogram within the caller's transaction: to its sum, its count, and the value's bucket.
 
-    Buckets are counters `NAME_bucket` with the label `le`, each without those below it; who shows them adds them up.
+    Buckets are counters `NAME_bucket` with the label `le`. Unlike in Prometheus they are not cumulative; the exporter
+    adds them up.
     """
     count(session, f"{name}_sum", amount=seconds)
     count(session, f"{name}_count")
     bound = next((bound for bound in BUCKETS if seconds <= bound), None)
-    if bound is not None:  # what is longer than all is in the number alone
+    if bound is not None:  # values above all bounds are in the count only
         count(session, f"{name}_bucket", f'le="{bound}"')
 
 
@@ -294,5 +302,5 @@ def _add_statement(dialect: str) -> Any:
 
 
 def upsert(session: Session) -> Any:
-    """The `insert` that knows ON CONFLICT, of the database that the session is on."""
+    """Return the `insert` construct with ON CONFLICT for the session's database."""
     return sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert

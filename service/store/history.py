@@ -1,8 +1,8 @@
-"""The course of a job's loss from its first step on, thinned as it is written: events keep the newest alone.
+"""History of a job's loss from the first step, thinned as it is written; events hold only the newest progress.
 
-A point is kept when the job's seconds have grown by a hundredth since the one before, which is even on the logarithmic
-axis that a loss is looked at on: 784 points in 25 hours of one attempt at a point a second. What many attempts bring
-together is halved.
+A point is stored when the job's running time has grown by one percent since the previous one. Points are thus evenly
+spaced on the logarithmic time axis of loss charts: 25 hours of an attempt with a point per second give 784 points. The
+points of jobs with many attempts are halved.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from sqlalchemy.orm import Session
 from service.store.database import upsert
 from service.store.tables import Base, ProgressPointRow
 
-#: A point is this much later than the one before it: in seconds, times these.
+#: Ratio of the running times of consecutive points.
 GROWTH = 1.01
-#: Of a job, when an attempt begins; more are halved then.
+#: Number of points of a job above which they are halved at the start of an attempt.
 MOST_POINTS = 2000
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A point of a job's course.
+    """Point of a job's loss history.
 
     Attributes:
-        attempt, step: where it stands; later ones are greater.
-        total: steps at most.
-        stage: of the job.
-        seconds: of all steps so far.
-        loss: of the step.
-        scales: the loss of each scale, full size first; None for scales that the step has left out.
-        updated_at: when it was reported, seconds since 1970.
+        attempt, step: Position of the point; later ones are greater.
+        total: Maximum number of steps.
+        stage: Stage of the job.
+        seconds: Duration of all steps so far.
+        loss: Loss of the step.
+        scales: Loss per scale, full size first; None for scales that the step left out.
+        updated_at: Time of the report in seconds since 1970.
     """
 
     attempt: int
@@ -61,10 +61,10 @@ _COUNT = select(func.count()).where(_OF_JOB)
 
 
 def keep_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
-    """Take a job's progress into its course, if it is time for a point; what has no loss is none.
+    """Store a job's progress as a point if one is due; progress without a loss is ignored.
 
     Args:
-        progress: as `Leases.report_progress` stores it.
+        progress: Progress as stored by `Leases.report_progress`.
     """
     if progress.get("loss") is None or progress.get("seconds") is None:
         return
@@ -80,7 +80,7 @@ def keep_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
 
 
 def _halve(session: Session, job_id: str) -> None:
-    """Drop every second point of a job that has too many; the first one stays."""
+    """Delete every second point of a job that has too many; the first one remains."""
     if (session.scalar(_COUNT, {"job_id": job_id}) or 0) <= MOST_POINTS:
         return
     places = session.execute(_PLACES, {"job_id": job_id}).all()
@@ -89,11 +89,11 @@ def _halve(session: Session, job_id: str) -> None:
 
 
 def points(connection: Connection, job_id: str, present: dict[str, Any] | None, most: int) -> list[Point]:
-    """A job's course: its points and, as the last of them, its present progress.
+    """Return a job's loss history: its points, and its current progress as the last one.
 
     Args:
-        present: the job's progress; None, or one without a loss, is no point.
-        most: points, 2 or more; of more, so many are taken evenly, the first and the last among them.
+        present: Current progress of the job; ignored if it is None or has no loss.
+        most: Maximum number of points, at least 2; longer histories are sampled evenly, including both ends.
     """
     found: list[Sequence[Any]] = list(connection.execute(_ALL, {"job_id": job_id}))
     if present and present.get("loss") is not None and present.get("seconds") is not None:

@@ -1,4 +1,4 @@
-"""Blobs, uploads and inspections in the store: the rows; the files are `service.files.blobs`'."""
+"""Rows of blobs, uploads and inspections; their files are managed by `service.files.blobs`."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from service.store.database import Database, idempotency_row, new_id, upsert
 from service.store.quotas import IS_RECEIPT, NO_QUOTAS, RECEIPT, Quotas, check_bytes, lock_owner
 from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadPartRow, UploadRow
 
-#: A blob that nobody refers to stays for so long: the request that brought it may not have created its job yet.
+#: Lifetime of an unreferenced blob in seconds: the request that brought it may not have created its job yet.
 GRACE_SECONDS = 3600.0
-#: Of that time: what was touched since is not touched again.
+#: Fraction of that time during which a touched blob is not touched again.
 _HOLD_SHARE = 0.1
-#: Unfinished uploads of one key.
+#: Maximum number of unfinished uploads per key.
 MAX_OPEN_UPLOADS = 1000
-#: What checking an input found is kept for so long.
+#: Lifetime of an input's inspection result in seconds.
 _INSPECTION_SECONDS = 30 * 86_400.0
 
-# Built once: building a query takes longer than answering it.
+# Built once, because building a query takes longer than running it.
 _BLOBS = select(Base.metadata.tables["blobs"]).where(BlobRow.sha256.in_(bindparam("digests", expanding=True)))
 _UPLOADS = select(Base.metadata.tables["uploads"]).where(
     UploadRow.id.in_(bindparam("ids", expanding=True)),
@@ -35,28 +35,28 @@ _INSPECTION = select(Base.metadata.tables["inspections"].c.result).where(Inspect
 
 
 def check_offset(upload: UploadRow, offset: int) -> None:
-    """Raise ConflictError where an upload's next byte is another one."""
+    """Raise ConflictError if an upload's next byte is at a different offset."""
     if upload.offset != offset:
         raise ConflictError(f"Upload-Offset is {offset}, but the next byte is {upload.offset}.", offset=upload.offset)
 
 
 class Inputs:
-    """The input part of the store."""
+    """Inputs in the store."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def add_blob(self, sha256: str, location: str, size: int, upload_id: str | None = None) -> str:
-        """Register a file's content; return the location to use, an older one if the content was there already.
+        """Register a file's content and return its location; known content keeps its earlier location.
 
         Args:
             sha256: SHA-256 of the content.
             location: Name of its file among the blobs.
-            size: Bytes of the content.
-            upload_id: Upload or receipt that brought it, and holds it from now on.
+            size: Size of the content in bytes.
+            upload_id: Upload or receipt that brought the content and holds it from now on.
 
         Raises:
-            NotFoundError: that upload is gone.
+            NotFoundError: If the upload or receipt is gone.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -69,7 +69,7 @@ class Inputs:
             return session.get_one(BlobRow, sha256, populate_existing=True).location
 
     def hold_known(self, sha256: str, size: int, upload_id: str | None) -> str | None:
-        """Hold a content for an upload or receipt, and return its location; None if it is not there yet."""
+        """Hold a known blob for an upload or receipt, and return its location; None if there is no such blob."""
         with self._database.writing() as session:
             if upload_id is not None:
                 _lock_upload(session, upload_id)
@@ -82,20 +82,20 @@ class Inputs:
             return row.location
 
     def hold(self, digests: Sequence[str]) -> dict[str, BlobRow]:
-        """Blobs by their digest, which all stay for a while from now on.
+        """Return blobs by digest, and protect them from collection for a while.
 
         Raises:
-            NotFoundError: one is gone.
+            NotFoundError: If a blob is gone.
         """
         found = self.blobs(digests)
-        # what was touched a moment ago stays long enough: submissions of one scene after another need not write it
+        # recently touched blobs are not touched again, so consecutive submissions of one scene need no write
         recent = self._database.clock() - _HOLD_SHARE * GRACE_SECONDS
         if any(sha256 not in found or found[sha256].touched_at < recent for sha256 in digests):
             with self._database.writing() as session:
                 now = self._database.clock()
                 for start in range(0, len(digests), 500):
                     mine = BlobRow.sha256.in_(digests[start : start + 500])
-                    # locked in the order of `release_blobs`
+                    # the same lock order as in `release_blobs`
                     session.execute(select(BlobRow.sha256).where(mine).order_by(BlobRow.sha256).with_for_update())
                     session.execute(update(BlobRow).where(mine).values(touched_at=now))
             found = self.blobs(digests)
@@ -105,7 +105,7 @@ class Inputs:
         return found
 
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
-        """Blobs by their digest, for a job that holds them."""
+        """Return blobs by digest, for a job that holds them."""
         found: dict[str, BlobRow] = {}
         with self._database.reading_rows() as connection:
             for start in range(0, len(digests), 500):
@@ -114,7 +114,7 @@ class Inputs:
         return found
 
     def collect(self) -> list[str]:
-        """Drop blobs that nobody has referred to for a while; returns their locations, for removing the files."""
+        """Delete the rows of blobs that have been unused for a while; return their locations for removing the files."""
         before = self._database.expiry() - GRACE_SECONDS
         used = exists().where(BlobUseRow.sha256 == BlobRow.sha256)
         with self._database.writing() as session:
@@ -126,7 +126,7 @@ class Inputs:
 
     @property
     def rolled_back(self) -> bool:
-        """Whether there may be files that the database should know and does not."""
+        """Whether files may exist that the database has lost its rows of."""
         return self._database.rolled_back
 
     def expiry(self) -> float:
@@ -134,7 +134,7 @@ class Inputs:
         return self._database.expiry()
 
     def locations(self) -> set[str]:
-        """All locations that rows refer to."""
+        """Return all locations that rows refer to."""
         with self._database.reading() as session:
             return set(session.scalars(select(BlobRow.location)))
 
@@ -149,12 +149,12 @@ class Inputs:
         quotas: Quotas = NO_QUOTAS,
         most: int = MAX_OPEN_UPLOADS,
     ) -> UploadRow:
-        """Begin an upload that expires when nothing has been heard of it for so many seconds.
+        """Create an upload that expires after `seconds` without new bytes.
 
         Raises:
-            ConflictError: the owner has `most` unfinished uploads.
-            IdempotencyError: the key was used for another upload.
-            QuotaError: its bytes would be too many for its owner.
+            ConflictError: If the owner has `most` unfinished uploads.
+            IdempotencyError: If the key was used for a different upload.
+            QuotaError: If its bytes would exceed the owner's quota.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -183,10 +183,10 @@ class Inputs:
         return row
 
     def upload(self, upload_id: str, owner: str) -> UploadRow:
-        """An upload of this owner that has not expired.
+        """Return an upload of this owner that has not expired.
 
         Raises:
-            NotFoundError: there is none.
+            NotFoundError: If there is no such upload.
         """
         with self._database.reading() as session:
             row = session.get(UploadRow, upload_id)
@@ -195,7 +195,7 @@ class Inputs:
         return row
 
     def uploads(self, upload_ids: Sequence[str], owner: str) -> dict[str, UploadRow]:
-        """Uploads of this owner by their id; those that are not there or have expired are left out."""
+        """Return uploads of this owner by id, without missing and expired ones."""
         now = self._database.clock()
         found: dict[str, UploadRow] = {}
         with self._database.reading_rows() as connection:
@@ -207,17 +207,17 @@ class Inputs:
     def advance_upload(
         self, upload_id: str, start: int, size: int, seconds: float, location: str | None = None
     ) -> float:
-        """Record bytes that were saved behind those that an upload had; return when it expires now.
+        """Record newly saved bytes of an upload and return its new expiry.
 
         Args:
             upload_id: Id of the upload.
-            start: Offset of the first of these bytes.
-            size: Number of bytes.
+            start: Offset of the first new byte.
+            size: Number of new bytes.
             seconds: Time until the upload expires.
-            location: Name of the object that holds them; None for the upload's own local file.
+            location: Name of the object with the bytes; None for the upload's local file.
 
         Raises:
-            ConflictError: Another request has saved bytes there meanwhile.
+            ConflictError: If another request has saved bytes at this offset meanwhile.
         """
         expires = self._database.clock() + seconds
         with self._database.writing() as session:
@@ -231,18 +231,18 @@ class Inputs:
         return expires
 
     def parts(self, upload_id: str) -> list[UploadPartRow]:
-        """Where the bytes of an unfinished upload are, in their order."""
+        """Return the parts of an unfinished upload in order."""
         query = select(UploadPartRow).where(UploadPartRow.upload_id == upload_id).order_by(UploadPartRow.start)
         with self._database.reading() as session:
             return list(session.scalars(query))
 
     def known_uploads(self, upload_ids: Sequence[str]) -> set[str]:
-        """Those of some uploads that are there, finished or not."""
+        """Return those of the given uploads that exist, finished or not."""
         with self._database.reading() as session:
             return set(session.scalars(select(UploadRow.id).where(UploadRow.id.in_(upload_ids))))
 
     def finish_upload(self, upload_id: str, sha256: str, seconds: float) -> None:
-        """Tie an upload to the blob that its bytes have become."""
+        """Link an upload to the blob made from its bytes."""
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None:
@@ -253,10 +253,10 @@ class Inputs:
             session.execute(use.on_conflict_do_nothing())
 
     def delete_upload(self, upload_id: str, owner: str) -> list[str]:
-        """Delete an upload; a blob that it has become stays for the jobs that use it.
+        """Delete an upload; a blob made from it remains for the jobs that use it.
 
         Returns:
-            Locations of blobs that nobody needs any more, for `Blobs.remove`.
+            Locations of blobs that nothing needs any more, for `Blobs.remove`.
         """
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
@@ -265,15 +265,15 @@ class Inputs:
             session.delete(row)
             return release_blobs(session, f"upload:{upload_id}")
 
-    # --- receipts: what requests bring themselves is charged to their owner until it is a job's, or gone ------------
+    # --- receipts: charges for the bytes of requests, until a job takes over their files -----------------------------
 
     def open_receipt(self, owner: str, size: int, quotas: Quotas) -> str:
-        """Charge an owner for the bytes of a request that is coming in; return the receipt's id.
+        """Charge an owner for the bytes of an incoming request and return the id of the receipt.
 
-        The receipt holds the blobs that the request's files become. It expires as an upload does, unless it is renewed.
+        The receipt holds the blobs made from the request's files. It expires like an upload unless it is renewed.
 
         Raises:
-            QuotaError: there would be too many bytes.
+            QuotaError: If the bytes would exceed the owner's quota.
         """
         now = self._database.clock()
         row = UploadRow(id=new_id(RECEIPT, now), owner=owner, length=size, offset=0, filename="", metadata_header="")
@@ -286,11 +286,11 @@ class Inputs:
         return row.id
 
     def grow_receipt(self, receipt: str, size: int, owner: str, quotas: Quotas) -> None:
-        """Charge more bytes, for a request that did not declare how many would come.
+        """Charge further bytes for a request that did not declare its size.
 
         Raises:
-            QuotaError: there would be too many.
-            NotFoundError: the receipt has expired.
+            QuotaError: If the bytes would exceed the owner's quota.
+            NotFoundError: If the receipt has expired.
         """
         with self._database.writing() as session:
             lock_owner(session, owner)
@@ -299,23 +299,23 @@ class Inputs:
             check_bytes(session, owner, quotas)
 
     def renew_receipts(self, receipts: Sequence[str]) -> None:
-        """Keep the receipts of requests that are still at work from expiring."""
+        """Extend the receipts of active requests."""
         with self._database.writing() as session:
             expires = self._database.clock() + GRACE_SECONDS
             session.execute(update(UploadRow).where(UploadRow.id.in_(receipts)).values(expires_at=expires))
 
     def end_receipt(self, receipt: str) -> list[str]:
-        """Delete a receipt whose request has ended without a job.
+        """Delete the receipt of a request that ended without a job.
 
         Returns:
-            Locations of blobs that nobody needs any more, for `Blobs.remove`.
+            Locations of blobs that nothing needs any more, for `Blobs.remove`.
         """
         with self._database.writing() as session:
             session.execute(delete(UploadRow).where(UploadRow.id == receipt))
             return release_blobs(session, f"upload:{receipt}")
 
     def expire_uploads(self) -> list[str]:
-        """Forget uploads whose time is over; returns their ids, for removing what has arrived of them."""
+        """Delete expired uploads and return their ids for removing their bytes."""
         now = self._database.expiry()
         with self._database.writing() as session:
             query = select(UploadRow).where(UploadRow.expires_at < now).limit(500)
@@ -326,18 +326,18 @@ class Inputs:
             return [row.id for row in rows]
 
     def open_uploads(self, owner: str) -> int:
-        """How many unfinished uploads this owner has."""
+        """Return the number of unfinished uploads of this owner."""
         with self._database.reading() as session:
             return _count_open_uploads(session, owner)
 
     def inspection(self, key: str) -> dict[str, Any] | None:
-        """What an earlier check of the same content found."""
+        """Return the result of an earlier inspection of the same content; None if there is none."""
         with self._database.reading_rows() as connection:
             found: dict[str, Any] | None = connection.execute(_INSPECTION, {"key": key}).scalar()
             return found
 
     def add_inspection(self, key: str, result: dict[str, Any]) -> None:
-        """Remember what a check found, and forget what is old."""
+        """Store the result of an inspection, and delete old results."""
         now = self._database.clock()
         with self._database.writing() as session:
             insert = upsert(session)(InspectionRow).values(key=key, result=result, created_at=now)
@@ -346,13 +346,13 @@ class Inputs:
 
 
 def hand_over(session: Session, receipt: str) -> None:
-    """Delete a receipt whose blobs a job of the same transaction holds by now."""
+    """Delete a receipt whose blobs are now held by a job of the same transaction."""
     session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{receipt}"))
     session.execute(delete(UploadRow).where(UploadRow.id == receipt))
 
 
 def _lock_upload(session: Session, upload_id: str) -> UploadRow:
-    """Return an upload's row, locked before any blob's."""
+    """Return an upload's row, locked before any blob's row."""
     row = session.get(UploadRow, upload_id, with_for_update=True)
     if row is None:
         raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
@@ -360,7 +360,7 @@ def _lock_upload(session: Session, upload_id: str) -> UploadRow:
 
 
 def _hold_for_upload(session: Session, upload_id: str, sha256: str, size: int) -> None:
-    """Hold a blob for an upload or receipt; a receipt's charge moves from the bytes on their way in to the blob."""
+    """Hold a blob for an upload or receipt; a receipt's charge moves from the incoming bytes to the blob."""
     use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
     session.execute(use.on_conflict_do_nothing())
     mine = update(UploadRow).where(UploadRow.id == upload_id, IS_RECEIPT).values(length=UploadRow.length - size)

@@ -1,4 +1,4 @@
-"""Jobs as their users see them: created, listed, shown, canceled, retried and deleted, with their files and events."""
+"""Operations of users on their jobs: create, list, cancel, retry and delete them, and read their files and events."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 _JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
     Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blob_uses")
 )
-# What is asked most, built once: building a query takes longer than answering it.
+# Frequent queries are built once, because building a query takes longer than running it.
 _JOB = select(_JOBS).where(_JOBS.c.id == bindparam("job_id"))
 _ATTEMPTS_OF = select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == bindparam("job_id")).order_by(_ATTEMPTS.c.number)
-# Names of previews sort by their steps.
+# Names of previews sort by step.
 _NEWEST_PREVIEWS = (
     select(_ARTIFACTS.c.job_id, func.max(_ARTIFACTS.c.name).label("newest"))
     .where(_ARTIFACTS.c.job_id.in_(bindparam("ids", expanding=True)), _ARTIFACTS.c.name.like("previews/%"))
@@ -36,7 +36,7 @@ _UNFINISHED_OF = select(func.count()).where(_JOBS.c.owner == bindparam("owner"),
 
 
 def _count_ahead() -> Select[int]:
-    """How many queued jobs come before one: two ranges of the queue's index."""
+    """Return the query that counts the queued jobs ahead of one: two ranges of the queue's index."""
     queued = select(func.count()).select_from(_JOBS).where(_JOBS.c.status == JobStatus.QUEUED)
     higher = queued.where(_JOBS.c.priority > bindparam("priority"))
     own_place = tuple_(bindparam("queued_at", type_=Float), bindparam("job_id", type_=String))
@@ -49,10 +49,10 @@ _AHEAD = _count_ahead()
 
 @dataclass(frozen=True)
 class NewJob:
-    """What a job is created from.
+    """Values of a job to be created.
 
     Attributes:
-        inputs: for each file its `role`, `name`, `sha256` and `size`.
+        inputs: `role`, `name`, `sha256` and `size` of each file.
     """
 
     owner: str
@@ -65,17 +65,17 @@ class NewJob:
 
 @dataclass(frozen=True)
 class Idempotency:
-    """The key that a client gave a request, and a digest of the request."""
+    """Idempotency-Key of a request, with a digest of the request."""
 
     key: str
     fingerprint: str
 
 
 class Jobs:
-    """The users' part of the store.
+    """Jobs of users in the store.
 
     Args:
-        retention: seconds that the results of a job that has ended are kept.
+        retention: Time in seconds until the results of an ended job expire.
     """
 
     def __init__(self, database: Database, retention: float) -> None:
@@ -91,23 +91,23 @@ class Jobs:
         idempotency: Idempotency | None = None,
         receipt: str | None = None,
     ) -> tuple[JobRow, bool]:
-        """Queue a job; its blobs are held from now on.
+        """Queue a job and hold its blobs.
 
         Args:
             new: Job to queue.
-            limit: Unfinished jobs that the owner may have.
+            limit: Maximum number of unfinished jobs of the owner.
             quotas: Quotas of the owner.
             idempotency: Idempotency-Key of the request; None for none.
-            receipt: Receipt of the files that the request brought; a new job takes them over. None for no files.
+            receipt: Receipt for the request's files, which a new job takes over; None if the request has no files.
 
         Returns:
-            The job, and whether it is new: with an Idempotency-Key that was used before it is the job of that time.
+            Job, and whether it is new; if the Idempotency-Key was used before, the job created then.
 
         Raises:
-            IdempotencyError: the key was used for another request.
-            QueueFullError: the owner has `limit` unfinished jobs.
-            QuotaError: it would exceed one of the owner's quotas.
-            NotFoundError: an input was deleted meanwhile.
+            IdempotencyError: If the key was used for a different request.
+            QueueFullError: If the owner has `limit` unfinished jobs.
+            QuotaError: If the job would exceed one of the owner's quotas.
+            NotFoundError: If an input was deleted meanwhile.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -140,19 +140,19 @@ class Jobs:
         return job, True
 
     def get(self, job_id: str, owner: str | None) -> JobRow:
-        """A job of this owner; of anybody for None.
+        """Return a job of this owner, or of any owner if None.
 
         Raises:
-            NotFoundError: there is none, or it is another's.
+            NotFoundError: If there is no such job or it belongs to another owner.
         """
         with self._database.reading() as session:
             return _job_of_owner(session, job_id, owner)
 
     def detail(self, job_id: str, owner: str | None) -> tuple[JobRow, int | None, list[AttemptRow], str | None]:
-        """A job, its place in the queue, its attempts and its newest picture's name, as of one moment.
+        """Return a job, its queue position, its attempts, and the name of its newest preview, all in one snapshot.
 
         Raises:
-            NotFoundError: as `get`.
+            NotFoundError: If there is no such job or it belongs to another owner.
         """
         with self._database.reading_rows() as connection:
             row = connection.execute(_JOB, {"job_id": job_id}).one_or_none()
@@ -167,7 +167,7 @@ class Jobs:
     def page(
         self, owner: str | None, *, status: Sequence[str] = (), before: str | None = None, limit: int = 50
     ) -> list[JobRow]:
-        """Jobs of an owner, the newest first, those older than the job `before`."""
+        """Return a page of an owner's jobs, newest first, starting after the job `before`."""
         query = select(JobRow).order_by(JobRow.id.desc()).limit(limit)
         if owner is not None:
             query = query.where(JobRow.owner == owner)
@@ -179,18 +179,20 @@ class Jobs:
             return list(session.scalars(query))
 
     def queue_position(self, job: JobRow) -> int | None:
-        """How many queued jobs are ahead by priority and age, plus one; None for a job that is not queued.
+        """Return the number of queued jobs ahead by priority and age, plus one; None if the job is not queued.
 
-        Turns between owners, which change with every lease, are left out.
+        Turns between owners are ignored, because they change with every lease.
         """
         with self._database.reading_rows() as connection:
             return _queue_position(connection, job)
 
     def cancel(self, job_id: str, owner: str | None) -> JobRow:
-        """Cancel a job: at once where it is queued, else as soon as its dispatcher sees it.
+        """Cancel a job: immediately if it is queued, otherwise as soon as its dispatcher notices.
+
+        A job that is already canceled is returned unchanged.
 
         Raises:
-            ConflictError: it has ended otherwise. A canceled job is returned as it is.
+            ConflictError: If the job has ended in another way.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -204,14 +206,14 @@ class Jobs:
         return job
 
     def retry(self, job_id: str, owner: str | None, *, limit: int, quotas: Quotas = NO_QUOTAS) -> JobRow:
-        """Queue a failed or canceled job again; it continues from its last checkpoint, if it has one.
+        """Queue a failed or canceled job again; it resumes from its last checkpoint if there is one.
 
-        A retry counts as one of the day's jobs.
+        A retry counts toward the day's jobs.
 
         Raises:
-            ConflictError: it is in another state.
-            QueueFullError: the owner has `limit` unfinished jobs.
-            QuotaError: it would exceed one of the owner's quotas.
+            ConflictError: If the job has another status.
+            QueueFullError: If the owner has `limit` unfinished jobs.
+            QuotaError: If the job would exceed one of the owner's quotas.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -231,13 +233,13 @@ class Jobs:
         return job
 
     def delete(self, job_id: str, owner: str | None) -> list[str]:
-        """Delete a job that has ended, and let go of its inputs. Its results are the caller's to remove, afterwards.
+        """Delete an ended job and release its inputs; the caller removes its results afterwards.
 
         Returns:
-            Locations of inputs that nobody needs any more, for `Blobs.remove`.
+            Locations of inputs that nothing needs any more, for `Blobs.remove`.
 
         Raises:
-            ConflictError: it has not ended.
+            ConflictError: If the job has not ended.
         """
         with self._database.writing() as session:
             job = _job_of_owner(session, job_id, owner, lock=True)
@@ -249,21 +251,21 @@ class Jobs:
             return forget(session, job)
 
     def artifacts(self, job_id: str) -> list[ArtifactRow]:
-        """The published files of a job, by name; those for the service alone start with a dot."""
+        """Return the published files of a job by name; internal ones start with a dot."""
         with self._database.reading() as session:
             found = select(ArtifactRow).where(ArtifactRow.job_id == job_id).order_by(ArtifactRow.name)
             return list(session.scalars(found))
 
     def artifact(self, job_id: str, name: str) -> ArtifactRow | None:
-        """One published file."""
+        """Return a published file; None if there is none."""
         with self._database.reading() as session:
             return session.get(ArtifactRow, (job_id, name))
 
     def add_made(self, source: ArtifactRow, files: Sequence[Published]) -> list[str]:
-        """Make files visible that were made from a published one, unless that is no longer there.
+        """Publish files derived from a published one, unless that one is gone.
 
         Returns:
-            Locations of those that no row refers to: others were faster, or their job is gone.
+            Locations of files without a row: others were faster, or the job is gone.
         """
         unused = []
         with self._database.writing() as session:
@@ -278,30 +280,29 @@ class Jobs:
         return unused
 
     def course(self, job: JobRow, most: int) -> list[Point]:
-        """The course of a job's loss from its first step to its present one, in `most` points or fewer."""
+        """Return a job's loss history up to its current step, in at most `most` points."""
         with self._database.reading_rows() as connection:
             return points(connection, job.id, job.progress, most)
 
     def previews(self, job_ids: Sequence[str]) -> dict[str, str]:
-        """The name of the newest picture of each job; jobs without one are left out."""
+        """Return the name of the newest preview of each job; jobs without previews are left out."""
         with self._database.reading_rows() as connection:
             return _newest_previews(connection, job_ids)
 
     def events(self, job_id: str, after: int, limit: int = 500) -> list[EventRow]:
-        """What happened to a job after the event of that number."""
+        """Return a job's events after the event number `after`."""
         query = select(EventRow).where(EventRow.job_id == job_id, EventRow.id > after)
         with self._database.reading() as session:
             return list(session.scalars(query.order_by(EventRow.id).limit(limit)))
 
     def last_events(self, job_ids: Sequence[str]) -> dict[str, int]:
-        """The number of the newest event of each job; jobs without events, or that are gone, are left out."""
+        """Return the number of the newest event of each job; jobs without events and missing jobs are left out."""
         query = select(EventRow.job_id, func.max(EventRow.id)).where(EventRow.job_id.in_(job_ids))
         with self._database.reading() as session:
             return dict(session.execute(query.group_by(EventRow.job_id)).tuples().all())
 
 
 def _row_of_new_job(new: NewJob, now: float) -> dict[str, Any]:
-    """The row of a job that has just been accepted."""
     return {
         "id": new_id("job", now),
         "owner": new.owner,

@@ -12,28 +12,28 @@ from service.store.database import Database, new_id
 from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import Base, KeyRow
 
-#: What every key starts with, so that secret scanners can find one that got lost.
+#: Prefix of all keys, by which secret scanners recognize a leaked key.
 KEY_PREFIX = "sgsst_"
 
 _KEY = select(Base.metadata.tables["api_keys"]).where(KeyRow.sha256 == bindparam("sha256"))
 
 
 def digest(key: str) -> str:
-    """What is stored of a key. It has 256 random bits, so that no salt and no slow hash is needed."""
+    """Return the stored digest of a key; its 256 random bits make a salt or a slow hash unnecessary."""
     return hashlib.sha256(key.encode()).hexdigest()
 
 
 class Keys:
-    """API keys; a key's id is the owner of what its holder creates."""
+    """API keys; a key's id is the owner of everything created with it."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def create(self, name: str, priority: int = 0, quotas: Quotas = NO_QUOTAS) -> tuple[KeyRow, str]:
-        """A new key, and the only copy of its text.
+        """Create a key; return its row and the only copy of its text.
 
         Args:
-            quotas: its own; for what they leave open, the service's hold.
+            quotas: Quotas of the key; the service's defaults apply where they are None.
         """
         text = KEY_PREFIX + secrets.token_urlsafe(32)
         now = self._database.clock()
@@ -44,15 +44,15 @@ class Keys:
         return row, text
 
     def all(self) -> list[KeyRow]:
-        """All keys, the oldest first."""
+        """Return all keys, oldest first."""
         with self._database.reading() as session:
             return list(session.scalars(select(KeyRow).order_by(KeyRow.id)))
 
     def revoke(self, key_id: str) -> KeyRow:
-        """Make a key useless from now on; what it created stays until it expires.
+        """Revoke a key; objects created with it remain until they expire.
 
         Raises:
-            NotFoundError: there is no such key.
+            NotFoundError: If there is no such key.
         """
         with self._database.writing() as session:
             row = session.get(KeyRow, key_id, with_for_update=True)
@@ -62,7 +62,7 @@ class Keys:
             return row
 
     def find(self, text: str) -> KeyRow | None:
-        """The key of this text, unless it is unknown or revoked."""
+        """Return the key with this text; None if it is unknown or revoked."""
         with self._database.reading_rows() as connection:
             row = connection.execute(_KEY, {"sha256": digest(text)}).one_or_none()
         return KeyRow(**row._mapping) if row is not None and row.revoked_at is None else None

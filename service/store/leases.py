@@ -1,8 +1,8 @@
-"""Leases of jobs: what a dispatcher does with a job, from taking it to its end.
+"""Leases of jobs: all operations of a dispatcher on a job, from taking it to its end.
 
-A job is leased for a few seconds at a time by the dispatcher that runs it. Each lease of a job has a number, its epoch;
-every write of a dispatcher names the epoch that it holds and does nothing but raise `LeaseLostError` where the job has
-been leased again since. So two dispatchers may both believe that they run a job, and still only one can write.
+A dispatcher leases the job that it runs for a few seconds at a time. Each lease of a job has a number, its epoch. Every
+write of a dispatcher names the epoch that it holds, and raises `LeaseLostError` without effect if the job has been
+leased again since. Two dispatchers may thus both believe that they run a job, but only one of them can write.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from sgsst_core.errors import InfrastructureError
 
 #: Expiry of a lease whose dispatcher is known to be dead.
 RUN_OUT = 0.0
-#: Progress events of a job that are kept; who resumes a stream from before them has missed nothing but old progress.
+#: Number of progress events stored per job; a client that resumes from an older event misses only old progress.
 KEPT_PROGRESS = 200
-#: Attempts that are looked back at for how long to wait: by then the wait is as long as it gets.
+#: Maximum number of past attempts counted for the retry delay: by then the delay is at its maximum.
 _OUTAGES = 20
-#: Jobs of different owners that are looked at for one that may run in kept room.
+#: Maximum number of candidates for backfilling, each from a different owner.
 _BACKFILLED = 16
 
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to write to a job, until somebody else has a higher epoch."""
+    """Right to write to a job until another lease has a higher epoch."""
 
     job: JobRow
     dispatcher: str
@@ -45,13 +45,13 @@ class Lease:
 
     @property
     def job_id(self) -> str:
-        """The job's id."""
+        """Id of the job."""
         return self.job.id
 
 
 @dataclass(frozen=True)
 class Published:
-    """A file that was put to its place, for the row that makes it visible; `step` is a checkpoint's."""
+    """Stored file, to be made visible by a row; `step` is set for checkpoints."""
 
     name: str
     location: str
@@ -61,12 +61,12 @@ class Published:
 
 
 class Leases:
-    """The dispatchers' part of the store.
+    """Operations of dispatchers on the store.
 
     Args:
-        seconds: after which a lease that was not renewed runs out.
-        policy: what becomes of a job whose attempt failed.
-        retention: seconds that the results of a job that has ended are kept.
+        seconds: Duration of a lease.
+        policy: Policy for jobs whose attempts failed.
+        retention: Time in seconds until the results of an ended job expire.
     """
 
     def __init__(self, database: Database, seconds: float, policy: RetryPolicy, retention: float) -> None:
@@ -85,22 +85,25 @@ class Leases:
         before: Callable[[JobRow], Callable[[JobRow], bool] | None] = lambda kept: None,
         is_lost: Callable[[JobRow], bool] = lambda job: True,
     ) -> Lease | None:
-        """Take the next job: the highest priority, then the owner who has waited longest, then the oldest job.
+        """Take the next job: by highest priority, then the owner who has waited longest, then the oldest job.
 
-        Jobs whose lease has run out come with the queued ones. One that has used up its attempts ends as failed
-        here, one that was being canceled as canceled, and the next is looked at.
+        Jobs with expired leases are candidates like queued ones. If such a job has used up its attempts, it is ended as
+        failed, and if it was being canceled, as canceled; then the next job is tried.
 
-        A job that there is no room for is reserved: this dispatcher takes no other one of its priority until it fits,
-        so that smaller jobs do not overtake it for ever. Other dispatchers take it where it fits them first, and pass
-        it over where it does not: one big job holds up one of them and not all. What may go `before` the job that room
-        is kept for is taken meanwhile, and the room stays kept.
+        A job that does not fit is reserved: this dispatcher takes no other job of its priority until it fits, so that
+        smaller jobs do not overtake it forever. Another dispatcher takes it if it fits there first, and skips it
+        otherwise, so a large job blocks one dispatcher rather than all. Jobs that may run `before` the reserved one are
+        taken meanwhile, and the reservation remains.
 
         Args:
-            dispatcher: its name.
-            fits: whether there is room for a job.
-            keeps: whether room is to be kept for a job that there is none for; one that is not is passed over.
-            before: of a job that room is kept for, tells which jobs are no hindrance to it; None for no job.
-            is_lost: Whether a job whose lease has run out by the clock may be taken over; others are passed over.
+            dispatcher: Name of the dispatcher.
+            fits: Callback that returns whether there is capacity for a job.
+            keeps: Callback that returns whether to reserve capacity for a job that does not fit; other jobs are
+                skipped.
+            before: Callback that returns, for a reserved job, the condition for jobs that do not delay it; None for no
+                job.
+            is_lost: Callback that returns whether a job with an expired lease may be taken over; other jobs are
+                skipped.
         """
         passed: list[str] = []
         while True:
@@ -117,14 +120,14 @@ class Leases:
                     continue
                 if fits(job):
                     return self._lease(session, job, dispatcher, now)
-                if lost:  # else the same loss would count again the next time that somebody looks
+                if lost:  # otherwise the same loss would be counted again next time
                     self._requeue(session, job, now, now)
                 if keeps(job) and reserve(session, job.id, dispatcher, now, self._seconds):
                     return self._backfill(session, dispatcher, now, [*passed, job.id], before(job))
                 passed.append(job.id)
 
     def waiting(self, most: int = 1_000_000) -> int:
-        """How many jobs could be leased now; more than `most` are not counted."""
+        """Return the number of jobs that could be leased now, counting up to `most`."""
         now = self._database.clock()
         found = 0
         with self._database.reading_rows() as connection:
@@ -140,7 +143,7 @@ class Leases:
         passed: Sequence[str],
         harmless: Callable[[JobRow], bool] | None,
     ) -> Lease | None:
-        """The first of the next jobs that is no hindrance to the one that room is kept for."""
+        """Lease the first of the next jobs that does not delay the reserved one."""
         if harmless is None:
             return None
         for job in next_jobs(session, dispatcher, now, passed, _BACKFILLED):
@@ -149,7 +152,7 @@ class Leases:
         return None
 
     def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float, *, keep: bool = False) -> Lease:
-        """`keep`: the room that the dispatcher keeps for another job."""
+        """Lease a job; `keep` preserves the dispatcher's reservation for another one."""
         job.attempt += 1
         job.lease_epoch += 1
         job.lease_owner, job.lease_expires_at = dispatcher, now + self._seconds
@@ -168,7 +171,7 @@ class Leases:
         return Lease(job, dispatcher, job.lease_epoch)
 
     def renew(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
-        """Hold leases for another term; a job's status where it is still held, None where the lease is lost."""
+        """Renew leases; return the status of each job, or None if its lease is lost."""
         until = self._database.clock() + self._seconds
         found: dict[str, JobStatus | None] = {}
         with self._database.writing() as session:
@@ -180,7 +183,7 @@ class Leases:
         return found
 
     def statuses(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
-        """As `renew`, without renewing: what has become of leased jobs."""
+        """Return the status of leased jobs as `renew` does, without renewing."""
         ids = [lease.job_id for lease in leases]
         with self._database.reading() as session:
             rows = {row.id: row for row in session.scalars(select(JobRow).where(JobRow.id.in_(ids)))}
@@ -190,20 +193,20 @@ class Leases:
         }
 
     def holders(self) -> list[str]:
-        """Names of all dispatchers that hold a lease."""
+        """Return the names of all dispatchers that hold a lease."""
         with self._database.reading() as session:
             query = select(JobRow.lease_owner).where(JobRow.status.in_(ACTIVE), JobRow.lease_owner.is_not(None))
             return sorted({str(owner) for owner in session.scalars(query)})
 
     def run_out(self, dispatcher: str) -> None:
-        """Let the leases of a dispatcher run out now, and its reservation: it is known to be dead."""
+        """Expire the leases and the reservation of a dispatcher that is known to be dead."""
         with self._database.writing() as session:
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
             session.execute(update(JobRow).where(held).values(lease_expires_at=RUN_OUT))
             session.execute(delete(ReservationRow).where(mine(dispatcher)))
 
     def hold_gpus(self, lease: Lease, gpus: int) -> None:
-        """From now on the attempt holds so many GPUs; what it held until now is counted for the job's owner."""
+        """Set the number of GPUs that the attempt holds, and charge its usage so far to the job's owner."""
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
@@ -214,7 +217,7 @@ class Leases:
     # --- while the job runs ----------------------------------------------------------------------------------------
 
     def begin(self, lease: Lease) -> None:
-        """Tell that the job's inputs are read and its steps begin; a job that is being canceled stays so."""
+        """Mark a job as running once its inputs are read; a job that is being canceled keeps its status."""
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
@@ -222,9 +225,9 @@ class Leases:
                 move(session, job, Transition.BEGIN, now)
 
     def report_progress(self, lease: Lease, progress: dict[str, Any]) -> None:
-        """Replace the job's progress, and take it into the course of its loss (`history`).
+        """Replace the job's progress and add it to the loss history (`history`).
 
-        Of all that dispatchers write this is most by far: it takes as few statements as can be.
+        This is by far the most frequent write of dispatchers, so it uses as few statements as possible.
         """
         now = self._database.clock()
         data = {**progress, "updated_at": now}
@@ -239,7 +242,7 @@ class Leases:
             session.execute(_FORGET_PROGRESS, {"of_job": lease.job_id})
 
     def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
-        """Make files visible; those of the same names are replaced. Returns locations that nothing refers to now."""
+        """Publish files, replacing those of the same names; return locations that nothing refers to any more."""
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
@@ -248,7 +251,7 @@ class Leases:
     # --- the end of an attempt -------------------------------------------------------------------------------------
 
     def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> list[str]:
-        """End a job with its results, all in one transaction; as `publish` otherwise.
+        """End a job as succeeded and publish its results in one transaction, as `publish` does.
 
         A job whose cancellation came too late has succeeded.
         """
@@ -256,7 +259,7 @@ class Leases:
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
             unused = _publish(session, job, files, now)
-            hidden = ArtifactRow.name.startswith(".")  # what an unfinished job would go on from
+            hidden = ArtifactRow.name.startswith(".")  # the checkpoint of an unfinished job
             session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, hidden))
             job.result, job.error = result, None
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
@@ -265,17 +268,17 @@ class Leases:
             return unused
 
     def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool) -> bool:
-        """End an attempt that failed: the job is queued again after a wait, or has failed for good (`retries`).
+        """End a failed attempt: the job is queued again after a delay, or fails (`retries`).
 
-        An error with the code of `InfrastructureError` is never for good.
+        An error with the code of `InfrastructureError` is never permanent.
 
         Args:
-            lease: of the job.
+            lease: Lease of the job.
             error: `code` and `message`.
-            permanent: another attempt would fail the same way.
+            permanent: Whether another attempt would fail in the same way.
 
         Returns:
-            Whether the job will be tried again.
+            Whether the job will be retried.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -290,7 +293,7 @@ class Leases:
             return True
 
     def release(self, lease: Lease) -> None:
-        """Give a job back unfinished, without counting the attempt as failed: the dispatcher is shutting down."""
+        """Return an unfinished job to the queue without counting a failure, because the dispatcher is shutting down."""
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
@@ -309,7 +312,7 @@ class Leases:
             end(session, job, Transition.STOP, now, self._retention)
 
     def _close_lost(self, session: Session, job: JobRow, now: float) -> bool:
-        """Close the attempt of a dispatcher that was not heard of again; True if the job has ended with it."""
+        """Close the attempt of a lost dispatcher; return whether the job has ended with it."""
         error = {"code": "dispatcher-lost", "message": "The process that ran the job was not heard of again."}
         verdict = self._close(session, job, AttemptOutcome.LOST, error, now)
         count(session, "sgsst_lease_expirations_total")
@@ -330,7 +333,7 @@ class Leases:
         *,
         permanent: bool = False,
     ) -> Verdict:
-        """Close an attempt, and count it where it failed; returns what is to become of the job."""
+        """Close an attempt and count it if it failed; return the verdict on the job."""
         _close_attempt(session, job, outcome, error, now)
         before, status = FailureCount(job.failures, job.failed_step), JobStatus(job.status)
         if error is not None and error["code"] == InfrastructureError.code:
@@ -361,7 +364,7 @@ class Leases:
 
 
 def _forget_progress() -> Delete:
-    """All but the last progress events of a job."""
+    """Return the statement that deletes all but the last progress events of a job."""
     mine = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
     newest = select(EventRow.id).where(mine).order_by(EventRow.id.desc()).offset(KEPT_PROGRESS).limit(1)
     return delete(EventRow).where(mine, EventRow.id <= newest.scalar_subquery())
@@ -397,7 +400,7 @@ def _publish(session: Session, job: JobRow, files: Sequence[Published], now: flo
 
 
 def _outages(session: Session, job: JobRow) -> int:
-    """How many of the last attempts in a row ended because of a machine, a network or the store of files."""
+    """Return the number of most recent consecutive attempts that ended by an outage."""
     query = select(AttemptRow.error).where(AttemptRow.job_id == job.id).order_by(AttemptRow.number.desc())
     count = 0
     for error in session.scalars(query.limit(_OUTAGES)):
@@ -418,6 +421,6 @@ def _close_attempt(
     attempt = session.get(AttemptRow, (job.id, job.attempt))
     if attempt is not None:
         attempt.finished_at, attempt.outcome, attempt.error = now, outcome, error
-        if outcome != AttemptOutcome.LOST:  # nobody knows how long it has worked, and that was not its owner's doing
+        if outcome != AttemptOutcome.LOST:  # its working time is unknown, and the loss is not the owner's fault
             _count_gpus(session, job, attempt, now)
     count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')

@@ -1,4 +1,4 @@
-"""What monitoring and webhooks keep in the store: dispatchers, counters, secrets and messages."""
+"""Data for monitoring and webhooks in the store: dispatchers, counters, secrets and messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from service.store.database import Database, upsert
 from service.store.states import JobStatus
 from service.store.tables import CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
 
-#: Dispatchers that were heard of within a lease's time. A heartbeat of the future is that of a wrong clock.
+#: Live dispatchers: those with a heartbeat within a lease duration. A heartbeat far in the future comes from a wrong
+#: clock.
 _IS_ALIVE = DispatcherRow.seen_at.between(bindparam("since"), bindparam("until"))
 _ALIVE = select(func.count()).select_from(DispatcherRow).where(_IS_ALIVE)
 
@@ -25,11 +26,11 @@ class Delivery:
     """Message that a dispatcher has taken to send.
 
     Attributes:
-        id, job_id: Of the message, and of the job that it is about.
+        id, job_id: Ids of the message and of its job.
         owner: Owner of the job; empty if the job is deleted.
         url: Receiver.
         body: JSON to send.
-        tries: Attempts, this one included.
+        tries: Number of attempts, including this one.
     """
 
     id: str
@@ -41,19 +42,19 @@ class Delivery:
 
 
 def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
-    """Return the count of a column's value."""
+    """Return an expression that maps a column's value to its count."""
     return case(dict(counts), value=column, else_=0) if counts else literal(0)
 
 
 class Operations:
-    """What monitoring and webhooks need."""
+    """Operations for monitoring and webhooks."""
 
     def __init__(self, database: Database, lease_seconds: float) -> None:
         self._database = database
         self._lease_seconds = lease_seconds
 
     def beat(self, name: str, places: int, free: int) -> None:
-        """Record that a dispatcher is alive, and how much room it has."""
+        """Record a dispatcher's heartbeat with its total and free capacity."""
         now = self._database.clock()
         values = {"seen_at": now, "places": places, "free": free}
         with self._database.writing() as session:
@@ -61,34 +62,34 @@ class Operations:
             session.execute(insert.on_conflict_do_update(index_elements=["name"], set_=values))
 
     def gone(self, name: str) -> None:
-        """A dispatcher has ended."""
+        """Remove a dispatcher that has ended."""
         with self._database.writing() as session:
             session.execute(delete(DispatcherRow).where(DispatcherRow.name == name))
 
     def dispatchers(self) -> list[DispatcherRow]:
-        """Return those that are alive: heard of within a lease's time."""
+        """Return the live dispatchers: those with a heartbeat within a lease duration."""
         span = self._span()
         with self._database.reading() as session:
             return list(session.scalars(select(DispatcherRow).where(_IS_ALIVE).order_by(DispatcherRow.name), span))
 
     def alive(self) -> int:
-        """Return how many dispatchers are alive."""
+        """Return the number of live dispatchers."""
         span = self._span()
         with self._database.reading_rows() as connection:
             return connection.execute(_ALIVE, span).scalar_one()
 
     def check(self) -> int:
-        """Prove that the database answers, as health checks do; returns how many dispatchers are alive.
+        """Query the database for a health check, and return the number of live dispatchers.
 
         Raises:
-            DatabaseUnavailableError: The database does not answer within some seconds.
+            DatabaseUnavailableError: If the database does not respond within some seconds.
         """
         span = self._span()
         with self._database.aside() as connection:
             return connection.execute(_ALIVE, span).scalar_one()
 
     def heartbeats(self) -> dict[str, float]:
-        """Return when each dispatcher was heard of last, by its own clock and whether it is alive or not."""
+        """Return the time of each dispatcher's last heartbeat by its own clock, for dead dispatchers too."""
         with self._database.reading() as session:
             return dict(session.execute(select(DispatcherRow.name, DispatcherRow.seen_at)).tuples().all())
 
@@ -97,31 +98,31 @@ class Operations:
         return {"since": now - self._lease_seconds, "until": now + self._lease_seconds}
 
     def counters(self) -> list[tuple[str, str, float]]:
-        """Name, labels and value of every counter."""
+        """Return name, labels and value of every counter."""
         with self._database.reading() as session:
             rows = session.scalars(select(CounterRow).order_by(CounterRow.name, CounterRow.labels)).all()
         return [(row.name, row.labels, row.value) for row in rows]
 
     def depths(self) -> dict[str, int]:
-        """Jobs by status."""
+        """Return the number of jobs by status."""
         query = select(JobRow.status, func.count()).group_by(JobRow.status)
         with self._database.reading() as session:
             return dict(session.execute(query).tuples().all())
 
     def oldest_queued(self) -> float:
-        """Seconds that the oldest queued job has waited; 0 where none waits."""
+        """Return the waiting time of the oldest queued job in seconds; 0 if none is queued."""
         with self._database.reading() as session:
             oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == JobStatus.QUEUED))
         return 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
 
     def steps_and_seconds(self) -> list[tuple[int, float]]:
-        """Steps that each running job has made, and the seconds that they took."""
+        """Return the number of steps of each running job, and their duration in seconds."""
         with self._database.reading() as session:
             found = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
         return [(progress["step"], progress["seconds"]) for progress in found if progress and progress.get("seconds")]
 
     def webhook_secret(self) -> str:
-        """The secret that signs webhooks, in the form of Standard Webhooks; made at first use."""
+        """Return the secret that signs webhooks, in the format of Standard Webhooks; it is created on first use."""
         made = "whsec_" + base64.b64encode(secrets.token_bytes(32)).decode()
         with self._database.writing() as session:
             insert = upsert(session)(SecretRow).values(name="webhooks", value=made)
@@ -131,15 +132,15 @@ class Operations:
     def due_deliveries(
         self, hold_seconds: float, sending: Collection[Delivery], *, total: int, per_owner: int, per_url: int
     ) -> list[Delivery]:
-        """Take messages that are due; no other dispatcher gets them for `hold_seconds`.
+        """Take due messages; no other dispatcher gets them for `hold_seconds`.
 
         Args:
-            sending: Messages that this dispatcher is sending already; they count toward the limits.
-            total, per_owner, per_url: Most messages that are sent at the same time. Thanks to the latter two, neither a
-                receiver that does not answer nor an owner with many of them delays the messages of others.
+            sending: Messages that this dispatcher is already sending; they count toward the limits.
+            total, per_owner, per_url: Maximum numbers of messages sent at the same time. The latter two keep a receiver
+                that does not respond, or an owner with many such receivers, from delaying the messages of others.
         """
         now = self._database.clock()
-        owner = func.coalesce(JobRow.owner, "")  # messages of deleted jobs share one turn
+        owner = func.coalesce(JobRow.owner, "")  # messages of deleted jobs count as one owner's
         per_url_rank = func.row_number().over(partition_by=DeliveryRow.url, order_by=DeliveryRow.next_at)
         due = (
             select(DeliveryRow.id, DeliveryRow.next_at, owner.label("owner"))
@@ -176,7 +177,7 @@ class Operations:
             return taken
 
     def settle_delivery(self, delivery_id: str, wait_seconds: float | None) -> None:
-        """Delete a message that was delivered or given up (None), or make it due again after `wait_seconds`."""
+        """Delete a delivered or abandoned message (None), or make it due again after `wait_seconds`."""
         with self._database.writing() as session:
             row = session.get(DeliveryRow, delivery_id, with_for_update=True)
             if row is None:

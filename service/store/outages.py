@@ -1,4 +1,4 @@
-"""What happens while the database is away or locked: waits are bounded, and callers get `DatabaseUnavailableError`."""
+"""Handling of a database that is down or locked: waits are bounded, and callers get `DatabaseUnavailableError`."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service.errors import DatabaseBusyError, DatabaseUnavailableError
 
-#: Seconds after which a client is told to try again.
+#: Time in seconds after which clients should retry.
 _RETRY_SECONDS = 5
-#: Seconds that a transaction waits for the answer to another one before it is refused.
+#: Time in seconds that a transaction waits for the result of another one before it is refused.
 _PROBE_SECONDS = 0.2
-#: SQLite's errors of a lock that others hold, and of a file that cannot be used; others are mistakes of the service.
+#: SQLite's errors of a locked database and of an unusable file; other errors are bugs of the service.
 _SQLITE_BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED")
 _SQLITE_AWAY = ("SQLITE_CANTOPEN", "SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY")
-#: Classes of PostgreSQL's errors of transactions that got into each other's way.
+#: Classes of PostgreSQL errors of conflicting transactions.
 _POSTGRESQL_BUSY = ("40", "55")
 
 
 class Gate:
-    """Keeps transactions off a database that did not answer the last one.
+    """Gate that keeps transactions off a database that did not respond to the last one.
 
-    After an outage one transaction at a time tries the database, and the others are refused at once. Without this every
-    thread of a process would wait for its own timeout, and nothing would be left for requests that need no database.
+    After an outage, one transaction at a time probes the database and the others are refused immediately. Otherwise
+    every thread of a process would wait for its own timeout, and none would be left for requests that need no database.
     """
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class Gate:
         """Run a transaction.
 
         Raises:
-            DatabaseUnavailableError: The database did not answer, or has not answered since it did not.
+            DatabaseUnavailableError: If the database does not respond, or an outage lasts.
         """
         refusal = self._refusal
         if refusal is not None and not self._probe.acquire(timeout=_PROBE_SECONDS):
@@ -62,7 +62,7 @@ class Gate:
 
 @contextmanager
 def translated() -> Iterator[None]:
-    """Turn errors of an outage into `DatabaseUnavailableError`; mistakes of the service stay what they are."""
+    """Convert errors of an outage to `DatabaseUnavailableError`; other errors are raised unchanged."""
     try:
         yield
     except PoolTimeoutError as error:
@@ -80,7 +80,7 @@ def busy() -> DatabaseBusyError:
 
 
 def _refusal(error: DBAPIError) -> DatabaseUnavailableError | None:
-    """Return what a driver's error means to callers; None if the service itself made a mistake."""
+    """Return the exception for callers that a driver's error stands for; None if it is a bug of the service."""
     sqlite: str | None = getattr(error.orig, "sqlite_errorname", None)
     sqlstate: str = getattr(error.orig, "sqlstate", None) or ""
     if (sqlite or "").startswith(_SQLITE_BUSY) or sqlstate.startswith(_POSTGRESQL_BUSY):
@@ -94,22 +94,22 @@ def _refusal(error: DBAPIError) -> DatabaseUnavailableError | None:
 
 
 def impatient_connection(seconds: float) -> Any:
-    """Return psycopg's connection class, with a bound on each wait for the server.
+    """Return a subclass of psycopg's connection that bounds each wait for the server.
 
-    A server that is stopped, or a machine that is frozen, still acknowledges packets: no timeout of TCP notices it.
+    A stopped server or a frozen machine still acknowledges packets, so no TCP timeout detects it.
     """
     import psycopg
 
     class ImpatientConnection(psycopg.Connection[Any]):
-        """Connection that is closed if the server takes too long to answer."""
+        """Connection that is closed if the server takes too long to respond."""
 
         def wait(self, gen: Any, *args: Any, **options: Any) -> Any:
-            """Wait for the server as long as allowed."""
+            """Wait for the server for at most the timeout."""
             try:
                 return super().wait(gen, *args, **{"timeout": seconds, **options})
             except psycopg.OperationalError:
                 if self.pgconn.transaction_status == psycopg.pq.TransactionStatus.ACTIVE:
-                    self.pgconn.finish()  # the answer may still come, and would be taken for that of another query
+                    self.pgconn.finish()  # a late response would be taken for that of another query
                 raise
 
     return ImpatientConnection

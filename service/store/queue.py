@@ -1,8 +1,8 @@
-"""Which job is next: the query that every dispatcher asks again and again, and reservations of jobs that wait for room.
+"""Queries for the next job, which every dispatcher runs continually, and reservations for jobs that do not fit yet.
 
 The queue may have tens of thousands of jobs, most of them of a few owners. Only the first job of each owner can be
-next, so that owners are walked from one to the other in an index, and their first jobs alone are compared: the time
-grows with the owners that wait, not with the jobs.
+next. The query therefore steps from owner to owner in an index and compares only their first jobs: the time grows with
+the number of waiting owners, not of jobs.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from service.store.database import upsert
 from service.store.states import ACTIVE, JobStatus
 from service.store.tables import JobRow, ReservationRow, TurnRow
 
-#: Seconds that no lease and no wait before an attempt takes: a time that is farther ahead is that of a wrong clock.
+#: Time in seconds that no lease and no retry delay reaches: a time further in the future comes from a wrong clock.
 _IMPLAUSIBLE_SECONDS = 3600.0
-#: Of a reservation's time that has to be left, or it is renewed: not every look at the queue is a write.
+#: Fraction of a reservation's duration below which it is renewed, so that not every query of the queue writes.
 _RENEW_SHARE = 0.5
 
 
 def queued_now(now: float | BindParameter[float]) -> ColumnElement[bool]:
-    """Queued, and to be started."""
+    """Return the condition for queued jobs that may start now."""
     return and_(JobRow.status == JobStatus.QUEUED, _may_start(JobRow, now))
 
 
 def expired(now: float | BindParameter[float]) -> ColumnElement[bool]:
-    """Held by a dispatcher that was not heard of again, by this clock; see `service.scheduling.clock_watch`."""
+    """Return the condition for jobs with expired leases by this clock; see `service.scheduling.clock_watch`."""
     expires = JobRow.lease_expires_at
     return and_(or_(expires < now, expires > now + _IMPLAUSIBLE_SECONDS), JobRow.status.in_(ACTIVE))
 
 
 def _may_start(job: type[JobRow], now: float | BindParameter[float]) -> ColumnElement[bool]:
-    """Whether a queued job has waited as long as it was to wait."""
+    """Return the condition for jobs whose retry delay is over."""
     return or_(job.not_before <= now, job.not_before > now + _IMPLAUSIBLE_SECONDS)
 
 
@@ -61,35 +61,35 @@ def _count(condition: ColumnElement[bool]) -> Select[int]:
     return select(func.count()).select_from(some)
 
 
-# Built once: building a query takes longer than answering it.
+# Built once, because building a query takes longer than running it.
 _NOW: BindParameter[float] = bindparam("now", type_=Float)
-#: How many jobs are queued `now`, and how many are lost; at `most`.
+#: Queries that count the jobs that may start `now`, and the lost ones, up to `most`.
 WAITING, LOST = _count(queued_now(_NOW)), _count(expired(_NOW))
 
 
 def mine(dispatcher: str | BindParameter[str]) -> ColumnElement[bool]:
-    """Reservations of a dispatcher."""
+    """Return the condition for a dispatcher's reservations."""
     return ReservationRow.dispatcher == dispatcher
 
 
 def next_job(session: Session, dispatcher: str, now: float, passed: Sequence[str] = ()) -> JobRow | None:
-    """The next job for a dispatcher: by priority, then what it keeps room for, then turns of owners, then age.
+    """Return the next job for a dispatcher: by priority, then its reservation, then turns of owners, then age.
 
-    Its row is locked; rows that others have locked are passed over.
+    The job's row is locked; rows locked by others are skipped.
 
     Args:
-        passed: jobs that are not to be looked at.
+        passed: Ids of jobs to skip.
     """
     return next(iter(next_jobs(session, dispatcher, now, passed, most=1)), None)
 
 
 def next_jobs(session: Session, dispatcher: str, now: float, passed: Sequence[str], most: int) -> Sequence[JobRow]:
-    """As `next_job`: the first ones of their owners in the order in which they are next, at `most` so many."""
+    """Return up to `most` next jobs in order, at most one queued job per owner; otherwise as `next_job`."""
     told = {"dispatcher": dispatcher, "now": now, "passed": list(passed)}
     candidates = [found for found in session.scalars(_candidates(), told) if found is not None]
     if not candidates:
         return []
-    # as a statement of its own: within one, PostgreSQL expects more candidates than there are, and reads all jobs
+    # a separate statement: inside one query, PostgreSQL overestimates the candidates and reads all jobs
     return session.scalars(
         _first(), {"dispatcher": dispatcher, "now": now, "candidates": candidates, "most": most}
     ).all()
@@ -97,7 +97,7 @@ def next_jobs(session: Session, dispatcher: str, now: float, passed: Sequence[st
 
 @cache
 def _candidates() -> Select[Any] | CompoundSelect[Any]:
-    """Ids of the jobs that may be next."""
+    """Return the query for the ids of the jobs that may be next."""
     dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
     passed = bindparam("passed", type_=String, expanding=True)
     lost = select(JobRow.id).where(expired(now), JobRow.id.not_in(passed))
@@ -107,7 +107,7 @@ def _candidates() -> Select[Any] | CompoundSelect[Any]:
 
 @cache
 def _first() -> Select[JobRow]:
-    """The first of them, at `most` so many."""
+    """Return the query for the first candidates, up to `most`."""
     dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
     turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
     kept = case((mine(dispatcher), 0), else_=1)
@@ -116,7 +116,7 @@ def _first() -> Select[JobRow]:
         .outerjoin(TurnRow, TurnRow.owner == JobRow.owner)
         .outerjoin(ReservationRow, ReservationRow.job_id == JobRow.id)
         .where(JobRow.id.in_(bindparam("candidates", type_=String, expanding=True)))
-        # once more, for a row that somebody else has changed since it was found
+        # repeated for rows that have changed since they were found
         .where(or_(queued_now(now), expired(now)))
     )
     order = (JobRow.priority.desc(), kept, turn, JobRow.queued_at, JobRow.id)
@@ -124,7 +124,7 @@ def _first() -> Select[JobRow]:
 
 
 def _first_of_each_owner(now: BindParameter[float], passed: BindParameter[str]) -> Select[Any]:
-    """Ids of the jobs that are next of their owners."""
+    """Return the query for the id of each owner's next job."""
     job = aliased(JobRow)
     queued = job.status == JobStatus.QUEUED
     owners = select(func.min(job.owner).label("owner")).where(queued).cte("owners", recursive=True)
@@ -141,11 +141,11 @@ def _first_of_each_owner(now: BindParameter[float], passed: BindParameter[str]) 
 
 
 def reserve(session: Session, job_id: str, dispatcher: str, now: float, seconds: float) -> bool:
-    """Keep a dispatcher's room for a job and for no other one; False where another dispatcher does that already.
+    """Reserve a dispatcher's capacity for one job; return False if another dispatcher has already reserved for it.
 
     Args:
-        session: in which the job's row is locked.
-        seconds: that the reservation holds, unless it is made again.
+        session: Session in which the job's row is locked.
+        seconds: Duration of the reservation unless it is renewed.
     """
     row = session.get(ReservationRow, job_id)
     if row is not None and row.dispatcher != dispatcher and row.until >= now:

@@ -1,4 +1,4 @@
-"""What a key may use: jobs and GPU seconds of a day (UTC), bytes kept for it. Counted where they are used up."""
+"""Quotas of keys: jobs and GPU seconds per day (UTC), and stored bytes; usage is counted when it occurs."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from service.store.database import Database, upsert
 from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, UploadRow, UsageRow
 
 _DAY = 86_400
-#: When to ask again for room: by then something may have been deleted, or has expired.
+#: Retry delay of an exceeded storage quota in seconds: by then something may have been deleted or expired.
 _BYTES_AGAIN = 3600
 
 _USAGE = Base.metadata.tables[UsageRow.__tablename__]
-#: Whether an upload is a receipt: the charge for the files that one request brings (`service.store.inputs`).
+#: Prefix and condition of receipts, the charges for the files of one request (`service.store.inputs`).
 RECEIPT = "rcp"
 IS_RECEIPT = UploadRow.id.startswith(f"{RECEIPT}_", autoescape=True)
 
 
 @dataclass(frozen=True)
 class Quotas:
-    """Of one key; None for no bound.
+    """Quotas of one key; None for no limit.
 
     Attributes:
-        jobs_a_day: that are accepted.
-        gpu_seconds_a_day: of attempts, after which no more jobs are accepted; those that run go on.
-        stored_bytes: of unfinished uploads, of what requests bring, inputs and results together; an input that several
-            jobs use counts once.
-        requests_a_second: to each process of the API, on average over some seconds.
+        jobs_a_day: Accepted jobs.
+        gpu_seconds_a_day: GPU seconds of attempts; further jobs are rejected, running ones continue.
+        stored_bytes: Bytes of unfinished uploads, incoming requests, inputs and results; an input of several jobs
+            counts once.
+        requests_a_second: Requests to each API process, on average over some seconds.
     """
 
     jobs_a_day: int | None = None
@@ -43,7 +43,7 @@ class Quotas:
 
     @classmethod
     def of_settings(cls, settings: ServiceSettings) -> Self:
-        """Those of keys that have none of their own."""
+        """Return the default quotas of keys without their own."""
         return cls(
             settings.max_jobs_a_day_per_key,
             settings.max_gpu_seconds_a_day_per_key,
@@ -52,12 +52,12 @@ class Quotas:
         )
 
     def with_own(self, own: Mapping[str, Any] | None) -> Self:
-        """Where a key has its own, those; what another version of the service has stored besides is left out."""
+        """Return these quotas overridden by a key's own; names from other versions of the service are ignored."""
         known = {field.name for field in fields(self)}
         return replace(self, **{name: value for name, value in (own or {}).items() if name in known})
 
     def given(self) -> dict[str, Any]:
-        """Those that are bounds, for `with_own`."""
+        """Return the quotas that set a limit, for `with_own`."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -66,7 +66,7 @@ NO_QUOTAS = Quotas()
 
 @dataclass(frozen=True)
 class Used:
-    """What a key has used today, and what is kept for it."""
+    """Usage of a key today, and its stored bytes."""
 
     jobs: int
     gpu_seconds: float
@@ -74,13 +74,13 @@ class Used:
 
 
 class Usage:
-    """What keys have used."""
+    """Usage of keys."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def of(self, owner: str) -> Used:
-        """Of one owner, now."""
+        """Return the current usage of one owner."""
         with self._database.reading() as session:
             row = session.get(UsageRow, (owner, day_of(self._database.clock())))
             jobs, seconds = (row.jobs, row.gpu_seconds) if row is not None else (0, 0.0)
@@ -88,15 +88,15 @@ class Usage:
 
 
 def day_of(now: float) -> int:
-    """Number of a day, from 1970 on."""
+    """Return the number of the day since 1970."""
     return int(now // _DAY)
 
 
 def lock_owner(session: Session, owner: str) -> None:
-    """Make other transactions that check the same owner's limits wait for the end of this one.
+    """Lock an owner's limits until the end of the transaction, so that concurrent checks of the same owner wait.
 
-    Take this lock before any other, and before the check: two transactions that do not see each other's rows would both
-    pass. On SQLite a writing transaction is alone anyway.
+    Take this lock before any other and before the check: two transactions that do not see each other's rows would both
+    pass. On SQLite a writing transaction is exclusive anyway.
     """
     if session.get_bind().dialect.name == "postgresql":
         session.execute(_LOCK_OWNER, {"owner": f"sgsst-owner:{owner}"})
@@ -106,7 +106,7 @@ def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
     """Count a job that is being accepted, within its transaction.
 
     Raises:
-        QuotaError: it would be one too many, or today's GPU seconds are used up.
+        QuotaError: If it exceeds the daily number, or today's GPU seconds are used up.
     """
     insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=1, gpu_seconds=0.0)
     counted = insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"jobs": _USAGE.c.jobs + 1})
@@ -129,17 +129,17 @@ def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
 
 
 def count_gpu_seconds(session: Session, owner: str, seconds: float, now: float) -> None:
-    """Count what an attempt has used."""
+    """Count the GPU seconds of an attempt."""
     insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=0, gpu_seconds=seconds)
     added = _USAGE.c.gpu_seconds + insert.excluded.gpu_seconds
     session.execute(insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"gpu_seconds": added}))
 
 
 def check_bytes(session: Session, owner: str, quotas: Quotas) -> None:
-    """Prove that what is kept for an owner is within its quota, in the transaction that has added to it.
+    """Check an owner's stored bytes against the quota, in the transaction that has added to them.
 
     Raises:
-        QuotaError: it is not; the transaction is to end without effect.
+        QuotaError: If the quota is exceeded; the caller must roll back the transaction.
     """
     limit = quotas.stored_bytes
     if limit is not None and (used := stored_bytes(session, owner)) > limit:

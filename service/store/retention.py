@@ -1,4 +1,4 @@
-"""What is done for jobs that have ended: their results expire, and what attempts have left behind is swept."""
+"""Housekeeping of ended jobs: their results expire, and leftovers of attempts are swept."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from service.store.database import IDEMPOTENCY_SECONDS, Database
 from service.store.states import FINISHED, JobStatus, Transition
 from service.store.tables import ArtifactRow, DispatcherRow, IdempotencyRow, JobRow
 
-#: Seconds after which a dispatcher that was not heard of is forgotten.
+#: Time in seconds after which a dispatcher without heartbeat is forgotten.
 _FORGET_SECONDS = 86_400.0
 
 
 class Retention:
-    """The housekeeping part of the store; any dispatcher may do it.
+    """Housekeeping of the store, which any dispatcher may do.
 
     Args:
-        retention: seconds that results are kept, and the record of an expired job as long again.
+        retention: Time in seconds until results expire; the record of an expired job is kept for the same time again.
     """
 
     def __init__(self, database: Database, retention: float) -> None:
@@ -26,17 +26,17 @@ class Retention:
         self._retention = retention
 
     def advance(self, seconds: float) -> None:
-        """Move the expiry time on, by which everything expires (`service.store.clocks`).
+        """Advance the time by which everything expires (`service.store.clocks`).
 
         Args:
-            seconds: Time that the caller has worked since it moved it last, by its monotonic clock.
+            seconds: Working time of the caller since its last call, by its monotonic clock.
         """
         now = self._database.clock()
         with self._database.writing() as session:
             advance_expiry_time(session, now, seconds)
 
     def expire(self) -> list[str]:
-        """End the time of results that have been kept long enough, and forget jobs long after.
+        """Expire old results, and delete the records of jobs that expired long ago.
 
         Returns:
             Ids of jobs whose files are to be removed.
@@ -58,13 +58,13 @@ class Retention:
             return [job.id for job in due]
 
     def unswept(self, limit: int) -> list[tuple[str, int]]:
-        """Jobs that have ended and may have left files that no row refers to, each with its last lease's epoch."""
+        """Return ended jobs that may have left files without rows, each with the epoch of its last lease."""
         query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
         with self._database.reading() as session:
             return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
 
     def mark_swept(self, job_id: str, epoch: int) -> None:
-        """Note that no such files are left; a job that was queued again since is left alone."""
+        """Mark a job as free of such files, unless it has been queued again."""
         same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
         with self._database.writing() as session:
             session.execute(update(JobRow).where(same).values(swept=True))

@@ -1,4 +1,4 @@
-"""What becomes of a job whose attempt has ended without its result: decided here, carried out by `leases`. Pure."""
+"""Pure decisions about a job whose attempt ended without a result; `leases` carries them out."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ from dataclasses import dataclass
 
 from service.store.states import AttemptOutcome, JobStatus, Transition
 
-#: A wait between attempts doubles, but not beyond this.
+#: Maximum delay between attempts in seconds; until then it doubles.
 MAX_RETRY_SECONDS = 300.0
 
 
 @dataclass(frozen=True)
 class FailureCount:
-    """Failed attempts in a row without progress.
+    """Count of consecutive failed attempts without progress.
 
     Attributes:
-        failures: how many.
-        failed_step: the farthest step that was saved when the last one failed; None for no step.
+        failures: Number of failures.
+        failed_step: Last saved step at the time of the last failure; None for no step.
     """
 
     failures: int
     failed_step: int | None
 
     def with_failure(self, saved_step: int | None) -> FailureCount:
-        """The count after another failure.
+        """Return the count after another failure.
 
-        It counts where nothing has been saved since the last one: a long job outlives many accidents, and one that
-        breaks at the same step each time does not.
+        A failure after progress resets the count. A long job thus survives many accidents, while one that breaks at the
+        same step each time does not.
 
         Args:
-            saved_step: the farthest that was saved of the job; None for no step.
+            saved_step: Last saved step of the job; None for no step.
         """
         progress = (saved_step or 0) > (self.failed_step or 0)
         return FailureCount(0 if progress else self.failures + 1, saved_step)
@@ -37,12 +37,12 @@ class FailureCount:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to be done with a job.
+    """Decision about a job.
 
     Attributes:
         transition: STOP, FAIL or REQUEUE.
-        count: what its record says of failures from now on.
-        wait: seconds before it may be taken again.
+        count: New count of failures for the job's record.
+        wait: Delay in seconds before the job may be taken again.
     """
 
     transition: Transition
@@ -52,11 +52,12 @@ class Verdict:
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """How often a job is tried.
+    """Policy for retrying jobs.
 
     Attributes:
-        max_attempts: in a row without progress.
-        retry_seconds: wait after the first failure; each further one is twice as long, up to `MAX_RETRY_SECONDS`.
+        max_attempts: Consecutive attempts without progress after which a job fails.
+        retry_seconds: Delay after the first failure in seconds; it doubles with each further one, up to
+            `MAX_RETRY_SECONDS`.
     """
 
     max_attempts: int
@@ -71,14 +72,14 @@ class RetryPolicy:
         *,
         permanent: bool = False,
     ) -> Verdict:
-        """What to do after an attempt that failed, was lost or was released.
+        """Decide about a job after an attempt that failed, was lost or was released.
 
         Args:
-            outcome: of the attempt.
-            status: of the job while the attempt ran.
-            count: before this attempt.
-            saved_step: the farthest that was saved of the job; None for no step.
-            permanent: another attempt would fail the same way.
+            outcome: Outcome of the attempt.
+            status: Status of the job while the attempt ran.
+            count: Count of failures before this attempt.
+            saved_step: Last saved step of the job; None for no step.
+            permanent: Whether another attempt would fail in the same way.
         """
         if status == JobStatus.CANCELING:
             return Verdict(Transition.STOP, count)
@@ -87,18 +88,18 @@ class RetryPolicy:
         count = count.with_failure(saved_step)
         if permanent or count.failures >= self.max_attempts:
             return Verdict(Transition.FAIL, count)
-        # who was lost has been waited for already, for as long as a lease
+        # a lost attempt has already cost the duration of a lease
         return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else self._wait(count.failures))
 
     def after_outage(self, status: JobStatus, count: FailureCount, outages: int) -> Verdict:
-        """What to do after an attempt that failed for a machine, a network or the store of files.
+        """Decide about a job after an attempt that failed because of a machine, a network or the file store.
 
-        That is no failure of the job: it is tried again, with longer and longer waits, until it goes or is canceled.
+        This does not count as a failure of the job. It is retried with growing delays until it succeeds or is canceled.
 
         Args:
-            status: of the job while the attempt ran.
-            count: before this attempt; it stays.
-            outages: attempts in a row that ended so, this one included.
+            status: Status of the job while the attempt ran.
+            count: Count of failures before this attempt; it does not change.
+            outages: Number of consecutive attempts that ended by an outage, including this one.
         """
         if status == JobStatus.CANCELING:
             return Verdict(Transition.STOP, count)

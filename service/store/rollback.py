@@ -1,7 +1,7 @@
-"""Whether an SQLite database has gone back in time: its write-ahead log was lost, or an old copy took its place.
+"""Detection of an SQLite database that was rolled back: its write-ahead log was lost, or an old copy replaced it.
 
-Files of jobs that such a database does not know must not be deleted. A marker beside the database holds the number of
-the newest event, which only grows; a database that is behind its marker has lost what was committed since.
+Files of jobs that such a database does not know must not be deleted. A marker file beside the database holds the number
+of the newest event, which only grows. A database that is behind its marker has lost later commits.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ NEWEST_EVENT = text("SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE nam
 
 
 class Marker:
-    """The marker of an SQLite database.
+    """Marker file of an SQLite database.
 
     Attributes:
-        note: File that is there once the database was found to be behind, until the operator deletes it.
+        note: File that exists from the time a rollback was detected until the operator deletes it.
     """
 
     def __init__(self, database: Path) -> None:
@@ -33,23 +33,23 @@ class Marker:
         self._reached = 0
 
     def read(self) -> int:
-        """Return the number in the marker; 0 where there is none."""
+        """Return the number in the marker; 0 if there is none."""
         try:
             return int(self._path.read_text())
         except (FileNotFoundError, ValueError):
             return 0
 
     def reach(self, number: int) -> None:
-        """Record a number that has been committed: never before, or a crash would look like a loss."""
+        """Record a committed number; recording it before the commit would make a crash look like a rollback."""
         if number > self._reached:
             self._reached = number
             self._write(number)
 
     def compare(self, marked: int, number: int) -> None:
-        """Leave a note where the database is behind.
+        """Leave a note if the database is behind its marker.
 
         Args:
-            marked: What `read` returned before the database was asked.
+            marked: Result of `read` from before the database was queried.
             number: Number of the database's newest event.
         """
         if number >= marked:

@@ -1,4 +1,4 @@
-"""Sessions of browsers in the store: who has shown an API key once need not send it again."""
+"""Browser sessions in the store: a browser that has sent an API key once need not send it again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.store.database import Database
 from service.store.keys import digest
 from service.store.tables import Base, KeyRow, SessionRow
 
-#: Of one key; the oldest ends when there would be more.
+#: Maximum number of sessions per key; a new one replaces the oldest.
 MOST_SESSIONS = 100
 
 _KEYS, _SESSIONS = (Base.metadata.tables[name] for name in ("api_keys", "sessions"))
@@ -27,10 +27,10 @@ _KEY = (
 
 
 class Sessions:
-    """Sessions; the text of one is a secret of 256 random bits, of which the SHA-256 is stored.
+    """Browser sessions; a session's text is a secret of 256 random bits, and only its SHA-256 is stored.
 
     Args:
-        seconds: that one lasts.
+        seconds: Lifetime of a session.
     """
 
     def __init__(self, database: Database, seconds: float) -> None:
@@ -38,7 +38,7 @@ class Sessions:
         self.seconds = seconds
 
     def create(self, key_id: str) -> str:
-        """A new session of a key, and the only copy of its text; sessions that have expired are forgotten."""
+        """Create a session of a key and return the only copy of its text; expired sessions are deleted."""
         text, now = secrets.token_urlsafe(32), self._database.clock()
         with self._database.writing() as session:
             session.execute(delete(SessionRow).where(SessionRow.expires_at <= expiry_time(session, now)))
@@ -50,12 +50,12 @@ class Sessions:
         return text
 
     def find(self, text: str) -> KeyRow | None:
-        """The key of a session, unless the session is unknown or over, or the key was revoked."""
+        """Return the key of a session; None if the session is unknown or expired, or the key was revoked."""
         with self._database.reading_rows() as connection:
             row = connection.execute(_KEY, {"sha256": digest(text), "now": self._database.clock()}).one_or_none()
         return KeyRow(**row._mapping) if row is not None else None
 
     def end(self, text: str) -> None:
-        """End a session, if there is one."""
+        """End a session if it exists."""
         with self._database.writing() as session:
             session.execute(delete(SessionRow).where(SessionRow.sha256 == digest(text)))

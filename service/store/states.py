@@ -1,4 +1,4 @@
-"""The states of a job, and every way from one to another, in one table. Pure: the store's updates follow it."""
+"""States of a job and all transitions between them, in one table that the store's updates follow."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class JobStatus(StrEnum):
-    """What a job is doing."""
+    """Status of a job."""
 
     QUEUED = "queued"
     STARTING = "starting"
@@ -20,50 +20,50 @@ class JobStatus(StrEnum):
 
 
 class AttemptOutcome(StrEnum):
-    """How an attempt ended."""
+    """Outcome of an attempt."""
 
     SUCCEEDED = "succeeded"
     FAILED = "failed"
     CANCELED = "canceled"
-    #: Its dispatcher shut down and put the job back.
+    #: The dispatcher shut down and returned the job to the queue.
     RELEASED = "released"
-    #: Its dispatcher was not heard of again.
+    #: The dispatcher stopped sending heartbeats.
     LOST = "lost"
 
 
 class Transition(StrEnum):
-    """What moves a job from one state to another."""
+    """Transition of a job from one state to another."""
 
-    #: A dispatcher leases it, for the first time or after another one that was lost.
+    #: A dispatcher leases the job, for the first time or after a lost one.
     TAKE = "take"
-    #: Its inputs are read and its steps begin.
+    #: The inputs are read and the steps start.
     BEGIN = "begin"
     SUCCEED = "succeed"
-    #: An attempt failed, and there is no other one.
+    #: An attempt failed and is not followed by another one.
     FAIL = "fail"
-    #: An attempt ended early, and another one follows.
+    #: An attempt ended early and is followed by another one.
     REQUEUE = "requeue"
-    #: Its dispatcher has stopped it.
+    #: The dispatcher has stopped the job.
     STOP = "stop"
-    #: Its user wants it to end.
+    #: The user cancels the job.
     CANCEL = "cancel"
-    #: Its user wants it to run again.
+    #: The user retries the job.
     RETRY = "retry"
-    #: Its results have been kept long enough.
+    #: The retention time of the results is over.
     EXPIRE = "expire"
 
 
 _S = JobStatus
-#: A dispatcher works on it.
+#: States in which a dispatcher works on the job.
 ACTIVE = (_S.STARTING, _S.RUNNING, _S.CANCELING)
 UNFINISHED = (_S.QUEUED, *ACTIVE)
-#: Ended, with what it has made.
+#: States of an ended job that still has its files.
 FINISHED = (_S.SUCCEEDED, _S.FAILED, _S.CANCELED)
-#: Nothing more happens to it, unless its user retries it.
+#: States in which nothing more happens, unless the user retries the job.
 ENDED = (*FINISHED, _S.EXPIRED)
 
-#: For each transition the states that it starts from, and where it leads; from all others there is no way. A job that
-#: is being canceled is stopped whatever becomes of its attempt, unless that succeeds first.
+#: Target state per transition and initial state; other combinations are not allowed. A job that is being canceled is
+#: stopped however its attempt ends, unless the attempt succeeds first.
 TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
     Transition.TAKE: dict.fromkeys((_S.QUEUED, _S.STARTING, _S.RUNNING), _S.STARTING),
     Transition.BEGIN: {_S.STARTING: _S.RUNNING, _S.RUNNING: _S.RUNNING, _S.CANCELING: _S.CANCELING},
@@ -84,19 +84,19 @@ TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
 
 
 class TransitionError(Exception):
-    """There is no such way out of a job's state."""
+    """Transition that a job's status does not allow."""
 
 
 def allowed(status: str, transition: Transition) -> bool:
-    """Whether there is such a way out of a state."""
+    """Return whether a status allows a transition."""
     return status in TRANSITIONS[transition]
 
 
 def next_status(status: str, transition: Transition) -> JobStatus:
-    """Where a transition leads.
+    """Return the status that a transition leads to.
 
     Raises:
-        TransitionError: nowhere, from this state.
+        TransitionError: If the status does not allow the transition.
     """
     found = TRANSITIONS[transition].get(JobStatus(status))
     if found is None:

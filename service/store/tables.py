@@ -1,4 +1,4 @@
-"""The tables. Times are seconds since 1970 (UTC), ids sort by creation."""
+"""Tables of the store; times are seconds since 1970 (UTC), and ids sort by creation."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, false, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-#: SQLite counts rows up by itself only for INTEGER, PostgreSQL needs BIGINT to count far enough.
+#: SQLite numbers rows automatically only with INTEGER; PostgreSQL needs BIGINT for large numbers.
 Sequence = BigInteger().with_variant(Integer, "sqlite")
 
 
 class Base(DeclarativeBase):
-    """Names of constraints are fixed, so that migrations can name them on every database."""
+    """Base class with fixed names of constraints, so that migrations can refer to them on every database."""
 
     metadata = MetaData(
         naming_convention={
@@ -26,11 +26,11 @@ class Base(DeclarativeBase):
 
 
 class JobRow(Base):
-    """A job.
+    """Job.
 
-    `lease_epoch` counts how often it was leased; every write of a dispatcher names the epoch it holds. `failures`
-    counts failed attempts in a row without progress: `saved_step` is the farthest of a checkpoint, `failed_step` what
-    it was at the last failure. `swept`: the job has ended, and no file is left that no row refers to.
+    `lease_epoch` counts its leases; every write of a dispatcher names the epoch that it holds. `failures` counts
+    consecutive failed attempts without progress. `saved_step` is the step of the newest checkpoint, and `failed_step`
+    its value at the last failure. `swept` means that the job has ended and has no files without rows.
     """
 
     __tablename__ = "jobs"
@@ -62,8 +62,8 @@ class JobRow(Base):
     lease_expires_at: Mapped[float | None] = mapped_column(Float)
 
     __table_args__ = (
-        Index("ix_jobs_queue", "status", "priority", "queued_at", "id"),  # a place in the queue is counted in it alone
-        # the first job of each owner is found in it without looking at the others (`service.store.queue`)
+        Index("ix_jobs_queue", "status", "priority", "queued_at", "id"),  # covers counting a queue position
+        # finds the first job of each owner without reading the others (`service.store.queue`)
         Index("ix_jobs_turns", "status", "owner", text("priority DESC"), "queued_at", "id"),
         Index("ix_jobs_lease_expires_at", "lease_expires_at"),
         Index("ix_jobs_owner_id", "owner", "id"),
@@ -74,9 +74,10 @@ class JobRow(Base):
 
 
 class AttemptRow(Base):
-    """One lease of a job, and how it ended; `outcome` is None while it runs.
+    """Attempt at a job under one lease; `outcome` is None while it runs.
 
-    `gpus` are those that it holds `gpus_since` then; what it held before has been counted for its owner (`UsageRow`).
+    A running attempt has held `gpus` GPUs since `gpus_since`; earlier usage is already charged to its owner
+    (`UsageRow`).
     """
 
     __tablename__ = "attempts"
@@ -94,7 +95,7 @@ class AttemptRow(Base):
 
 
 class DispatcherRow(Base):
-    """A dispatcher that is at work, when it was last heard of, and what room it has: GPUs, or places for jobs."""
+    """Live dispatcher with its last heartbeat and its capacity: GPUs, or slots for jobs."""
 
     __tablename__ = "dispatchers"
 
@@ -105,7 +106,7 @@ class DispatcherRow(Base):
 
 
 class TurnRow(Base):
-    """When an owner's job was leased last, as a number that counts leases: who has waited longest is next."""
+    """Turn of an owner: the serial number of the last lease of its jobs. The owner with the lowest number is next."""
 
     __tablename__ = "turns"
 
@@ -114,7 +115,7 @@ class TurnRow(Base):
 
 
 class ReservationRow(Base):
-    """A queued job that a dispatcher keeps its room for, until the moment `until` unless it asks again."""
+    """Queued job that a dispatcher reserves its capacity for, until the time `until` unless it is renewed."""
 
     __tablename__ = "reservations"
 
@@ -124,7 +125,7 @@ class ReservationRow(Base):
 
 
 class EventRow(Base):
-    """Something that happened to a job; `id` is what a stream of events resumes from."""
+    """Event of a job; event streams resume from an `id`."""
 
     __tablename__ = "events"
 
@@ -138,7 +139,7 @@ class EventRow(Base):
 
 
 class ProgressPointRow(Base):
-    """A point of the course of a job's loss; `scales` has the loss of each scale, None where one took no part."""
+    """Point of a job's loss history; `scales` has the loss of each scale, None for scales that took no part."""
 
     __tablename__ = "progress_points"
 
@@ -154,7 +155,7 @@ class ProgressPointRow(Base):
 
 
 class ArtifactRow(Base):
-    """A published file of a job; it is there as soon as this row is, and not before."""
+    """Published file of a job; it is visible as soon as this row exists."""
 
     __tablename__ = "artifacts"
 
@@ -167,7 +168,7 @@ class ArtifactRow(Base):
 
 
 class BlobRow(Base):
-    """The content of an input, once for all who use it; `location` is the file's name among the blobs."""
+    """Content of an input, shared by all its users; `location` is the file's name among the blobs."""
 
     __tablename__ = "blobs"
 
@@ -178,7 +179,7 @@ class BlobRow(Base):
 
 
 class BlobUseRow(Base):
-    """Who needs a blob: `job:ID` or `upload:ID`."""
+    """Holder of a blob: `job:ID` or `upload:ID`."""
 
     __tablename__ = "blob_uses"
 
@@ -187,7 +188,7 @@ class BlobUseRow(Base):
 
 
 class UploadRow(Base):
-    """A file that arrives in parts; `sha256` is set once it is whole."""
+    """Multipart upload; `sha256` is set once it is complete."""
 
     __tablename__ = "uploads"
 
@@ -203,7 +204,7 @@ class UploadRow(Base):
 
 
 class UploadPartRow(Base):
-    """Bytes of an unfinished upload that are in the store of files as an object of their own."""
+    """Bytes of an unfinished upload, stored as an object in the file store."""
 
     __tablename__ = "upload_parts"
 
@@ -214,7 +215,7 @@ class UploadPartRow(Base):
 
 
 class KeyRow(Base):
-    """An API key: its SHA-256, never the key."""
+    """API key; only its SHA-256 is stored."""
 
     __tablename__ = "api_keys"
 
@@ -228,7 +229,7 @@ class KeyRow(Base):
 
 
 class UsageRow(Base):
-    """What an owner has used on a day, which is a number of days since 1970 (UTC)."""
+    """Usage of an owner on a day, which is a number of days since 1970 (UTC)."""
 
     __tablename__ = "usage"
 
@@ -239,7 +240,7 @@ class UsageRow(Base):
 
 
 class SessionRow(Base):
-    """A browser that has shown an API key: the SHA-256 of what its cookie holds, never the key."""
+    """Browser session of an API key; only the SHA-256 of the cookie's secret is stored."""
 
     __tablename__ = "sessions"
 
@@ -252,7 +253,7 @@ class SessionRow(Base):
 
 
 class IdempotencyRow(Base):
-    """The answer to a request that created something, under the key that its sender gave it."""
+    """Idempotency-Key of a client with the id of the object that its request created."""
 
     __tablename__ = "idempotency_keys"
 
@@ -264,7 +265,7 @@ class IdempotencyRow(Base):
 
 
 class InspectionRow(Base):
-    """What checking an input has found; the same content is not looked at twice."""
+    """Result of inspecting an input, so that the same content is not inspected twice."""
 
     __tablename__ = "inspections"
 
@@ -274,7 +275,7 @@ class InspectionRow(Base):
 
 
 class DeliveryRow(Base):
-    """A webhook message that is still to be delivered."""
+    """Webhook message that is still to be delivered."""
 
     __tablename__ = "deliveries"
 
@@ -287,7 +288,7 @@ class DeliveryRow(Base):
 
 
 class CounterRow(Base):
-    """A count that only grows, for monitoring; `labels` is the part between braces of the Prometheus form."""
+    """Monotonic counter for monitoring; `labels` is the part in braces of the Prometheus format."""
 
     __tablename__ = "counters"
 
@@ -297,7 +298,7 @@ class CounterRow(Base):
 
 
 class SecretRow(Base):
-    """Secrets that the service has made for itself, such as the one that signs webhooks."""
+    """Secret created by the service itself, such as the one that signs webhooks."""
 
     __tablename__ = "secrets"
 

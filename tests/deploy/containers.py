@@ -1,8 +1,8 @@
-"""Images and the compose file, built and run by buildah, podman and podman-compose as root, beside nothing else.
+"""Images and the compose file, built and run by buildah, podman and podman-compose as root.
 
-Images lie in a storage of their own, which is kept as a cache (`SGSST_TEST_CONTAINERS`, by default a folder in the
-user's cache): what is in it was built before, or pulled. Where no registry can be reached, Debian's base image is made
-from its packages, and images that were to be pulled are replaced by those of `stand_ins`.
+Images are cached in their own storage (`SGSST_TEST_CONTAINERS`, a folder in the user's cache by default), so they are
+built or pulled only once, and other containers of the machine are not affected. If no registry can be reached, Debian's
+base image is built from its packages, and pulled images are replaced by those of `stand_ins`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ STAND_INS = Path(__file__).with_name("stand_ins")
 BASE = "docker.io/library/debian:bookworm-slim"
 DATABASE, STORE = "docker.io/library/postgres:17", "docker.io/chrislusf/seaweedfs:4.22"
 TOOLS = {"podman": "podman", "buildah": "buildah", "runc": "runc", "curl": "curl", "iptables": "iptables"}
-#: Of a base image that is made here, as of the official one: no documentation, no lists of packages.
+#: A base image built here lacks documentation and package lists, like the official one.
 _SLIM = [f"--dpkgopt=path-exclude=/usr/share/{name}/*" for name in ("doc", "man", "locale")]
 _SLIM.append('--customize-hook=rm -rf "$1"/var/lib/apt/lists/* "$1"/var/cache/apt/*')
 
 
 def problem() -> str | None:
-    """Why no containers can be run here; None where they can."""
+    """Return why no containers can be run here; None if they can."""
     if sys.platform != "linux" or os.geteuid() != 0:
         return "containers are run by root, on Linux"
     for tool, package in TOOLS.items():
@@ -42,7 +42,7 @@ def problem() -> str | None:
 
 
 def compose_program() -> Path:
-    """Beside this Python."""
+    """Return the path of podman-compose in this Python's environment."""
     return Path(sys.executable).parent / "podman-compose"
 
 
@@ -50,7 +50,7 @@ class Containers:
     """Podman with settings that need no systemd and no cgroup of its own.
 
     Attributes:
-        environment: for every command.
+        environment: Environment of every command.
     """
 
     def __init__(self, storage: Path, folder: Path) -> None:
@@ -69,7 +69,7 @@ class Containers:
         }
 
     def run(self, *command: str | Path, check: bool = True, variables: Mapping[str, str] | None = None) -> str:
-        """What a command prints; it must not fail where `check` says so."""
+        """Return the output of a command; with `check` it must not fail."""
         ended = subprocess.run(
             command,
             env={**self.environment, **(variables or {})},
@@ -82,11 +82,11 @@ class Containers:
         return ended.stdout
 
     def succeeds(self, *command: str | Path) -> bool:
-        """Whether a command ends well."""
+        """Return whether a command exits with status 0."""
         return subprocess.run(command, env=self.environment, cwd=ROOT, capture_output=True).returncode == 0
 
     def provide(self, image: str, target: str | None = None) -> None:
-        """Have an image here: one that is, a pulled one, or what stands in for it."""
+        """Provide an image: an existing one, a pulled one, or a replacement."""
         if self.succeeds("podman", "image", "exists", image) or self.succeeds("podman", "pull", "--quiet", image):
             return
         if target is not None:
@@ -119,7 +119,7 @@ class Containers:
 
 
 def _pip(*names: str) -> list[str]:
-    """Words of this machine's settings of pip."""
+    """Return values of this machine's pip settings."""
     listed = subprocess.run([sys.executable, "-m", "pip", "config", "list"], capture_output=True, text=True).stdout
     found = []
     for line in listed.splitlines():
@@ -130,7 +130,7 @@ def _pip(*names: str) -> list[str]:
 
 
 def _package_sources() -> list[str]:
-    """Volumes that let pip find packages in a build as it does here: its settings, and local folders that they name."""
+    """Return volumes that let pip find packages in a build as it does here: its settings and their local folders."""
     paths = {Path(word.removeprefix("file://")) for word in _pip("cert", "find-links", "extra-index-url", "index-url")}
     roots = {path.parent if path.name == "simple" else path for path in paths if path.is_absolute() and path.exists()}
     if Path("/etc/pip.conf").exists():
@@ -139,14 +139,14 @@ def _package_sources() -> list[str]:
 
 
 def _torch_wheels() -> list[str]:
-    """Where the wheel of PyTorch without CUDA is, if this machine has it in a folder."""
+    """Return the build argument for the wheel of PyTorch without CUDA if this machine has it in a folder."""
     folders = [word for word in _pip("find-links") if list(Path(word).glob("torch-*cpu*.whl"))]
     return ["--build-arg", f"TORCH_CPU={folders[0]}"] if folders else []
 
 
 @contextmanager
 def containers() -> Iterator[Containers]:
-    """With the images that the compose file names; skipped where that cannot be."""
+    """Provide containers with the images of the compose file; skip the test if that is impossible."""
     if reason := problem():
         pytest.skip(reason)
     storage = os.environ.get("SGSST_TEST_CONTAINERS") or str(Path.home() / ".cache" / "sgsst-containers")
@@ -159,5 +159,5 @@ def containers() -> Iterator[Containers]:
             made.provide(STORE, "store")
             yield made
         finally:
-            made.run("podman", "volume", "prune", "--force", check=False)  # without a name, of images' own folders
+            made.run("podman", "volume", "prune", "--force", check=False)  # unnamed volumes of the images' own folders
             made.run("umount", str(Path(storage, "overlay")), check=False)

@@ -1,4 +1,4 @@
-"""`deploy/backup.py`: a service is saved while it works, lost with all that it had, and restored elsewhere."""
+"""`deploy/backup.py`: a running service is saved, lost with all its data, and restored elsewhere."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.service.store.conftest import postgres  # noqa: F401 (a fixture)
 from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow
-#: A job has to run for longer than two backups take, on a busy machine too.
+#: The job has to run for longer than two backups take, even on a busy machine.
 PARAMETERS = {
     "steps_sos": 700,
     "early_stop": False,
@@ -41,7 +41,7 @@ def s3() -> Iterator[str]:
 
 
 def bucket(s3: str, name: str) -> dict[str, str]:
-    """A new bucket as a service's store."""
+    """Create a bucket and return the environment of a service that stores its files there."""
     assert httpx.put(f"{s3}/{name}").status_code == 200
     return {**environment_of(s3), "SGSST_ARTIFACTS": f"s3://{name}/service"}
 
@@ -69,7 +69,7 @@ def has_ended(client: httpx.Client, job_id: str) -> bool:
 
 
 def lose(service: Service) -> None:
-    """All processes at once."""
+    """Kill all processes at once."""
     for process in service.survivors():
         process.send_signal(signal.SIGKILL)
     wait_for(lambda: not service.survivors(), "the end of all processes")
@@ -93,7 +93,7 @@ def test_jobs_go_on_after_a_restore(kind: str, tmp_path: Path, tiny_installed: P
         running = submit(client, tmp_path)
         waiting = submit(client, tmp_path)
         wait_for(lambda: (job(client, running)["progress"] or {}).get("step", 0) > 60, "steps", service.said)
-        for _ in range(2):  # the second adds to the first
+        for _ in range(2):  # the second backup adds to the first
             ended = backup({"SGSST_DATA": str(service.data), **before}, "save", saved)
             assert ended.returncode == 0, ended.stderr
         assert job(client, running)["status"] == "running"

@@ -1,4 +1,4 @@
-"""Machines that fail while a cluster works: a few of `benchmarks.cluster_faults`."""
+"""Failing machines in a working cluster: a few cases of `benchmarks.cluster_faults`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """With a name so short that Ray's sockets can lie below it."""
+    """Provide a folder with a path short enough for Ray's sockets."""
     path = Path(tempfile.mkdtemp(prefix="sgsst-c-", dir="/tmp"))
     yield path
     shutil.rmtree(path, ignore_errors=True)
 
 
 def networks() -> set[str]:
-    """Devices and namespaces of networks of `benchmarks.cluster_hosts` that are on this machine now."""
+    """Return the network devices and namespaces of `benchmarks.cluster_hosts` on this machine."""
     commands = (["ip", "-o", "link"], ["ip", "netns", "list"])
     said = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for command in commands)
     return {name for text in said for name in re.findall(r"sgsst\d[\w-]*", text)}

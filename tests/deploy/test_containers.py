@@ -1,4 +1,4 @@
-"""`deploy/Dockerfile` and `deploy/compose.yaml`: built, brought up, used from outside, killed, and taken down again."""
+"""`deploy/Dockerfile` and `deploy/compose.yaml`: built, started, used from outside, killed, and stopped."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.small_scenes import wall, write_files
 pytestmark = pytest.mark.slow
 IMAGE = "docker.io/library/sgsst:cpu"
 PROJECT = "sgsst-test"
-#: Seconds.
+#: Time limit of waits in seconds.
 PATIENCE = 900.0
 OPTIONS = {"steps_coarse": 0, "backbone": "vgg16", "compute_everything": True, "seed": 1}
 
@@ -36,7 +36,7 @@ def podman() -> Iterator[Containers]:
 
 
 class Composed:
-    """The compose file's services, under a name and a port of their own."""
+    """Services of the compose file, with their own project name and port."""
 
     def __init__(self, podman: Containers, weights: Path) -> None:
         self.podman = podman
@@ -52,21 +52,21 @@ class Composed:
         self.key = ""
 
     def compose(self, *words: str) -> str:
-        """`podman-compose` with the file."""
+        """Run `podman-compose` with the compose file and return its output."""
         command: list[str | Path] = [compose_program(), "--in-pod=0", "-p", PROJECT, "-f", COMPOSE, *words]
         return self.podman.run(*command, variables=self.variables)
 
     def name(self, service: str) -> str:
-        """Of a service's container."""
+        """Return the name of a service's container."""
         return f"{PROJECT}_{service}_1"
 
     def kill(self, service: str) -> None:
-        """End a service's first process as a crash would: podman is not asked, and starts it again."""
+        """Kill a service's first process like a crash, without podman's knowledge; podman restarts it."""
         pid = int(self.podman.run("podman", "inspect", "--format", "{{.State.Pid}}", self.name(service)))
         os.kill(pid, signal.SIGKILL)
 
     def said(self) -> str:
-        """The ends of all logs."""
+        """Return the ends of all logs."""
         names = self.podman.run("podman", "ps", "--all", "--format", "{{.Names}} {{.Status}}")
         logs = [
             subprocess.run(
@@ -81,18 +81,18 @@ class Composed:
         return "\n---\n".join([names, *logs])
 
     def health(self) -> dict[str, Any]:
-        """Of `/readyz`; nothing where it does not answer."""
+        """Return the content of `/readyz`; empty if it does not respond."""
         try:
             return dict(httpx.get(f"{self.url}/readyz", timeout=5).json())
         except (httpx.TransportError, ValueError):
             return {}
 
     def client(self) -> httpx.Client:
-        """With the key."""
+        """Return an HTTP client with the API key."""
         return httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {self.key}"}, timeout=60)
 
     def job(self, job_id: str) -> dict[str, Any]:
-        """A job as the API shows it; nothing where it does not answer."""
+        """Return a job from the API; empty if it does not respond."""
         try:
             with self.client() as client:
                 return dict(client.get(f"/v1/jobs/{job_id}").json())
@@ -104,12 +104,12 @@ class Composed:
 def composed(podman: Containers, tiny_cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Composed]:
     weights = tmp_path_factory.mktemp("weights")
     shutil.copytree(tiny_cache, weights, dirs_exist_ok=True)
-    weights.chmod(0o777)  # kernels that were compiled are kept there, too
+    weights.chmod(0o777)  # compiled kernels are cached there too
     made = Composed(podman, weights)
     made.compose("down", "--volumes")
     try:
         made.compose("up", "--detach", "--no-build", "api", "dispatcher", "setup")
-        time.sleep(3)  # what they need is not there yet
+        time.sleep(3)  # the services that they need do not run yet
         made.compose("up", "--detach", "--no-build")
         wait_for(lambda: made.health().get("status") == "ok", "the composed service", made.said)
         made.key = json.loads(
@@ -129,12 +129,12 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
 
 
 def expected(files: tuple[Path, Path, Path], steps: int, cache: Path, out: Path) -> bytes:
-    """What `sgsst stylize` makes on this machine."""
+    """Return the result of `sgsst stylize` on this machine."""
     ply, cameras, style = files
     command = [sys.executable, "-m", "api.cli", "stylize", ply, "--cameras", cameras, "--style", style, "--out", out]
     command += ["--steps-sos", str(steps), "--steps-coarse", "0", "--backbone", "vgg16", "--compute-everything"]
     command += ["--seed", "1"]
-    # with as many threads as in the container: on another number, sums are added in another order
+    # with as many threads as in the container: another number would add in another order
     own = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     environment = {**own, "SGSST_CACHE": str(cache), "PYTHONPATH": str(COMPOSE.parents[1])}
     ended = subprocess.run(list(map(str, command)), env=environment, capture_output=True, text=True)
@@ -151,7 +151,7 @@ def test_the_image_is_small_and_has_no_rights(podman: Containers) -> None:
     for compiler in ("cc", "gcc", "clang", "pip", "make"):
         assert podman.run(*inside, f"command -v {compiler} || true") == ""
     assert podman.run(*inside, "touch /opt/here 2> /dev/null || id -u").strip() == "10001"
-    # compiled beforehand: nothing has to be compiled, and kept nowhere, at each start
+    # bytecode is compiled in advance, because it could not be stored at run time
     assert podman.run(*inside, "ls /opt/sgsst/lib/python3*/site-packages/api/http/__pycache__ | grep -c server").strip()
 
 
@@ -175,7 +175,7 @@ def test_without_a_key_nobody_gets_in(composed: Composed) -> None:
 def test_health_is_that_of_the_process(composed: Composed) -> None:
     for service in ("api", "dispatcher"):
         inspected = composed.podman.run("podman", "inspect", composed.name(service))
-        # by itself: `podman healthcheck run` has the file's patience, which a busy machine may need more than
+        # run directly: `podman healthcheck run` uses the file's timeout, which may be too short on a busy machine
         test = json.loads(inspected)[0]["Config"]["Healthcheck"]["Test"]
         assert test == ["CMD", "python", "-m", "service.health", service]
         assert composed.podman.succeeds("podman", "exec", composed.name(service), *test[1:]), composed.said()
@@ -193,7 +193,7 @@ def curl(composed: Composed, files: tuple[Path, Path, Path], parameters: dict[st
 
 
 def seen(look: Callable[[], bool], composed: Composed, what: str) -> None:
-    """Wait for something; kernels are compiled anew in a new container, which takes minutes on a busy machine."""
+    """Wait for a condition; a new container compiles kernels again, which takes minutes on a busy machine."""
     until = time.monotonic() + PATIENCE
     while not look():
         assert time.monotonic() < until, f"waited in vain for {what}\n{composed.said()}"
@@ -205,7 +205,7 @@ def test_a_job_by_curl_outlives_its_containers(
     composed: Composed, victims: tuple[str, ...], files: tuple[Path, Path, Path], tiny_cache: Path, tmp_path: Path
 ) -> None:
     if "store" in victims and "moto" in composed.podman.run("podman", "exec", composed.name("store"), "ls", "/opt"):
-        victims = ("database",)  # moto keeps everything in memory, which a store does not
+        victims = ("database",)  # moto stores everything in memory, unlike a real store
     submitted = curl(composed, files, {**OPTIONS, "steps_sos": 300})
     assert "id" in submitted, submitted
     job_id = submitted["id"]

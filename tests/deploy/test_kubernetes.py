@@ -1,4 +1,4 @@
-"""`deploy/kubernetes`: rendered by kustomize, against the schemas of Kubernetes and KubeRay, and what must hold."""
+"""`deploy/kubernetes`: rendered by kustomize, validated against schemas of Kubernetes and KubeRay, with invariants."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ FOLDER = Path(__file__).resolve().parents[2] / "deploy" / "kubernetes"
 SCHEMA = Path(__file__).with_name("schemas") / "raycluster_v1.schema.json.gz"
 OVERLAYS = ("small", "gpu")
 each_overlay = pytest.mark.parametrize("overlay", OVERLAYS)
-#: Where Kubernetes' clients look for a token.
+#: Path where Kubernetes clients look for a token.
 TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"
-#: Secrets and their keys that the docs ask for.
+#: Secrets that the documents ask for.
 SECRETS = {"sgsst-database", "sgsst-store", "sgsst-ray", "sgsst-tls"}
 
 
@@ -58,7 +58,7 @@ def of_kind(overlay: str, kind: str) -> list[dict[str, Any]]:
 
 
 def pods(overlay: str) -> list[dict[str, Any]]:
-    """Templates of all pods."""
+    """Return the templates of all pods."""
     found = [each["spec"]["template"] for each in objects(overlay) if each["kind"] in ("Deployment", "Job")]
     for cluster in of_kind(overlay, "RayCluster"):
         found.append(cluster["spec"]["headGroupSpec"]["template"])
@@ -78,7 +78,7 @@ def containers(overlay: str) -> list[dict[str, Any]]:
 def test_manifests_keep_to_the_schemas(overlay: str) -> None:
     validate = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate is missing: see the extra [dev]")
     cluster_schema = json.loads(gzip.decompress(SCHEMA.read_bytes()))
-    # the schema is that of a custom resource: Kubernetes adds the members that every object has
+    # the schema is that of a custom resource; Kubernetes adds the members common to all objects
     cluster_schema["properties"] |= {name: {} for name in ("apiVersion", "kind", "metadata")}
     for found in objects(overlay):
         if found["kind"] == "RayCluster":
@@ -146,7 +146,7 @@ def policies_of(overlay: str) -> dict[str, dict[str, Any]]:
 
 
 def selected(overlay: str, policy: str) -> set[str]:
-    """Names of the pods that a policy is for."""
+    """Return the names of the pods that a policy selects."""
     selector = policies_of(overlay)[policy]["podSelector"]
     found = set()
     for labels in (pod["metadata"]["labels"] for pod in pods(overlay)):
@@ -178,7 +178,7 @@ def test_only_the_api_can_be_reached(overlay: str) -> None:
 
 @each_overlay
 def test_pods_reach_what_they_need_alone(overlay: str) -> None:
-    """Names, the database, the store, Ray's other pods; the API server of Kubernetes, if there is an autoscaler."""
+    """Name server, database, store and Ray's other pods; with an autoscaler, the API server of Kubernetes too."""
     policies = {name: spec for name, spec in policies_of(overlay).items() if "egress" in spec}
     (cluster,) = of_kind(overlay, "RayCluster")
     scales = bool(cluster["spec"].get("enableInTreeAutoscaling"))
@@ -204,7 +204,7 @@ def test_pods_reach_what_they_need_alone(overlay: str) -> None:
 
 
 def test_webhooks_are_a_choice(tmp_path: Path) -> None:
-    """The component turns them on, and lets dispatchers reach every port of public addresses, and no private one."""
+    """The component enables webhooks and lets dispatchers reach all ports of public addresses, but no private ones."""
     for overlay in OVERLAYS:
         assert "SGSST_WEBHOOKS" not in rendered(overlay)
     found = changed(tmp_path, lambda overlay: overlay["components"].append("../../components/webhooks"))
@@ -243,7 +243,7 @@ def test_images_can_be_named_by_their_digests(tmp_path: Path) -> None:
 
 
 def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[dict[str, Any]]:
-    """Objects of the overlay `gpu`, whose kustomization an operator has changed."""
+    """Return the objects of the overlay `gpu` after an operator's change to its kustomization."""
     shutil.copytree(FOLDER, folder / "kubernetes")
     overlay = folder / "kubernetes" / "overlays" / "gpu"
     kustomization = yaml.safe_load((overlay / "kustomization.yaml").read_text())
@@ -261,7 +261,7 @@ def test_ray_asks_for_a_token_and_is_of_the_version_that_is_installed(overlay: s
     assert (head["rayStartParams"]["num-cpus"], head["rayStartParams"]["num-gpus"]) == ("0", "0")
     (dispatcher,) = [each for each in of_kind(overlay, "Deployment") if each["metadata"]["name"] == "sgsst-dispatcher"]
     assert dispatcher["spec"]["strategy"] == {"type": "Recreate"}
-    name = f"{cluster['metadata']['name']}-head-svc:6379"  # how the operator calls the head's Service
+    name = f"{cluster['metadata']['name']}-head-svc:6379"  # the operator's name of the head's Service
     (node,) = [each for each in containers(overlay) if each["name"] == "ray-node"]
     assert f"--address={name}" in node["command"]
     (process,) = [each for each in containers(overlay) if each["name"] == "dispatcher"]

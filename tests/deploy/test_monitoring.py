@@ -1,4 +1,4 @@
-"""Alert rules and dashboard: their syntax, when alerts fire, and that what they read is what `/metrics` shows."""
+"""Alert rules and dashboard: their syntax, when alerts fire, and that they only use metrics of `/metrics`."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from tests.api.service import Service
 pytestmark = pytest.mark.slow
 MONITORING = Path(__file__).resolve().parents[2] / "deploy" / "monitoring"
 OPERATIONS = MONITORING.parents[1] / "docs" / "operations.md"
-#: Of functions that a query has beside metrics.
+#: Names of metrics in a query, unlike names of functions.
 _METRIC = re.compile(r"\bsgsst_\w+")
 
 
 def rules() -> dict[str, str]:
-    """Expressions by the name of their alert."""
+    """Return the expressions of all alerts by name."""
     (group,) = yaml.safe_load((MONITORING / "alerts.yaml").read_text())["groups"]
     return {rule["alert"]: rule["expr"] for rule in group["rules"]}
 
 
 def queries() -> list[str]:
-    """All expressions of alerts and dashboard."""
+    """Return all expressions of alerts and dashboard."""
     board = json.loads((MONITORING / "dashboard.json").read_text())
     return [*rules().values(), *(target["expr"] for panel in board["panels"] for target in panel["targets"])]
 

@@ -1,4 +1,4 @@
-"""`deploy/requirements`: what pip installs into the images, at the tested versions and with digests of all files."""
+"""`deploy/requirements`: packages that pip installs in the images, in tested versions and with digests of all files."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from packaging.utils import canonicalize_name
 from deploy.lock import FOLDER, ROOT, cuda_packages
 
 FILES = ("build", "common", "cpu", "cuda")
-#: What the images run on.
+#: Environment markers of the images.
 IMAGE = {"python_version": "3.11", "python_full_version": "3.11.2", "sys_platform": "linux", "platform_system": "Linux"}
 IMAGE |= {"platform_machine": "x86_64", "implementation_name": "cpython", "platform_python_implementation": "CPython"}
 
 
 def packages(file: str) -> dict[str, str]:
-    """Versions by name; every package must have a digest, and nothing else may be in the file."""
+    """Return versions by name; every package must have a digest, and the file must contain nothing else."""
     found: dict[str, str] = {}
     for line in (FOLDER / f"{file}.txt").read_text().replace(" \\\n", "").splitlines():
         if line.startswith("#"):
@@ -54,7 +54,7 @@ def test_the_image_without_gpus_has_no_package_of_cuda() -> None:
 
 @pytest.mark.parametrize("kind", ["cpu", "cuda"])
 def test_nothing_that_is_needed_is_missing(kind: str) -> None:
-    """All that the project and its packages ask for, as far as these are installed here."""
+    """Only requirements of packages that are installed here can be checked."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [
         *project["dependencies"],

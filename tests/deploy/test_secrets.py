@@ -1,4 +1,4 @@
-"""`deploy/make_secrets.py` and `deploy/compose.yaml`: no service starts with a password that somebody else knows."""
+"""`deploy/make_secrets.py` and `deploy/compose.yaml`: no service starts with a publicly known password."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from deploy.make_secrets import make_secrets
 from tests.deploy.containers import COMPOSE
 
 SECRETS = ("database/password", "store/key", "store/secret", "grafana/password")
-#: Volumes of secrets that each service of the compose file mounts; the others mount none.
+#: Volumes of secrets that each service of the compose file mounts; other services mount none.
 MOUNTED = {
     "secrets": {"secret-database", "secret-store", "secret-grafana"},
     "setup": {"secret-database", "secret-store"},
@@ -92,5 +92,5 @@ def test_every_service_mounts_its_own_secrets() -> None:
         assert mounted == MOUNTED.get(name, set()), name
         if mounted and name != "secrets":
             assert all(mounts[volume].endswith(":ro") for volume in mounted), name
-            # until the secrets are there, it ends and is restarted
+            # it exits and is restarted until the secrets exist
             assert service["restart"] == ("on-failure" if name == "setup" else "unless-stopped"), name

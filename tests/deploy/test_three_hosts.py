@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 def missing() -> str | None:
-    """Which program this machine lacks; None where all are there."""
+    """Return which program this machine lacks; None if it has all."""
     for tool in ("curl", "setpriv", "initdb"):
         if shutil.which(tool) is None and not list(Path("/usr/lib/postgresql").glob(f"*/bin/{tool}")):
             return f"{tool} is missing: apt-get install -y curl util-linux postgresql"

@@ -1,4 +1,4 @@
-"""`deploy/two_hosts.sh`: one job on two hosts, which are namespaces of this machine, from a cold cache."""
+"""`deploy/two_hosts.sh`: one job on two hosts, which are namespaces of this machine, with a cold cache."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PROBE = f"sgsst-p{os.getpid()}"
 
 
 def problem() -> str | None:
-    """Why this machine cannot pretend to be two; None where it can."""
+    """Return why this machine cannot act as two hosts; None if it can."""
     if sys.platform != "linux" or os.geteuid() != 0:
         return "network namespaces are made by root, on Linux"
     for tool in ("ip", "unshare", "nsenter", "setpriv"):
@@ -43,8 +43,9 @@ def problem() -> str | None:
 
 
 def run(command: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    """A script of `deploy/` to its end. Where the tests are broken off, it is asked to end and not killed: it removes
-    its hosts then.
+    """Run a script of `deploy/` to its end.
+
+    If the tests are interrupted, the script receives SIGTERM rather than SIGKILL, so that it removes its hosts.
     """
     held = ["setpriv", "--pdeathsig", "TERM", *command]
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -59,7 +60,7 @@ def run(command: list[str], environment: dict[str, str]) -> subprocess.Completed
 
 
 def assert_removed(network: re.Match[str] | None) -> None:
-    """That the network whose number a script said is gone with its hosts."""
+    """Assert that the network whose number a script printed is gone with its hosts."""
     assert network is not None
     left = subprocess.run(["ip", "-o", "link"], capture_output=True, text=True, check=True).stdout
     left += subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
@@ -73,7 +74,7 @@ def test_one_job_on_two_hosts_from_a_cold_cache(tmp_path: Path, vgg16_weights: B
     environment = {
         **os.environ,
         "BIN": str(Path(sys.executable).parent),
-        "NUMBA_CACHE_DIR": str(kernels),  # takes the place of the __pycache__ folders
+        "NUMBA_CACHE_DIR": str(kernels),  # used in place of the __pycache__ folders
     }
     ended = run([str(ROOT / "deploy" / "two_hosts.sh"), str(out)], environment)
     assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}"

@@ -1,4 +1,4 @@
-"""Run by Alembic: the migrations, on the connection that `Database.upgrade` hands in."""
+"""Alembic environment: runs the migrations on the connection passed by `Database.upgrade`."""
 
 from __future__ import annotations
 

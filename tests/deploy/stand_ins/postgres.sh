@@ -1,4 +1,4 @@
-# As the official image: a new cluster for POSTGRES_USER, POSTGRES_PASSWORD_FILE and POSTGRES_DB at the first start.
+# Like the official image: the first start creates a cluster for POSTGRES_USER, POSTGRES_PASSWORD_FILE and POSTGRES_DB.
 set -eu
 bin=$(echo /usr/lib/postgresql/*/bin)
 if [ ! -s "$PGDATA/PG_VERSION" ]; then

@@ -1,4 +1,4 @@
-"""A server that speaks S3 (moto's), and one in front of it that answers wrongly when it is told to."""
+"""Server that speaks S3 (moto's), and a proxy that injects faults."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any, Literal
 import httpx
 import pytest
 
-#: "slow-down": 503, as S3 says that there are too many requests; "not-implemented": 501; "reset": the connection is
-#: broken off before the answer; "cut-off": in the middle of it; "silence": there is no answer at all.
+#: "slow-down": 503, S3's response to too many requests. "not-implemented": 501. "reset": the connection is closed
+#: before the response. "cut-off": it is closed in the middle of the response. "silence": there is no response at all.
 Fault = Literal["slow-down", "not-implemented", "reset", "cut-off", "silence"]
 
 _SLOW_DOWN = (
@@ -26,7 +26,7 @@ _NOT_IMPLEMENTED = b"<?xml version='1.0'?><Error><Code>NotImplemented</Code><Mes
 
 @contextmanager
 def s3_server() -> Iterator[str]:
-    """URL of a server with no buckets."""
+    """Run a server without buckets and yield its URL."""
     server_module = pytest.importorskip("moto.server", reason="moto's server is not installed: see the extra [dev]")
     pytest.importorskip("s3fs", reason="s3fs is not installed: see the extra [s3]")
     server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
@@ -37,7 +37,7 @@ def s3_server() -> Iterator[str]:
 
 
 def environment_of(endpoint: str) -> dict[str, str]:
-    """What tells clients of S3 where it is, and who they are."""
+    """Return the environment variables with the address and credentials for S3 clients."""
     return {
         "AWS_ENDPOINT_URL": endpoint,
         "AWS_ACCESS_KEY_ID": "key",
@@ -47,11 +47,11 @@ def environment_of(endpoint: str) -> dict[str, str]:
 
 
 class FaultyS3:
-    """Hands requests on to a server, but for those that it is told to answer wrongly.
+    """Proxy that forwards requests to a server, except those that it should fail.
 
     Attributes:
-        url: of this.
-        asked: method and path of every request.
+        url: URL of the proxy.
+        asked: Method and path of every request.
     """
 
     def __init__(self, behind: str) -> None:
@@ -79,17 +79,17 @@ class FaultyS3:
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def fail(self, fault: Fault, times: int, which: Callable[[str, str], bool] = lambda method, path: True) -> None:
-        """Answer so many of the next requests that are meant (by method and path) with a fault."""
+        """Fail the next requests selected by method and path, this many times."""
         with self._lock:
             self._faults = [(fault, which)] * times
 
     def heal(self) -> None:
-        """No more faults."""
+        """Stop failing requests."""
         with self._lock:
             self._faults = []
 
     def close(self) -> None:
-        """Listen no more."""
+        """Close the proxy."""
         self._server.shutdown()
         self._server.server_close()
 

@@ -1,4 +1,4 @@
-"""Results, in a local folder and in a store that only knows whole objects (as S3 does)."""
+"""Results in a local folder and in a store that only handles whole objects, like S3."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A host's cache of the store's files: fetched once, verified, bounded, shared by processes."""
+"""A host's cache of stored files: fetched once, verified, bounded in size, shared by processes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def content(number: int, size: int = 1000) -> tuple[bytes, str]:
 
 
 class Source:
-    """Something to fetch from, which counts."""
+    """Source of a file that counts fetches."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.fetched = data, 0
@@ -59,7 +59,7 @@ def test_what_was_used_longest_ago_goes_first_and_what_is_in_use_stays(cache: Fi
     (tmp_path / "0").unlink()
     (tmp_path / "1").unlink()
     again = Source(found[0][0])
-    cache.link(found[0][1], 1000, tmp_path / "0", again)  # used again, and let go of: now the other one is older
+    cache.link(found[0][1], 1000, tmp_path / "0", again)  # used again and released, so the other one is now older
     (tmp_path / "0").unlink()
     assert again.fetched == 0
     cache.link(found[2][1], 1000, tmp_path / "2", Source(found[2][0]))
@@ -151,7 +151,7 @@ def test_a_file_that_is_handed_over_is_not_copied(cache: FileCache, tmp_path: Pa
 def test_half_files_go_by_how_long_they_have_lain(
     cache: FileCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A whole file is given the time of its content just before its place, and may then seem decades old."""
+    """A complete file gets its synthetic time just before it is moved into the cache, and may then seem decades old."""
     half = tmp_path / "cache" / "half" / "0123456789abcdef"
     half.write_bytes(b"whole")
     os.utime(half, (0, 0))
@@ -163,7 +163,7 @@ def test_half_files_go_by_how_long_they_have_lain(
 
 
 def _use(folder: str, number: int) -> None:
-    """Link, read and let go of five files, again and again, in a cache that holds two."""
+    """Repeatedly link, read and release five files in a cache that holds two."""
     cache = FileCache(Path(folder) / "cache", 2500)
     for turn in range(40):
         data, sha256 = content((number + turn) % 5)

@@ -1,4 +1,4 @@
-"""Uploads whose API was killed between the last byte and the row that says so."""
+"""Uploads whose API was killed between the last byte and the row that records it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def append(service: Service, where: str, offset: int, content: bytes, checksum: 
 
 
 def begin(service: Service, path: Path) -> str:
-    """The path of an upload with all bytes but the last one."""
+    """Create an upload with all bytes but the last one and return its path."""
     content = path.read_bytes()
     headers = {**TUS, "Upload-Length": str(len(content))}
     where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
@@ -41,7 +41,7 @@ def begin(service: Service, path: Path) -> str:
 
 
 def die_at_the_end(service: Service, path: Path, where: str, *, linked: bool) -> None:
-    """Bring the disk and the store where the API is after the last byte; after the blob's link, if so."""
+    """Reproduce the state of disk and store after the last byte; with `linked`, after the blob's link too."""
     service.stop(signal.SIGKILL)
     settings = ServiceSettings(data=service.data, min_free_bytes=0)
     store = open_store(settings)

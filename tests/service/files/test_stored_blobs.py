@@ -1,4 +1,4 @@
-"""Inputs in an S3-compatible store, by several processes' eyes, while the store has its faults."""
+"""Inputs in an S3-compatible store, used by several processes while the store fails."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def server() -> Iterator[str]:
 
 @dataclass
 class Fleet:
-    """Hosts that share a database and a store of files, which has its faults."""
+    """Hosts that share a database and a file store with injected faults."""
 
     folder: Path
     store: Store
@@ -46,7 +46,7 @@ class Fleet:
         return StoredBlobs(settings, self.store.inputs, Artifacts(self.url).objects)
 
     def names(self) -> list[str]:
-        """All objects of the store."""
+        """Return the names of all objects in the store."""
         return sorted(Artifacts(self.url).objects.below(""))
 
     def take(self, host: StoredBlobs, data: bytes) -> str:
@@ -64,7 +64,7 @@ class Fleet:
         return self.store.inputs.create_upload("me", length, "scene.ply", "", HOUR)
 
     def again(self, upload: UploadRow) -> UploadRow:
-        """Its row as it is now."""
+        """Return the current row of an upload."""
         return self.store.inputs.upload(upload.id, "me")
 
     def append(self, host: StoredBlobs, upload: UploadRow, *blocks: bytes) -> None:
@@ -194,7 +194,7 @@ def test_of_two_who_send_the_same_bytes_one_is_told_so(fleet: Fleet) -> None:
     fast.discard()
     fast.write(b"and the end.")
     with pytest.raises(NotFoundError, match="gone"):
-        fleet.host("three").finish_upload(fleet.again(upload), HOUR)  # it is not whole yet
+        fleet.host("three").finish_upload(fleet.again(upload), HOUR)  # not complete yet
     fast.write(b"!!")
     fast.save()
     fast.close()
@@ -237,7 +237,7 @@ def test_a_disk_without_inodes_takes_nothing_in(fleet: Fleet, monkeypatch: pytes
         host.ensure_room(0)
     with pytest.raises(NoSpaceError):
         host.receive(10)
-    inodes(0, 0)  # a file system that has as many as it needs
+    inodes(0, 0)  # a file system without a limit of inodes
     host.ensure_room(0)
 
 

@@ -1,4 +1,4 @@
-"""What an attacker runs who has taken a reader over; sent as a scene, by its own text. Signals are harmless ones."""
+"""Code of an attacker who has taken over a reader, sent as a scene in source form; its signals are harmless."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ATTACH, IO_URING_SETUP = 16, 425
 
 
 def outcome(attempt: Callable[[], Any]) -> str:
-    """'done', or the name of the error that the kernel answered."""
+    """Return "done", or the name of the error that the kernel returned."""
     try:
         attempt()
         return "done"

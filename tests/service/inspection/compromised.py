@@ -1,6 +1,6 @@
-"""The inspecting process with a reader that runs what a scene holds: `python compromised.py [landlock] [seccomp]`.
+"""Inspecting process whose reader runs the code in a scene: `python compromised.py [landlock] [seccomp]`.
 
-Features that are named are taken for missing from the kernel.
+The named features are treated as missing from the kernel.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The API whose readers run what a scene holds."""
+"""API whose readers run the code in a scene."""
 
 from __future__ import annotations
 

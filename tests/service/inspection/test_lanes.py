@@ -1,4 +1,4 @@
-"""Turns of owners: nobody waits behind more than one request of another owner."""
+"""Turns of owners: nobody waits for more than one request of another owner."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.inspection.lanes import MAX_WAITING, Lanes
 
 
 class Work:
-    """Requests that end when they are told to; `order` is that in which they had their turn."""
+    """Requests that end on demand; `order` is the order of their turns."""
 
     def __init__(self, lanes: Lanes[str]) -> None:
         self.lanes = lanes
@@ -21,7 +21,7 @@ class Work:
         self.at_work: dict[str, asyncio.Event] = {}
 
     async def ask(self, name: str) -> None:
-        """Have a turn for the owner who is the first letter."""
+        """Take a turn for the owner named by the first letter."""
         async with self.lanes.turn(name[0]):
             self.order.append(name)
             self.at_work[name] = asyncio.Event()
@@ -29,7 +29,7 @@ class Work:
             del self.at_work[name]
 
     async def end(self, name: str) -> None:
-        """End a request, and let those who wait for its place begin."""
+        """End a request and let waiting ones start."""
         self.at_work[name].set()
         await settle()
 
@@ -97,7 +97,7 @@ def test_a_full_waiting_room_is_the_owners_own() -> None:
 
 
 def test_every_place_comes_back_whoever_gives_up() -> None:
-    """Any order of requests, ends and cancellations: at most one place an owner, none lost, none had twice."""
+    """For random requests, ends and cancellations: at most one slot per owner; no slot is lost or assigned twice."""
 
     async def run(seed: int) -> None:
         chance = random.Random(seed)

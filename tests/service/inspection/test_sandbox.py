@@ -1,4 +1,4 @@
-"""A reader that has been taken over: what it tries fails, and the files of others are checked as before."""
+"""Compromised reader: its attacks fail, and other users' files are still checked."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.service.inspection.test_limits import inspect
 from tests.small_scenes import wall, write_files
 
 COMPROMISED = Path(__file__).with_name("compromised.py")
-#: Set for the libraries; LC_CTYPE is of Python's own making where there is no locale.
+#: Variables set for the libraries; Python itself adds LC_CTYPE if there is no locale.
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 ADDED = {*THREADS, "CUDA_VISIBLE_DEVICES", "LC_CTYPE"}
 pytestmark = pytest.mark.skipif(bool(sandbox.missing()), reason=f"the kernel lacks {sandbox.missing()}")
@@ -40,7 +40,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
 
 @pytest.fixture
 def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
-    """What an attacker is after. The listener is on loopback, and would take a connection."""
+    """Provide the target of an attack; its listener on loopback would accept a connection."""
     for name in ("PGPASSWORD", "AWS_SECRET_ACCESS_KEY", "RAY_AUTH_TOKEN"):
         monkeypatch.setenv(name, "secret")
     outside = tmp_path / "outside"
@@ -60,7 +60,7 @@ def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str
 def attacked(
     monkeypatch: pytest.MonkeyPatch, folder: Path, files: dict[str, Path], target: dict[str, Any], *lacking: str
 ) -> dict[str, Any]:
-    """What an attack reports of itself."""
+    """Return the report of an attack about itself."""
     monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED), *lacking))
     code = f"# attack\n{source.getsource(attack)}\ntold = attack({target!r})\n".encode()
     scene = folder / "attack" / "scene.ply"
@@ -96,7 +96,7 @@ def test_a_reader_that_is_taken_over_reaches_nothing(
 def test_without_landlock_network_and_processes_are_out_of_reach(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
-    target["data"] = target["outside"]  # what can be written to is at most one byte of nobody's
+    target["data"] = target["outside"]  # whatever can be written to is worthless and grows by at most one byte
     found = attacked(monkeypatch, tmp_path, files, target, "landlock")
     assert allowed(found["calls"]) == set(), found["calls"]
     for name in ("write a huge file", "write outside", "write to own scene"):
@@ -138,7 +138,7 @@ def test_forged_answers_reach_nobody_else(
     write = f"os.write(descriptor, {answer.encode()!r} + bytes([10]))"
     code = f"import os\nfor descriptor in range(16):\n    try: {write}\n    except OSError: pass\nos._exit(0)\n"
     scene.write_text(f"# attack\n{code}")
-    if answer.startswith('{"found": {}}'):  # about its own files it may say what it likes
+    if answer.startswith('{"found": {}}'):  # it may falsify the answer about its own files
         assert inspect(tmp_path, {**files, "scene": scene}) == {}
     else:
         with pytest.raises(RefusedInputError, match="breaks their reader"):
@@ -166,7 +166,7 @@ def test_what_the_kernel_lacks_is_logged_at_start(
 
 
 def verdict(program: bytes, architecture: int, number: int, argument: int = 0) -> int:
-    """What a filter answers to a system call: classic BPF, as the kernel runs it."""
+    """Return the filter's verdict on a system call, interpreting classic BPF as the kernel does."""
     call = {0: number, 4: architecture, 16: argument}
     code = list(struct.iter_unpack("=HBBI", program))
     at = value = 0

@@ -1,4 +1,4 @@
-"""What a dispatcher does beside running jobs: it is there, keeps house, and takes over from those that are gone."""
+"""Tasks of a dispatcher besides running jobs: heartbeats, housekeeping, and taking over from dead dispatchers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def store(settings: ServiceSettings) -> Iterator[Store]:
 
 @contextmanager
 def at_work(settings: ServiceSettings, store: Store) -> Iterator[Dispatcher]:
-    """A dispatcher that runs in a thread."""
+    """Run a dispatcher in a thread."""
     dispatcher = Dispatcher(settings, store, Machine(("0", "1"), 2, 10**10))
     thread = threading.Thread(target=dispatcher.run)
     thread.start()
@@ -72,7 +72,7 @@ def test_it_is_known_while_it_is_at_work(settings: ServiceSettings, store: Store
 
 
 def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Store, folder: Path) -> RunningAttempt:
-    """One that was not started."""
+    """Return an attempt that has not been started."""
     blobs = BlobFolder(settings.folder, store.inputs, 0)
     artifacts = Artifacts(settings.artifacts_url)
     return RunningAttempt(held, grant, folder, store, blobs, artifacts, settings, cluster=False)
@@ -81,7 +81,7 @@ def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Stor
 def test_an_attempt_tells_when_it_will_end(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
     held = leased(store, "one")
     attempt = attempt_of(held, Grant(1, ("0",)), settings, store, tmp_path)
-    for stage in ("planning", "preparing"):  # seconds of these are not the job's
+    for stage in ("planning", "preparing"):  # the remaining seconds of these stages are not the job's
         attempt._take_in({"kind": "stage", "stage": stage, "seconds_left": 3.0})
     assert attempt.holding == Holding(attempt.grant)
     attempt._take_in({"kind": "progress", "step": 1, "total": 2, "seconds_left": 1000.0})
@@ -90,7 +90,7 @@ def test_an_attempt_tells_when_it_will_end(settings: ServiceSettings, store: Sto
     assert told.until - store.database.clock() == pytest.approx(1000.0, abs=60.0)
     estimated = estimated_seconds(held.job.parameters, held.job.inputs)
     assert told.pace == pytest.approx(1000.0 / estimated, rel=0.06)
-    held.job.attempt = 2  # its seconds may be those that a checkpoint has left
+    held.job.attempt = 2  # the seconds may be those left after a checkpoint
     assert attempt.holding.pace is None
 
 
@@ -140,7 +140,7 @@ def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store
 
 
 def test_leases_that_cannot_be_renewed_end_their_jobs_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The database does not answer: the thread that renews leases waits for it, and others will take the job over."""
+    """The database does not respond: the thread that renews leases waits for it, and others will take over the job."""
     settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, lease_seconds=4)
     store = open_store(settings)
     store.inputs.add_blob(SHA, "aa/blob", 3)
@@ -152,7 +152,7 @@ def test_leases_that_cannot_be_renewed_end_their_jobs_in_time(tmp_path: Path, mo
         return {}
 
     class Attempt:
-        """An attempt that runs for ever."""
+        """Attempt that runs forever."""
 
         def __init__(self, lease: Lease, grant: Grant, *others: object) -> None:
             self.lease, self.holding = lease, Holding(grant)
@@ -187,7 +187,7 @@ def test_leases_that_cannot_be_renewed_end_their_jobs_in_time(tmp_path: Path, mo
 
 
 def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
-    """It died after its job had succeeded: the job has nobody who would look after it again."""
+    """The dispatcher died after its job had succeeded, so nobody else would handle the job again."""
     artifacts = Artifacts(settings.artifacts_url)
     source = tmp_path / "stylized.ply"
     source.write_bytes(b"ply")
@@ -207,7 +207,7 @@ def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings
 
 @pytest.mark.parametrize(("damage", "code"), [("lost", "file-lost"), ("flipped", "file-damaged")])
 def test_a_job_whose_input_is_gone_fails(tmp_path: Path, damage: str, code: str) -> None:
-    """It is tried as often as any other job that comes no further, and not for ever."""
+    """The job is retried as often as any other job without progress, and not forever."""
     settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, retry_seconds=0.01, max_attempts=2)
     store = open_store(settings)
     blobs = BlobFolder(settings.folder, store.inputs, 0)

@@ -1,4 +1,4 @@
-"""How an attempt has ended: the decision by itself, without a process."""
+"""Decision about how an attempt ended, without a process."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_an_end_that_was_wanted_is_no_failure(wish: Wish, outcome: str, last: Me
 
 
 def test_on_a_cluster_a_process_that_ray_ended_is_an_outage() -> None:
-    """When the cluster's head dies, Ray ends who is connected to it, with code 1 and without a word."""
+    """When the cluster's head dies, Ray terminates connected processes with exit code 1 and without a message."""
     found = ending(None, None, 1, "raylet has died", cluster=True)
     assert (found.outcome, found.error, found.permanent) == (AttemptOutcome.FAILED, OUTAGE, False)
     assert found.detail == "The process that ran the job ended with code 1.\nraylet has died"

@@ -1,4 +1,4 @@
-"""When a container's process counts as one that works, and what processes wait for at their start."""
+"""Health of a container's process, and what processes wait for when they start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a job is worth by its record, and whether that agrees with the forecast that it was made from."""
+"""Number of GPUs that a job is worth by its record, and agreement with the forecast that the estimate comes from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SIGKILL at bad moments: jobs are neither lost nor published twice, and end with what an undisturbed run gives."""
+"""SIGKILL at bad moments: jobs are neither lost nor published twice, and give the result of an undisturbed run."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
     folder = tmp_path_factory.mktemp("service")
-    # attempts end by the test's hand here, which is no reason to give a job up
+    # attempts are killed by the test here, which must not fail the job
     with Service(folder / "data", SGSST_MAX_ATTEMPTS="50", SGSST_CHECKPOINT_SECONDS="0.5") as running:
         yield running
 
 
 @pytest.fixture(scope="module")
 def expected(files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What one rank makes of the same files and settings, undisturbed."""
+    """Return the result of one undisturbed rank on the same files and settings."""
     return undisturbed(files, PARAMETERS, tmp_path_factory.mktemp("cli"))
 
 
@@ -52,7 +52,7 @@ def submit(service: Service, files: dict[str, Path], key: str, **parameters: Any
 
 
 def look(service: Service, job_id: str) -> dict[str, Any]:
-    """The job; it waits where the API is away."""
+    """Return the job, waiting while the API is down."""
 
     def ask() -> httpx.Response | None:
         try:
@@ -67,7 +67,7 @@ def look(service: Service, job_id: str) -> dict[str, Any]:
 
 
 def ended(service: Service, job_id: str) -> dict[str, Any]:
-    """The job at its end, which is a success."""
+    """Wait for the job's end and return it; it must succeed."""
 
     def there() -> dict[str, Any] | None:
         found = look(service, job_id)
@@ -92,7 +92,7 @@ def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
 
 
 def check_published_once(service: Service, job_id: str) -> bytes:
-    """The result, which was told of once, ended the job once, and is on the disk once."""
+    """Return the result, which must be announced once, end the job once, and be stored once."""
     stream = httpx.get(f"{service.url}/v1/jobs/{job_id}/events", timeout=60).text
     blocks = [dict(line.split(": ", 1) for line in block.splitlines()) for block in stream.split("\n\n") if block]
     told = [(block["event"], json.loads(block["data"])) for block in blocks if "data" in block]
@@ -108,7 +108,7 @@ def test_a_job_outlives_the_death_of_all_its_processes(
     service: Service, files: dict[str, Path], expected: Path
 ) -> None:
     job_id = submit(service, files, "all").json()["id"]
-    service.kill(API)  # just after its promise
+    service.kill(API)  # just after it has accepted the job
     wait_for(lambda: look(service, job_id)["attempt"] == 1, "the first attempt", service.said)
     service.kill(DISPATCHER)  # while the attempt reads its inputs
     at_step(service, job_id, 5, attempt=2)
@@ -119,7 +119,7 @@ def test_a_job_outlives_the_death_of_all_its_processes(
     service.start()
     at_step(service, job_id, 20, attempt=4)
     folder = service.data / "artifacts" / job_id
-    # the result is in its place, and the row that makes it visible is written at this moment or has just been
+    # the result is stored, and the row that makes it visible is being written or has just been written
     wait_for(lambda: any(folder.rglob("stylized.ply")), "the result's file", service.said, every=0.002)
     service.kill(DISPATCHER)
     found = ended(service, job_id)
@@ -153,7 +153,8 @@ def test_a_request_that_the_api_dies_in_can_be_sent_again(service: Service, file
 def test_killed_ranks_cost_time_only(service: Service, files: dict[str, Path], expected: Path) -> None:
     job_id = submit(service, files, "ranks", workers=2).json()["id"]
     at_step(service, job_id, 3, attempt=1)
-    for process in service.processes("ray::RankProcess"):  # the plan may do without one: whichever takes part is killed
+    # the plan may leave out a rank, so every participant is killed
+    for process in service.processes("ray::RankProcess"):
         process.kill()
     found = ended(service, job_id)
     assert found["result"]["steps"] == STEPS
@@ -163,6 +164,6 @@ def test_killed_ranks_cost_time_only(service: Service, files: dict[str, Path], e
     two, one = (read_scene(path).scene for path in (service.data / "two.ply", expected))
     before = read_scene(files["scene"]).scene
     moved = (one.sh_dc - before.sh_dc).norm()
-    # two ranks add in another order, and rounding grows along the path of the optimizer
+    # two ranks add in a different order, and rounding grows along the path of the optimizer
     assert (two.sh_dc - one.sh_dc).norm() < 0.05 * moved
     assert torch.equal(two.means, one.means)

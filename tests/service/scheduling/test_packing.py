@@ -1,4 +1,4 @@
-"""How jobs share a machine: the real store and dispatcher, and machines that are only described."""
+"""Sharing of a machine by jobs, with the real store and dispatcher on simulated machines."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from service.store.tables import JobRow, ReservationRow
 
 GB = 1_000_000_000
 SHA = "a" * 64
-#: A job of hours, worth all GPUs of a machine.
+#: Parameters of a job of several hours that is worth all GPUs of a machine.
 LARGE = {"preset": "paper", "resolution": 5187}
 
 
@@ -32,7 +32,7 @@ def machine(gpus: int, **more: Any) -> Machine:
 
 
 class Queue:
-    """A store with jobs, and a dispatcher that is asked what it would start; nothing is run."""
+    """Store with jobs, and a dispatcher that decides what to start; nothing is run."""
 
     def __init__(self, folder: Path, gpus: int, parallel_jobs: int | None = None) -> None:
         self.now = 1_000_000.0
@@ -41,7 +41,7 @@ class Queue:
         self.store.inputs.add_blob(SHA, "aa/blob", 3)
         self.dispatcher = Dispatcher(settings, self.store, machine(gpus))
         self.held: dict[str, Grant] = {}
-        #: Of jobs that tell it: when they will have ended, and seconds over those estimated.
+        #: Expected ends of jobs that report progress; `pace` is their duration relative to the estimate.
         self.ends: dict[str, float] = {}
         self.pace = 1.0
 
@@ -59,7 +59,7 @@ class Queue:
         ]
 
     def start(self) -> list[str]:
-        """Start what there is room for, as the dispatcher does; ids in the order of their start."""
+        """Start the jobs that fit, as the dispatcher does; return ids in the order of their start."""
         started = []
         while (found := self.dispatcher.next_job(self.holdings())) is not None:
             lease, grant = found
@@ -75,7 +75,7 @@ class Queue:
 
 
 def kept_for(queue: Queue) -> list[str]:
-    """Jobs that room is kept for."""
+    """Return the jobs that capacity is reserved for."""
     with queue.store.database.reading() as session:
         return list(session.scalars(select(ReservationRow.job_id)))
 
@@ -173,11 +173,11 @@ def test_what_ends_in_time_uses_the_room_that_is_kept_for_a_big_job(eight: Queue
     for job_id in long[:2]:
         del eight.held[job_id]
     eight.ends = dict.fromkeys(long, eight.now + 600)
-    assert eight.start() == short[:2]  # as many as are free, in their order
+    assert eight.start() == short[:2]  # as many as there are free GPUs, in order
     assert kept_for(eight) == [big]
     for job_id in short[:2]:
         del eight.held[job_id]
-    eight.now += 575  # the third would end too late now
+    eight.now += 575  # the third job would end too late now
     assert eight.start() == []
     eight.held.clear()
     assert eight.start() == [big]
@@ -198,7 +198,7 @@ def test_nothing_is_let_in_before_a_pace_is_known_nor_what_takes_too_long_at_it(
 
 
 def test_a_kept_job_waits_no_longer_than_was_foreseen_at_first(eight: Queue) -> None:
-    """Running jobs that take ever longer than they told do not keep the door open for others."""
+    """Running jobs that exceed their forecasts do not let further jobs be backfilled."""
     long = [eight.add("a", workers=1) for _ in range(8)]
     assert eight.start() == long
     eight.add("b", workers=8)
@@ -214,7 +214,7 @@ def test_a_kept_job_waits_no_longer_than_was_foreseen_at_first(eight: Queue) -> 
 
 
 def test_the_machine_that_has_room_first_keeps_it(tmp_path: Path) -> None:
-    """Where room comes late, a big job is left to other machines until it has waited as long as it would have to."""
+    """A machine whose capacity is freed late leaves a large job to others until the job has waited long enough."""
     late, soon = (Queue(tmp_path, gpus=8) for _ in range(2))
     soon.dispatcher.name = "soon"
     for queue in (late, soon):

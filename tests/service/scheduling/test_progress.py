@@ -1,4 +1,4 @@
-"""What an attempt's process tells of its progress, and the record that the dispatcher makes of it."""
+"""Progress messages of an attempt's process, and the dispatcher's record of them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from worker.description import Prepared
 
 @pytest.fixture
 def channel(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
-    """Where messages for the dispatcher go."""
+    """Return the stream that receives messages for the dispatcher."""
     written = io.StringIO()
     monkeypatch.setattr(attempt_process, "_channel", written)
     return written
 
 
 def records(channel: io.StringIO) -> list[dict[str, Any]]:
-    """The records of the messages, as the job's second attempt has them."""
+    """Return the records of the messages for the job's second attempt."""
     return [progress_record(json.loads(line), 2) for line in channel.getvalue().splitlines()]
 
 

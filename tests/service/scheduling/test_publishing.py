@@ -1,4 +1,4 @@
-"""What is published of an attempt's folder, and when: a real store, a real folder of results, no process."""
+"""Publication of an attempt's files, with a real store and a real folder of results but no process."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def publisher(lease: Lease, folder: Path, store: Store, settings: ServiceSetting
 
 
 def told(store: Store, lease: Lease) -> list[str]:
-    """Names of files that watchers were told of, in order."""
+    """Return the names of files announced to watchers, in order."""
     return [event.data["name"] for event in store.jobs.events(lease.job_id, 0) if event.kind == "artifact"]
 
 

@@ -1,4 +1,4 @@
-"""Files of jobs that nothing refers to."""
+"""Stray files of jobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Webhooks: signed, tried again, sent to checked addresses only, and no receiver can hold the messages of others."""
+"""Webhooks: signed, retried, sent to checked addresses only, and no receiver can delay the messages of others."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from service.store.tables import DeliveryRow
 from tests.postgres import fresh_database, is_installed, server
 from tests.service.store.helpers import Clock
 
-#: Seconds for which a test waits for an event before it fails.
+#: Time limit of a test's waits in seconds.
 PATIENCE = 60.0
-#: Bytes of a body that no receiver of a status needs; more than the buffers of a connection.
+#: Size in bytes of a response body that the sender must not read: larger than the buffers of a connection.
 LARGE = 64 << 20
 
 
 class Receiver:
-    """An HTTP server on loopback that records the messages it receives.
+    """HTTP server on loopback that records the messages it receives.
 
     Args:
-        behave: What it does with a connection after it has read the message; by default it answers `status`.
+        behave: Handling of a connection after its message is read; by default the response is `status`.
         certificate: Certificate and key for TLS.
     """
 
@@ -96,7 +96,7 @@ Start = Callable[..., Receiver]
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Starts receivers that end with the test."""
+    """Provide a function that starts receivers, which end with the test."""
     started: list[Receiver] = []
 
     def start(*arguments: Any, **named: Any) -> Receiver:
@@ -134,7 +134,7 @@ def _deliver(store: Store, folder: Path, **values: Any) -> None:
 
 
 def _end_job(store: Store, url: str, owner: str = "local") -> str:
-    """End a job whose webhook is `url`, without the check at submission."""
+    """End a job whose webhook is `url`, bypassing the check at submission."""
     store.inputs.add_blob("a" * 64, "aa/b", 1)
     inputs = [{"role": "scene", "name": "s", "sha256": "a" * 64, "size": 1}]
     job, _ = store.jobs.create(NewJob(owner, "wall", 0, {}, inputs, url), limit=1000)
@@ -143,12 +143,12 @@ def _end_job(store: Store, url: str, owner: str = "local") -> str:
 
 
 def _tries(store: Store) -> list[int]:
-    """Attempts of each message that is neither delivered nor given up."""
+    """Return the attempts of each message that is neither delivered nor given up."""
     with store.database.reading() as session:
         return list(session.scalars(select(DeliveryRow.tries)))
 
 
-# --- what is sent --------------------------------------------------------------------------------------------------
+# --- messages -----------------------------------------------------------------------------------------------------
 
 
 def test_a_message_is_signed_by_the_convention(tmp_path: Path, store: Store, receiver: Receiver) -> None:
@@ -188,13 +188,13 @@ def test_redirects_are_not_followed(tmp_path: Path, store: Store, receiver: Rece
     assert _tries(store) == [1]
 
 
-# --- receivers and rows that do harm -------------------------------------------------------------------------------
+# --- harmful receivers and rows -----------------------------------------------------------------------------------
 
 UNUSABLE = ["http://127.0.0.1:99999/", "http://[::1", "http://℀.com/", "http://[v1.x]/", "\ud800", ""]
 
 
 def test_bad_rows_stop_no_other_message(tmp_path: Path, store: Store, receiver: Receiver) -> None:
-    """As a version that did not check them may have stored them; the last message is the youngest."""
+    """A version without checks may have stored such rows; the last message is the newest."""
     for url in UNUSABLE[:4]:
         _end_job(store, url)
     _end_job(store, receiver.url)
@@ -258,7 +258,7 @@ def test_a_head_without_end_is_not_kept(tmp_path: Path, store: Store, start: Sta
 def test_a_receiver_that_drips_is_cut_off(
     head: bytes, tmp_path: Path, store: Store, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No single read takes long; the deadline is that of the whole delivery."""
+    """No single read takes long, but the deadline covers the whole delivery."""
     cut_off = threading.Event()
 
     def drip(handler: Any) -> None:
@@ -281,7 +281,7 @@ def test_a_receiver_that_drips_is_cut_off(
 def test_the_deadline_includes_lookup_and_tls(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A name that is never found, and a server that accepts connections and is silent."""
+    """A name that is never found, and a server that accepts connections and stays silent."""
     release, found = threading.Event(), socket.getaddrinfo
 
     def slow(host: Any, *arguments: Any, **named: Any) -> Any:
@@ -302,7 +302,7 @@ def test_the_deadline_includes_lookup_and_tls(
 
 
 def test_slow_receivers_hold_no_other_message(tmp_path: Path, store: Store, start: Start) -> None:
-    """One owner has many messages to one receiver that does not answer, another one to many such receivers."""
+    """One owner has many messages to one unresponsive receiver, another one to many such receivers."""
     release = threading.Event()
     slow = start(lambda handler: release.wait(PATIENCE))
     heard = threading.Semaphore(0)
@@ -361,7 +361,7 @@ def _check_turns(store: Store) -> None:
     store.close()
 
 
-# --- addresses -----------------------------------------------------------------------------------------------------
+# --- addresses ----------------------------------------------------------------------------------------------------
 
 
 def test_private_addresses_are_not_called(tmp_path: Path, store: Store, receiver: Receiver) -> None:
@@ -405,7 +405,7 @@ def test_what_counts_as_public(address: str) -> None:
 def test_the_checked_address_is_the_one_that_is_called(
     tmp_path: Path, store: Store, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The name leads elsewhere from the second lookup on; there is none."""
+    """From the second lookup on, the name leads elsewhere; there is no second lookup."""
     looked_up, found = [], socket.getaddrinfo
 
     def resolve(host: Any, *arguments: Any, **named: Any) -> Any:
@@ -426,7 +426,7 @@ def test_the_checked_address_is_the_one_that_is_called(
 def test_certificates_are_verified_for_the_name(
     name: str, delivered: bool, tmp_path: Path, store: Store, start: Start
 ) -> None:
-    """The connection goes to an address; SNI, certificate and `Host` are those of the name."""
+    """The connection goes to an address; SNI, certificate and `Host` use the name."""
     receiver = start(certificate=_certificate(tmp_path, name))
     tls = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
     _end_job(store, f"https://localhost:{receiver.port}/hook")
@@ -437,7 +437,7 @@ def test_certificates_are_verified_for_the_name(
 
 
 def _certificate(folder: Path, name: str) -> Path:
-    """Certificate and key of a name, signed by itself."""
+    """Write a self-signed certificate for a name, with its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.UTC)
@@ -457,7 +457,7 @@ def _certificate(folder: Path, name: str) -> Path:
     return path
 
 
-# --- submission ----------------------------------------------------------------------------------------------------
+# --- submission ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A rank's folder on a machine that shares nothing with others but the store of files."""
+"""Folder of a rank on a machine that shares only the file store with others."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def s3(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
 
 @dataclass
 class Heard:
-    """What was told of stored files."""
+    """Recorded notifications of stored files."""
 
     files: list[Published] = field(default_factory=list)
     steps: list[int | None] = field(default_factory=list)
@@ -199,7 +199,7 @@ def _open_and_wait(job: StoreWorkplace, ready: Any) -> None:
 
 @pytest.mark.parametrize("alone", [True, False])
 def test_what_a_killed_rank_leaves_is_removed(job: StoreWorkplace, tmp_path: Path, alone: bool) -> None:
-    """By the process beside it; or, where that one was killed with it, by the next one on this machine."""
+    """The helper process removes it; if that is killed too, the next rank on this machine does."""
     spawned = multiprocessing.get_context("spawn")
     ready = spawned.Event()
     process = spawned.Process(target=_open_and_wait, args=(job, ready))

@@ -33,7 +33,7 @@ LEASE = 3.0
 
 @pytest.fixture(scope="module")
 def postgres() -> Iterator[str]:
-    """A PostgreSQL server of our own; skipped where none is installed."""
+    """Run a PostgreSQL server for the tests; skip them if it is not installed."""
     if not is_installed():
         pytest.skip("PostgreSQL's server is not installed")
     with server() as url:
@@ -42,7 +42,7 @@ def postgres() -> Iterator[str]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def settings(request: pytest.FixtureRequest, tmp_path: Path) -> ServiceSettings:
-    """Settings of a service with an empty database and short leases."""
+    """Return the settings of a service with an empty database and short leases."""
     database = None if request.param == "sqlite" else fresh_database(request.getfixturevalue("postgres"))
     return ServiceSettings(data=tmp_path / "data", database=database, poll_seconds=0.05, lease_seconds=LEASE)
 
@@ -72,7 +72,7 @@ def heartbeats(store: Store) -> dict[str, float]:
 
 @contextmanager
 def healthy(store: Store, held: Lease) -> Iterator[list[object]]:
-    """Renew a lease and beat, as a dispatcher with the right clock does; yields the statuses of the lease."""
+    """Renew a lease and send heartbeats like a dispatcher with the right clock; yield the statuses of the lease."""
     stop, found = threading.Event(), list[object]()
 
     def work() -> None:
@@ -91,7 +91,7 @@ def healthy(store: Store, held: Lease) -> Iterator[list[object]]:
 
 @contextmanager
 def wrong_dispatcher(settings: ServiceSettings, seconds: float) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the dispatcher's own process with a clock that is wrong by so much."""
+    """Run the dispatcher's own process with a clock that is wrong by `seconds`."""
     environment = {
         **os.environ,
         **SETTINGS,
@@ -128,7 +128,7 @@ def test_a_dispatcher_a_month_off_deletes_nothing(
     incoming.parent.mkdir(parents=True, exist_ok=True)
     incoming.write_bytes(b"on its way")
     held = leased(store, "healthy-00000000-1-1")
-    # the wrong heartbeat is there before the first housekeeping, which the process does on a thread of its own
+    # the wrong heartbeat precedes the first housekeeping, which the process does in its own thread
     with store_with_clock(settings, seconds) as (wrong, _, _):
         wrong.operations.beat("wrong-00000000-1-1", 1, 1)
     with healthy(store, held) as statuses, wrong_dispatcher(settings, seconds) as process:
@@ -163,12 +163,12 @@ def test_a_dispatcher_two_minutes_ahead_takes_no_healthy_lease(settings: Service
     assert time.time() - store.database.clock() == pytest.approx(0.0, abs=30.0)
 
 
-# --- with clocks that the tests turn ---------------------------------------------------------------------------------
+# --- with simulated clocks ----------------------------------------------------------------------------------------
 
 
 @contextmanager
 def store_with_clock(settings: ServiceSettings, wrong_by: float) -> Iterator[tuple[Store, ClockWatch, Clock]]:
-    """Open the same database with a clock that is wrong by so much, and the doubts of a dispatcher there."""
+    """Open the same database with a clock that is wrong by `wrong_by`, and the clock watch of a dispatcher there."""
     store, monotonic = open_store(settings, lambda: time.time() + wrong_by), Clock()
     try:
         yield store, ClockWatch(store, LEASE, monotonic), monotonic
@@ -200,7 +200,7 @@ def test_a_dead_dispatcher_of_this_machine_is_not_waited_for(tmp_path: Path) -> 
 
 
 def test_what_a_clock_ahead_has_written_waits_for_nothing(settings: ServiceSettings, store: Store) -> None:
-    """Neither the lease of its dispatcher, which has died, nor a job that was queued by it."""
+    """Neither the lease of its dead dispatcher nor a job queued by it has to wait."""
     with (
         store_with_clock(settings, 31 * DAY) as (ahead, _, _),
         store_with_clock(settings, 0.0) as (right, watch, clock),
@@ -219,7 +219,7 @@ def test_what_a_clock_ahead_has_written_waits_for_nothing(settings: ServiceSetti
 
 
 def test_what_is_due_is_deleted_after_some_hours_of_work_and_not_at_once(settings: ServiceSettings) -> None:
-    """A machine that was off for 40 days, or a clock that is ahead: nobody can tell."""
+    """A machine that was off for 40 days cannot be told from a clock that is ahead."""
     clock = Clock()
     store = open_store(settings, clock)
     store.inputs.add_blob(SHA, "aa/blob", 3)
@@ -231,7 +231,7 @@ def test_what_is_due_is_deleted_after_some_hours_of_work_and_not_at_once(setting
     assert store.retention.expire() == []
     assert store.inputs.collect() == []
     store.close()
-    store = open_store(settings, clock)  # and the next process goes on from there
+    store = open_store(settings, clock)  # the next process continues from there
     store.retention.advance(29 * DAY / CATCH_UP)
     assert store.retention.expire() == []
     store.retention.advance(2 * DAY / CATCH_UP)
@@ -259,7 +259,8 @@ def test_nothing_is_deleted_while_live_dispatchers_disagree(
         monotonic = Clock()
         store.retention.advance(0.0)
         right_watch = ClockWatch(store, LEASE, monotonic)
-        for passing in (True, False, False):  # the first look has nothing to compare with, and moves nothing on
+        # the first call has nothing to compare with and does not advance the expiry time
+        for passing in (True, False, False):
             store.operations.beat("healthy", 1, 1)
             wrong.operations.beat("wrong", 1, 1)
             before = wrong.database.expiry()
@@ -267,5 +268,5 @@ def test_nothing_is_deleted_while_live_dispatchers_disagree(
             assert right_watch.confirm() == passing, "nobody knows who is right"
             assert wrong.database.expiry() <= max(before, store.database.clock())
             clock.now, monotonic.now = clock.now + 1.0, monotonic.now + 1.0
-        wrong.operations.beat("wrong", 1, 1)  # it knows of its own heartbeats, and hears of no other any more
+        wrong.operations.beat("wrong", 1, 1)  # it knows of its own heartbeats and receives no others any more
         assert watch.confirm()

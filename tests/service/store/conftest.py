@@ -1,4 +1,4 @@
-"""The store on SQLite and on PostgreSQL."""
+"""Fixtures of the store on SQLite and on PostgreSQL."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.service.store.helpers import SHA, Clock, store_settings
 
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[str]:
-    """A PostgreSQL server of our own; skipped where none is installed."""
+    """Run a PostgreSQL server for the tests; skip them if it is not installed."""
     if not is_installed():
         pytest.skip("PostgreSQL's server is not installed")
     with server() as url:
@@ -23,7 +23,7 @@ def postgres() -> Iterator[str]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> str | None:
-    """URL of an empty database; None for SQLite's default place."""
+    """Return the URL of an empty database; None for SQLite's default path."""
     return None if request.param == "sqlite" else fresh_database(request.getfixturevalue("postgres"))
 
 

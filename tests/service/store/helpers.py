@@ -1,4 +1,4 @@
-"""What the tests of the store share: a clock that they turn, and jobs."""
+"""Helpers of the store's tests: a simulated clock, and jobs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RETENTION = 100.0
 
 
 class Clock:
-    """Stands still until told otherwise."""
+    """Clock that stands still until it is set."""
 
     def __init__(self) -> None:
         self.now = 1_000_000.0
@@ -25,7 +25,7 @@ class Clock:
 
 
 def store_settings(folder: Path, database: str | None) -> ServiceSettings:
-    """With the times above."""
+    """Return settings with the durations above."""
     return ServiceSettings(
         data=folder,
         database=database,

@@ -1,4 +1,4 @@
-"""Migrations only add, so that processes of the version before go on, and start, while a new one takes over."""
+"""Migrations only add, so processes of the previous version keep working and can start while a new one takes over."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VERSIONS = sorted(path.name[:4] for path in (MIGRATIONS / "versions").glob("[0-9
 
 
 def columns(engine: Engine) -> dict[tuple[str, str], Any]:
-    """Of all tables, by table and name."""
+    """Return the columns of all tables by table and name."""
     found = inspect(engine)
     return {(table, each["name"]): each for table in found.get_table_names() for each in found.get_columns(table)}
 
@@ -56,7 +56,7 @@ def test_versions_are_numbered_in_their_order() -> None:
 
 
 def next_version(folder: Path) -> Path:
-    """A copy of the project whose next version adds a table, a column and an index."""
+    """Create a copy of the project whose next version adds a table, a column and an index."""
     for name in ("sgsst_core", "worker", "service"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     new = f"{int(SCHEMA) + 1:04d}"

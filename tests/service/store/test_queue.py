@@ -1,4 +1,4 @@
-"""The next job of a long queue: as a plain sort of all jobs would have it, and without reading them all."""
+"""The next job of a long queue equals that of a plain sort of all jobs, without reading them all."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tests.service.store.helpers import ATTEMPTS, LEASE, Clock, lease, queue
 
 
 def sorted_queue(jobs: list[JobRow], served: dict[str, int], now: float) -> JobRow | None:
-    """The reference: all jobs that may start, in their order."""
+    """Return the first job by the reference order: a plain sort of all jobs that may start."""
     ready = [job for job in jobs if job.status == JobStatus.QUEUED and job.not_before <= now]
     lost = [job for job in jobs if job.lease_expires_at is not None and job.lease_expires_at < now]
-    ready += [job for job in lost if job.failures + 1 < ATTEMPTS]  # the others end as they are looked at
+    ready += [job for job in lost if job.failures + 1 < ATTEMPTS]  # the others end when they are examined
     return min(ready, key=lambda job: (-job.priority, served.get(job.owner, 0), job.queued_at, job.id), default=None)
 
 
@@ -41,7 +41,7 @@ def test_the_order_is_that_of_a_plain_sort(store: Store, clock: Clock, seed: int
         elif ending == 1:
             store.leases.release(found)
         elif ending == 2:
-            store.leases.succeed(found, [], {})  # and a fourth is lost
+            store.leases.succeed(found, [], {})  # in the fourth case the job is lost
 
 
 def test_who_keeps_room_takes_nothing_else_and_others_pass_it_over(store: Store, clock: Clock) -> None:

@@ -1,4 +1,4 @@
-"""What keys may use: counted exactly, refused before it is too much, and given back."""
+"""Quotas of keys: usage is counted exactly, requests beyond a limit are refused, and usage is released."""
 
 from __future__ import annotations
 
@@ -82,10 +82,10 @@ def test_a_machine_that_died_is_not_its_users_doing(store: Store, clock: Clock) 
 
 
 def test_bytes_are_of_uploads_inputs_and_results(store: Store, clock: Clock) -> None:
-    """An input of three bytes counts once, however many jobs have it."""
+    """An input of three bytes counts once, however many jobs use it."""
     quotas = Quotas(stored_bytes=10)
     job_id = submit(store, quotas)
-    clock.now += 1  # jobs of the same moment are in any order
+    clock.now += 1  # jobs of the same moment have no defined order
     submit(store, quotas)
     assert store.usage.of("local") == Used(2, 0, 3)
     store.inputs.create_upload("local", 5, "x", "", 1000, quotas=quotas)
@@ -139,7 +139,7 @@ def test_retry_is_refused_once_the_gpu_seconds_are_used_up(store: Store, clock: 
 
 
 def at_once(work: Callable[[], object], times: int) -> int:
-    """Call `work` in so many threads at the same moment; return how many calls were not refused."""
+    """Call `work` in `times` threads at the same moment; return the number of calls that were not refused."""
     ready, passed, broken = threading.Barrier(times), [], []
 
     def one() -> None:
@@ -161,7 +161,7 @@ def at_once(work: Callable[[], object], times: int) -> int:
 
 
 def test_no_limit_is_passed_by_requests_at_once(store: Store) -> None:
-    """On PostgreSQL transactions do not see each other's rows: without a lock, all of these would pass."""
+    """On PostgreSQL, transactions do not see each other's rows: without a lock, all of these would pass."""
     bytes_of_two = Quotas(stored_bytes=10)
     assert at_once(lambda: store.jobs.create(new_job("a"), limit=5), 30) == 5
     assert at_once(lambda: submit(store, Quotas(jobs_a_day=5), "b"), 30) == 5
@@ -188,7 +188,7 @@ def test_limits_name_what_is_too_much(store: Store) -> None:
         store.jobs.retry(job_id, "local", limit=0)
 
 
-# --- receipts ------------------------------------------------------------------------------------------------------
+# --- receipts -----------------------------------------------------------------------------------------------------
 
 OTHER = "b" * 64
 

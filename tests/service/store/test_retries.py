@@ -1,4 +1,4 @@
-"""What becomes of a job after an attempt: the decision by itself, without a store."""
+"""Decision about a job after an attempt, without a store."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An SQLite database whose write-ahead log is lost: files that it does not know any more are kept."""
+"""SQLite database whose write-ahead log is lost: files that it no longer knows are kept."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import ROOT
 
-#: A service that takes a job in, makes a file, and dies.
+#: Service that accepts a job, creates a file, and dies.
 _WORK = """
 import os, sys
 from pathlib import Path
@@ -60,7 +60,7 @@ def files_of(settings: ServiceSettings) -> set[bytes]:
 
 
 def collect(settings: ServiceSettings) -> bool:
-    """Open the database, collect what it does not know, and return whether it has gone back in time."""
+    """Open the database, collect files that it does not know, and return whether it was rolled back."""
     store = open_store(settings)
     BlobFolder(settings.folder, store.inputs, 0).collect()
     strays.remove_strays(store, Artifacts(settings.artifacts_url))

@@ -1,4 +1,4 @@
-"""The table of states: every pair of a state and a transition, against what the service promises."""
+"""Table of states: every combination of state and transition, compared with what the service promises."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.store.states import (
     next_status,
 )
 
-#: Rows: from; columns: by. A dot: there is no way.
+#: Rows: initial states; columns: transitions. A dot marks a combination that is not allowed.
 EXPECTED = """
             take      begin     succeed    fail    requeue  stop      cancel     retry   expire
 queued      starting  .         .          .       .        .         canceled   .       .
@@ -67,12 +67,12 @@ def test_every_state_is_reached_from_the_first_one() -> None:
 
 
 def test_a_job_that_is_being_canceled_can_only_end() -> None:
-    """Never back into the queue, and never failed: its user has given it up."""
+    """Such a job never returns to the queue and never fails, because its user has given it up."""
     ways = {way[JobStatus.CANCELING] for way in TRANSITIONS.values() if JobStatus.CANCELING in way}
     assert ways == {JobStatus.CANCELING, JobStatus.CANCELED, JobStatus.SUCCEEDED}
 
 
 def test_names_are_stored_as_text() -> None:
-    """The database and the API know plain strings."""
+    """The database and the API use plain strings."""
     assert [str(status) for status in JobStatus] == [status.value for status in JobStatus]
     assert next_status("queued", Transition.TAKE) == "starting"

@@ -1,4 +1,4 @@
-"""The store against a model of it, on SQLite and PostgreSQL, with a clock that the tests turn."""
+"""The store compared with a model, on SQLite and PostgreSQL, with a simulated clock."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_migrations_make_the_tables_that_the_code_describes(store: Store, tm
         assert columns == {column.name: column.nullable for column in table.columns}, table.name
         indexes = {index["name"] for index in found.get_indexes(table.name) if not index["unique"]}
         assert indexes == {index.name for index in table.indexes}, table.name
-    Base.metadata.create_all(store.database.engine)  # finds them all there
+    Base.metadata.create_all(store.database.engine)  # finds that all tables exist
 
 
 def test_sqlite_is_safe_against_power_cuts(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_the_same_idempotency_key_creates_one_job(store: Store) -> None:
 def test_places_in_the_queue_are_the_order_of_leases(store: Store, clock: Clock) -> None:
     ids = []
     for number, priority in enumerate([0, 5, 0, 5, -1, 0]):
-        clock.now += number % 2  # two at a time
+        clock.now += number % 2  # two jobs at a time
         ids.append(queue(store, priority=priority))
     found = {store.jobs.detail(job_id, "local")[1]: job_id for job_id in ids}
     assert {store.jobs.queue_position(store.jobs.get(job_id, None)): job_id for job_id in ids} == found
@@ -103,7 +103,7 @@ def test_many_dispatchers_lease_every_job_once(store: Store) -> None:
             found.append(held.job_id)
 
     _at_once(work, 4)
-    # with PostgreSQL a dispatcher may find nothing while another one holds the row that is next
+    # with PostgreSQL, a dispatcher may find nothing while another one holds the next row
     while (held := store.leases.take("last")) is not None:
         found.append(held.job_id)
     assert sorted(found) == sorted(expected)
@@ -166,7 +166,7 @@ def test_a_poisonous_job_is_given_up(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     for attempt in range(1, ATTEMPTS + 1):
         assert lease(store).job.attempt == attempt
-        clock.now += LEASE + 1  # the dispatcher died with it
+        clock.now += LEASE + 1  # the dispatcher died with the attempt
     assert store.leases.take("one") is None
     job = store.jobs.get(job_id, "local")
     assert (job.status, (job.error or {})["code"]) == ("failed", "dispatcher-lost")
@@ -174,7 +174,7 @@ def test_a_poisonous_job_is_given_up(store: Store, clock: Clock) -> None:
 
 
 def test_a_lost_job_that_finds_no_room_is_lost_once(store: Store, clock: Clock) -> None:
-    """However often a dispatcher that is full looks at it."""
+    """The loss counts once, however often a dispatcher without free capacity examines the job."""
     job_id = queue(store)
     lease(store, "late")
     clock.now += LEASE + 1
@@ -217,7 +217,7 @@ def test_an_outage_is_waited_out_however_long_it_takes(store: Store, clock: Cloc
 
 
 def fail_at(store: Store, clock: Clock, saved: int | None, *, lost: bool = False) -> bool:
-    """An attempt that saves a step and fails; whether the job is tried again."""
+    """Run an attempt that saves a step and fails; return whether the job will be retried."""
     clock.now += 1000
     held = lease(store)
     if saved is not None:
@@ -243,7 +243,7 @@ def test_a_job_that_always_breaks_at_the_same_step_is_given_up(store: Store, clo
     job_id = queue(store)
     assert fail_at(store, clock, None, lost=lost)
     assert fail_at(store, clock, 90, lost=lost), "this one came on"
-    # each attempt publishes the checkpoint that it begins with once more, or an older one where it begins anew
+    # each attempt first republishes the checkpoint that it resumes from, or an older step if it starts over
     assert fail_at(store, clock, 90, lost=lost)
     assert fail_at(store, clock, 10, lost=lost)
     assert not fail_at(store, clock, 90, lost=lost)
@@ -277,7 +277,7 @@ def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
     store.retention.mark_swept(third, 0)
     assert store.retention.unswept(10) == [(second, 1)]
     store.jobs.retry(second, "local", limit=10)
-    store.retention.mark_swept(second, 1)  # too late: it is not at its end any more
+    store.retention.mark_swept(second, 1)  # too late: the job has been queued again
     store.jobs.cancel(third, "local")
     store.leases.succeed(lease(store), [], {})
     assert sorted(store.retention.unswept(10)) == [(second, 2), (third, 0)]
@@ -367,7 +367,7 @@ def test_old_progress_is_forgotten_but_no_status(store: Store) -> None:
 
 
 def step_of(job: Lease, step: int, seconds: float, **more: Any) -> dict[str, Any]:
-    """Progress as the dispatcher reports it."""
+    """Return progress as the dispatcher reports it."""
     known = {"stage": "sos", "total": 10_000, "fraction": 0.5, "eta_s": 1.0, "scales": [1.0, None]}
     return {**known, "step": step, "seconds": seconds, "loss": 1e6 / step, "attempt": job.job.attempt, **more}
 
@@ -377,7 +377,7 @@ def test_the_course_of_a_loss_is_kept_from_its_beginning(store: Store, clock: Cl
     held = lease(store)
     store.leases.report_progress(held, {"stage": "planning", "step": 1, "total": 3, "attempt": 1})
     assert store.jobs.course(store.jobs.get(job_id, None), 10) == []
-    with store.database.writing() as session:  # as `report_progress`, without a transaction for each
+    with store.database.writing() as session:  # like `report_progress`, without a transaction for each point
         for step in range(1, 5000):
             keep_point(session, job_id, {**step_of(held, step, 0.9 * step), "updated_at": clock.now + step})
     clock.now += 5000
@@ -434,7 +434,7 @@ def test_the_course_of_many_attempts_is_halved(store: Store, monkeypatch: pytest
 
 
 def test_the_newest_picture_of_each_job(store: Store) -> None:
-    jobs = sorted(queue(store) for _ in range(3))  # of the same moment: their ids say which comes first
+    jobs = sorted(queue(store) for _ in range(3))  # created at the same moment, so their ids define the order
     for number in range(2):
         held = lease(store)
         names = ["previews/step_0000009.jpg", "previews/step_0000100.jpg", "views.jpg", "previewsx.jpg"]
@@ -508,11 +508,11 @@ def test_revoked_keys_are_unknown(store: Store) -> None:
     assert store.keys.find(text) is None
 
 
-# --- against a model -----------------------------------------------------------------------------------------------
+# --- comparison with a model --------------------------------------------------------------------------------------
 
 
 class StoreMachine(RuleBasedStateMachine):
-    """Any order of what users and dispatchers do; the model knows of each job its status and who may write to it."""
+    """Random operations of users and dispatchers; the model tracks each job's status and who may write to it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -535,10 +535,8 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(owner=st.sampled_from("ab"), priority=st.integers(0, 1))
     def create(self, owner: str, priority: int) -> None:
-        self.clock.now += (
-            1e-3  # ids sort by time and then by chance, which would make a run one that cannot be repeated
-        )
-        self.store.inputs.add_blob(SHA, "aa/blob", 3)  # it goes with the last job
+        self.clock.now += 1e-3  # ids sort by time and then randomly, which would make a run irreproducible
+        self.store.inputs.add_blob(SHA, "aa/blob", 3)  # deleted with the last job
         job_id = queue(self.store, owner, priority)
         self.status[job_id] = "queued"
 
@@ -560,7 +558,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.status[found.job_id] = "starting"
 
     def _see_settled(self) -> None:
-        """Leases that had run out may have ended their jobs."""
+        """Account for jobs that may have ended because their leases had expired."""
         for job_id, (held, until) in list(self.held.items()):
             status = self.store.jobs.get(job_id, None).status
             if until < self.clock.now and status in ("failed", "canceled"):

@@ -1,4 +1,4 @@
-"""The first tables."""
+"""Initial tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ down_revision = None
 
 
 def upgrade() -> None:
-    """Create them."""
+    """Create the tables."""
     op.create_table(
         "api_keys",
         sa.Column("id", sa.String(length=40), nullable=False),
@@ -168,5 +168,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """There is no way back before the first version."""
+    """Refuse to downgrade: there is no earlier version."""
     raise NotImplementedError("restore a backup")

@@ -1,4 +1,4 @@
-"""Dispatchers tell that they are alive; jobs know how far they came before they failed, and whether they are swept."""
+"""Heartbeats of dispatchers, and the columns of jobs for their saved steps and for sweeping."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ down_revision = "0001"
 
 
 def upgrade() -> None:
-    """Add them."""
+    """Add table and columns."""
     op.create_table(
         "dispatchers",
         sa.Column("name", sa.String(length=120), nullable=False),
@@ -26,7 +26,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Remove them."""
+    """Remove table and columns."""
     op.drop_index("ix_jobs_swept", table_name="jobs")
     for column in ("swept", "failed_step", "saved_step"):
         op.drop_column("jobs", column)

@@ -1,4 +1,4 @@
-"""Indexes in which places in the queue, and jobs of an owner by status, are counted without reading the jobs."""
+"""Indexes that count queue positions, and an owner's jobs by status, without reading the jobs."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ down_revision = "0002"
 
 
 def upgrade() -> None:
-    """Create them."""
+    """Create the indexes."""
     op.drop_index("ix_jobs_queue", "jobs")
     op.create_index("ix_jobs_queue", "jobs", ["status", "priority", "queued_at", "id"], unique=False)
     op.create_index("ix_jobs_owner_status", "jobs", ["owner", "status", "id"], unique=False)
 
 
 def downgrade() -> None:
-    """Back to an index that only finds what is queued."""
+    """Restore the previous index, which only finds queued jobs."""
     op.drop_index("ix_jobs_owner_status", "jobs")
     op.drop_index("ix_jobs_queue", "jobs")
     op.create_index("ix_jobs_queue", "jobs", ["status", "not_before"], unique=False)

@@ -1,4 +1,4 @@
-"""Where the parts of an unfinished upload are, for services whose files are in an object store."""
+"""Locations of the parts of unfinished uploads, for services with an object store."""
 
 from __future__ import annotations
 
@@ -25,5 +25,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Unfinished uploads are lost."""
+    """Drop the table; unfinished uploads are lost."""
     op.drop_table("upload_parts")

@@ -1,4 +1,4 @@
-"""Sessions of browsers, and the course of each job's loss."""
+"""Browser sessions, and the loss history of each job."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ down_revision = "0004"
 
 
 def upgrade() -> None:
-    """Create the tables. A service of the version before works on beside them: jobs and keys take theirs along."""
+    """Create the tables; a service of the previous version keeps working, because rows are deleted by cascade."""
     op.create_table(
         "sessions",
         sa.Column("sha256", sa.String(length=64), nullable=False),
@@ -39,6 +39,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Everybody is signed out, and the courses are forgotten."""
+    """Drop the tables: all browsers are signed out and loss histories are lost."""
     op.drop_table("progress_points")
     op.drop_table("sessions")

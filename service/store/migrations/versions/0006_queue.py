@@ -1,6 +1,6 @@
-"""The next job is found however long the queue is, dispatchers keep room for jobs, and keys have quotas.
+"""Queries of the next job that scale with the queue, reservations of dispatchers, and quotas of keys.
 
-The version before works on these tables too: what is new has defaults, and it asks for nothing of it.
+The previous version also works with these tables: the new columns have defaults and nothing is required of it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ down_revision = "0005"
 
 
 def upgrade() -> None:
-    """Create them."""
+    """Create tables, columns and indexes."""
     op.create_table(
         "reservations",
         sa.Column("job_id", sa.String(length=40), nullable=False),
@@ -39,7 +39,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Dispatchers keep room for nothing, and nothing is counted."""
+    """Remove tables, columns and indexes."""
     op.drop_column("api_keys", "quotas")
     for column in ("gpus_since", "gpus"):
         op.drop_column("attempts", column)
