@@ -23,6 +23,7 @@ PACKAGES = (
     "sgsst_core/report",
     "sgsst_core/scene",
     "sgsst_core/stylizing",
+    "worker",
 )
 OPENERS = ("Of", "Who", "What", "That", "From which", "In which")
 SECTIONS = ("Args", "Attributes", "Raises")

@@ -134,7 +134,7 @@ def prepare(
 def _refine(
     inputs: Inputs, settings: Settings, collectives: Collectives, show: ShowPlanning | None
 ) -> Refinement | None:
-    """Return how the scene is refined; None if no Gaussian is split."""
+    """Return how the scene is refined; None if `settings.refine` turns refinement off."""
     return refine(
         inputs.scene_file.scene,
         inputs.cameras,
