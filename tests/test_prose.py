@@ -15,6 +15,7 @@ PACKAGES = (
     "benchmarks",
     "sgsst_core/bench",
     "sgsst_core/features",
+    "sgsst_core/files",
     "sgsst_core/loss",
     "sgsst_core/parallel",
     "sgsst_core/planning",

@@ -56,7 +56,7 @@ class PlyElement:
         return np.dtype([(prop.name, byte_order + prop.kind) for prop in self.properties])
 
     def least_row_bytes(self, text: bool) -> int:
-        """Return the minimum bytes of a row. A value in text has at least a digit and a separator; lists may be empty."""
+        """Return the minimum bytes of a row. Text values have at least a digit and a separator; lists may be empty."""
         if text:
             return 2 * len(self.properties)
         return sum(np.dtype(prop.length_kind or prop.kind).itemsize for prop in self.properties)

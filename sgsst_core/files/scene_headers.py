@@ -41,7 +41,7 @@ _KSPLAT_HEADER_BYTES = 4096
 
 
 def form_of_name(name: str) -> Form | None:
-    """Return the format of an output file, given the ending of its name; None if it is not a supported output format."""
+    """Return the format of an output file by the ending of its name; None if the ending is not supported."""
     lower = name.lower()
     packed: Form | None = next((form for form in PACKED_FORMS if lower.endswith(f".{form}")), None)
     return packed or ("ply" if lower.endswith(".ply") else None)
@@ -54,7 +54,7 @@ def packed_name(ply: str, form: PackedForm) -> str:
 
 @dataclass(frozen=True)
 class SpzSection:
-    """Compressed stream of an SPZ file of version 4: its byte offset, its compressed size, and its decompressed size."""
+    """Compressed stream of an SPZ file of version 4: byte offset, compressed size and decompressed size."""
 
     offset: int
     compressed: int
