@@ -41,7 +41,7 @@ class Result:
     Attributes:
         stopped: Reason why the job ended; see `run`. If it is "interrupted", only a checkpoint was written.
         step, total: Completed and planned numbers of steps.
-        before, after: Loss on the evaluation views before and after the job; empty if the job was interrupted.
+        before, after: Losses on the evaluation views before and after the job; empty if the job was interrupted.
         bought: Relation of the loss to the time spent; see `report.bought`. None if no step was made on all scales.
         report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
         packed: Measured loss of quality in the compressed file; None if no compressed file was requested.

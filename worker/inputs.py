@@ -231,7 +231,7 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
 
 
 def _same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
-    """Load the weights of the feature network on every rank, those of the network that rank 0 chooses."""
+    """Load the weights of the feature network on every rank. Rank 0 chooses the network."""
     name = collectives.broadcast(lambda: load_network_weights(backbone).name)
     return together(collectives, lambda: load_network_weights(name))
 

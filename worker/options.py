@@ -34,7 +34,7 @@ _SHOWN = ("preset", "seed", "precision")
 
 
 class ViewOptions(BaseModel):
-    """Options of the views of a scene."""
+    """Options that determine the cameras and how they see the scene."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

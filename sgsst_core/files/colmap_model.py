@@ -53,7 +53,7 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """Intrinsics: the model's name, the size in pixels, and the parameters in the model's order."""
+    """Intrinsics of a camera: name of the model, size in pixels, and parameters in the model's order."""
 
     model: str
     width: int
@@ -63,13 +63,13 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A registered image.
+    """Registered image with its pose.
 
     Attributes:
         name: Path of the image, relative to COLMAP's image folder.
-        camera: Id of its camera.
+        camera: ID of its camera.
         rotation: Quaternion wxyz, world to camera, as stored.
-        translation: World to camera.
+        translation: Translation, world to camera.
     """
 
     name: str
@@ -79,10 +79,12 @@ class ColmapImage:
 
 
 def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
-    """Read the cameras by id, and the registered images in the file's order. Binary files win over text, as in COLMAP.
+    """Read the cameras by ID, and the registered images in the file's order.
+
+    Binary files take precedence over text files, as in COLMAP.
 
     Raises:
-        CameraError: A file is missing, truncated, or holds a value that is not allowed; names the file.
+        CameraError: If a file is missing, truncated, or has an invalid value. The message names the file.
     """
     if (folder / "cameras.bin").is_file():
         cameras = _by_id(folder / "cameras.bin", _binary(folder / "cameras.bin", _binary_camera))

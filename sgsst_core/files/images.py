@@ -75,7 +75,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """Find and check the photo of each camera. Only headers are read, so that errors show before long work starts.
+    """Find and check the photo of each camera. Only headers are read, so that errors occur before long work starts.
 
     A camera's name matches a file with or without its extension. Leading folders of the name are dropped until a file
     matches: "images/cam0/0001.png" matches FOLDER/images/cam0/0001.png, else FOLDER/cam0/0001.jpg, else

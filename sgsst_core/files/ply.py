@@ -196,9 +196,11 @@ def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
     """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
 
-    The bytes of a value that does not change in float32 stay too. There are three exceptions. With an SH attenuation,
-    f_rest_* change. Dropped rows are absent. Each piece of a split Gaussian gets a row of its own, with its own
-    position, scale and opacity. The count in the header is adjusted.
+    Even a color keeps its bytes if its value in float32 does not change. The rest of the file changes in three cases:
+
+    - With an SH attenuation, f_rest_* change.
+    - Dropped rows are absent, and the count in the header is adjusted.
+    - Each piece of a split Gaussian has its own row with its own position, scale and opacity; so the count changes too.
 
     A scene in another format is written as a PLY by `write_scene`.
 

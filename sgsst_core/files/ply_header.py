@@ -68,7 +68,7 @@ class PlyHeader:
 
     Attributes:
         byte_order: "<" or ">"; "" for text files.
-        raw: Bytes of the header up to the line end of `end_header`; the data starts at len(raw).
+        raw: Bytes of the header, including the line end of `end_header`; the data starts at len(raw).
         elements: Elements in the file's order.
     """
 

@@ -39,7 +39,7 @@ def test_a_search_says_how_jobs_ended() -> None:
         (691, "within its bounds"),  # pixels that differ by less than the rounding error of the network's input
         (737, "within its bounds"),  # pixels that differ by little more than the rounding error of their mean
         (667, "within its bounds"),  # pixels that differ in their last bit
-        (4237, "within its bounds"),  # an image whose features differ from the style's by 1 %
+        (4237, "within its bounds"),  # an image whose features differ from the style's by at most 1 %
         (5810, "within its bounds"),  # a layer whose standard deviation is 1e-4 of its mean
         (7447, "within its bounds"),  # content that changed by 1e4 rounding errors, with a weight of 1e12
         (12096, "within its bounds"),  # all pixels within a range of 4e-7

@@ -41,7 +41,7 @@ def counts() -> Iterator[Counts]:
 
 
 def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 32), **settings: Any) -> StylizeRequest:
-    """Write the inputs of a job with two tiny views at two or more scales and a few steps in each phase."""
+    """Write the inputs of a job with two tiny views at two or more scales and a few steps per phase; return it."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True)
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)

@@ -258,7 +258,7 @@ class _Attempts:
         return int(size * self._request.settings.refine)
 
     def _resume(self) -> Resume:
-        """Return the user's choice for the first attempt, and this job's own checkpoints for later attempts."""
+        """Return the checkpoint to resume from: the user's choice for the first attempt, then the job's own."""
         from worker.request import Resume
 
         if not self._lost:

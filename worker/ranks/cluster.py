@@ -22,8 +22,8 @@ from sgsst_core.errors import ClusterAwayError, RanksFailedError
 from worker.ranks import sweeper
 from worker.ranks.failure_policy import first_line
 
-#: Size of Ray's object store, which would take 30 % of all memory by default. It holds almost nothing, because tensors
-#: are exchanged by torch.distributed and scenes are read from files.
+#: Size of Ray's object store in bytes. The default is 30 % of all memory, but the store holds almost nothing here:
+#: torch.distributed exchanges tensors, and scenes are read from files.
 OBJECT_STORE_BYTES = 512 << 20
 #: Maximum length of the folder's path, so that the paths of Ray's sockets stay within the system's limit of 107 bytes.
 _LONGEST_FOLDER = 40

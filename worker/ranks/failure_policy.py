@@ -35,7 +35,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class FailedAttempt:
-    """Failed attempt.
+    """Outcome of a failed attempt, for `decide`.
 
     Attributes:
         failure: Cause of the failure.

@@ -103,7 +103,7 @@ def _meet(
     timeout: timedelta,
     listener: socket.socket | None = None,
 ) -> tuple[torch.device, Any]:
-    """Return the device that this rank's tensors lie on, and the ranks' store.
+    """Return the device of this rank's tensors, and the ranks' store.
 
     The device is a GPU if every rank has one, else the CPU. Ranks exchange this before they form a group, because all
     of them must form it for the same back ends.
@@ -338,7 +338,7 @@ class ProcessGroupCollectives:
 
 
 def _machine() -> tuple[str, str]:
-    """Return an identifier of the machine. Containers on one machine differ, since each has its own memory limit."""
+    """Return an identifier of the machine, by which containers count as machines: each has its own memory limit."""
     return socket.gethostname(), os.environ.get("HOSTNAME", "")
 
 

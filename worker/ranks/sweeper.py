@@ -43,7 +43,10 @@ def dismiss(process: subprocess.Popen[bytes]) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Kill all processes that have a file in the folder open or name it in their command line; delete the folder."""
+    """Wait until no other process uses a folder, kill those that still do after a moment, and delete the folder.
+
+    A process uses the folder if it has a file in it open or names it in its command line.
+    """
     started = time.monotonic()
     while users := _users(folder):
         if time.monotonic() - started > _LIMIT:

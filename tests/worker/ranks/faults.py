@@ -109,7 +109,7 @@ def forget(request: StylizeRequest) -> None:
 
 
 def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
-    """Write the inputs of a job with tiny views that uses all ranks."""
+    """Return a request with tiny views that uses all ranks, and write its inputs."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True, exist_ok=True)
     ply, cameras, style = write_files(inputs, wall())

@@ -215,7 +215,7 @@ def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, v
 
 
 def test_ranks_draw_the_same_colors_behind_a_scan() -> None:
-    """All ranks draw the background colors of a run on one rank, for any groups of ranks."""
+    """Background colors equal those of a run on one rank, however the ranks are grouped."""
     values = {
         "steps_coarse": 2,
         "steps_sos": 3,

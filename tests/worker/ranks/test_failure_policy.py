@@ -64,7 +64,7 @@ def test_too_many_attempts_in_vain_are_given_up() -> None:
 
 
 def twice(error: Exception, second: Exception | None = None, steps: tuple[int, int] = (4, 4)) -> Decision:
-    """Return the decision after two attempts without progress that ended with these errors."""
+    """Return the decision after two attempts that made no progress and ended with these errors."""
     return decide([failed(raised(error), steps[0]), failed(raised(second or error), steps[1])])
 
 
