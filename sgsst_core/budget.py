@@ -20,8 +20,8 @@ GPU_SHARE = 0.7
 #: Fractions of the memory limit: activations of one iteration, view targets and colors, and the rasterizer's tile
 #: intersections or cached weights.
 MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
-#: Where blend weights are cached, the memory limit divided by this, taken from the views' fraction, is left for tile
-#: intersections: views whose weights do not fit are rendered from them.
+#: If blend weights are cached, this divisor of the memory limit gives the budget for tile intersections. It is taken
+#: from the fraction of the views. Views whose weights do not fit are rendered from tile intersections.
 LISTS_BESIDE_WEIGHTS = 16
 
 

@@ -14,8 +14,8 @@ import numba
 import numba.core.caching
 import torch
 
-#: Numba's `workqueue` threading layer, the only one that is always available, aborts the process if two Python threads
-#: are inside a parallel kernel at once. A kernel uses every core anyway, so the kernels of a process take turns.
+#: Lock of the kernels of this process. Numba's `workqueue` threading layer, the only one that is always available,
+#: aborts the process if two Python threads run parallel kernels at once. A kernel uses every core anyway.
 _TURN = threading.RLock()
 
 
@@ -23,20 +23,20 @@ _TURN = threading.RLock()
 _COMPILED_IN = ("constants.py", "rasterizer/vectors.py", "rasterizer/kernels.py")
 
 
-#: Folders of the machine code of all kernels.
+#: Folders that hold the machine code of the kernels.
 _folders: set[Path] = set()
 
 
 def kernel_folders() -> set[Path]:
-    """Return the folders that machine code is kept in."""
+    """Return the folders that hold machine code."""
     return set(_folders)
 
 
 def keep_in_memory(report: Callable[[], None]) -> None:
-    """Keep kernels that are compiled from now on in memory: this process may read the folders, not write to them.
+    """Do not write newly compiled kernels to disk, because this process may only read the folders.
 
     Args:
-        report: Called for each kernel that the folders lack.
+        report: Callback for each kernel that the folders lack.
     """
     numba.core.caching.Cache.save_overload = lambda self, sig, data: report()  # type: ignore[method-assign]
 
@@ -52,9 +52,9 @@ def _digest() -> str:
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a `numba.njit` decorator that caches machine code on disk, or only in memory if no folder is writable.
 
-    Numba validates a cached kernel only against its own source file. Other inputs of the machine code are therefore
-    made part of its cached name: see `_COMPILED_IN`, the only modules from which a kernel may call compiled functions.
-    Multiply-adds are contracted, but nothing is reordered, so results do not depend on threads.
+    Numba validates a cached kernel only against its own source file. A hash of the other sources in its machine code is
+    therefore part of its cached name. A kernel may call compiled functions only from these modules (`_COMPILED_IN`).
+    Multiply-adds are contracted, but nothing is reordered, so results do not depend on the number of threads.
     """
     settings: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}, **options}
 
@@ -64,7 +64,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             kernel = numba.njit(cache=True, **settings)(function)
             _folders.add(Path(kernel.stats.cache_path))
             return kernel
-        except RuntimeError:  # "no locator available": neither the package's folder nor the user's cache can be written
+        except RuntimeError:  # "no locator available": neither the package's folder nor the user's cache is writable
             return numba.njit(**settings)(function)
 
     return decorate

@@ -36,7 +36,7 @@ Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-wei
 EVERYTHING: tuple[Item, ...] = get_args(Item)
 #: Content weight of each named style strength, chosen on the trade-off curve of style and content (docs/quality.md).
 STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 1e4, "strong": 1.0}
-#: First words of the default's description for settings whose default depends on the preset.
+#: Prefix of the description of a default that depends on the preset.
 BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
 

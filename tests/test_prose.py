@@ -18,6 +18,7 @@ PACKAGES = (
     "service",
     "sgsst_core/bench",
     "sgsst_core/features",
+    "sgsst_core/files",
     "sgsst_core/loss",
     "sgsst_core/parallel",
     "sgsst_core/planning",
@@ -29,6 +30,7 @@ PACKAGES = (
     "tests/api",
     "tests/deploy",
     "tests/service",
+    "worker",
 )
 OPENERS = ("Of", "Who", "What", "That", "From which", "In which")
 SECTIONS = ("Args", "Attributes", "Raises")

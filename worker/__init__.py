@@ -1,6 +1,6 @@
-"""One job, from its files to its files, on one rank or several.
+"""Stylization jobs, from input files to output files, on one rank or several.
 
-`options` declares what can be asked for, `request` says what is, `inputs` reads it, `prepare` plans it, `description`
-tells what was decided, `execute` runs it and writes the results; `previews` are pictures of a running job, `processes`
-what the system knows of processes. `ranks` spreads a job over several processes.
+`options` declares the options of a job and `request` holds the values of one. `inputs` reads the files, `prepare`
+plans the work, `description` summarizes the plan, and `execute` runs the job and writes the results. `previews` saves
+images of a running job, and `processes` identifies and ends processes. `ranks` runs a job in several processes.
 """

@@ -1,4 +1,4 @@
-"""What a job tells before its first step: what was read, what was decided, and why."""
+"""Summary of a prepared job: its inputs, and the decisions of the plan with their reasons."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from worker.prepare import Job
 
 @dataclass(frozen=True)
 class Prepared:
-    """What there is to tell before the first step.
+    """Summary of a job before its first step.
 
     Attributes:
-        lines: pairs of a heading and a line, see `describe`.
-        step: at which the job starts; more than 0 after a resume.
-        total: of all steps.
+        lines: Pairs of a heading and a line of text; see `describe`.
+        step: Step at which the job starts; more than 0 if it resumes from a checkpoint.
+        total: Number of steps of the whole job.
     """
 
     lines: list[tuple[str, str]]
@@ -23,7 +23,7 @@ class Prepared:
 
 
 def describe(job: Job) -> Prepared:
-    """What was decided, for the user to read before the work starts."""
+    """Summarize the inputs and the plan for the user."""
     stylizer, settings = job.stylizer, job.stylizer.settings
     lines = [("scene", _describe_scene(job)), ("views", _describe_views(job)), ("network", _describe_network(job))]
     lines += [(decision.item, f"{decision.decision}: {decision.reason}") for decision in stylizer.plan.decisions]

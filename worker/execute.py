@@ -1,4 +1,4 @@
-"""A prepared job from its first step to its files."""
+"""Execution of a prepared job: run all steps, then write the outputs."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from worker.options import RunOptions
 from worker.prepare import Job, Warn
 from worker.request import Outputs
 
-#: Seconds between checkpoints, unless told otherwise: what a lost rank costs at most.
+#: Default seconds between checkpoints. A lost rank costs at most this much work.
 CHECKPOINT_SECONDS = RunOptions().checkpoint_seconds
 
 
 @dataclass(frozen=True)
 class Result:
-    """How a job ended.
+    """Result of a job.
 
     Attributes:
-        stopped: see `run`; where it is "interrupted", only the checkpoint was written.
-        step, total: that were done, and planned.
-        before, after: loss on the evaluation views; both are empty where the job was interrupted.
-        bought: what error the time bought (`report.bought`).
-        report_error: why report, contact sheet or curves are missing; None if they are not.
-        packed: what the packed file loses that lies beside the PLY; None where there is none.
-        weights: of the scales in `before` and `after`.
+        stopped: Reason why the job ended; see `run`. If it is "interrupted", only a checkpoint was written.
+        step, total: Completed and planned numbers of steps.
+        before, after: Losses on the evaluation views before and after the job; empty if the job was interrupted.
+        bought: Relation of the loss to the time spent; see `report.bought`. None if no step was made on all scales.
+        report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
+        packed: Measured loss of quality in the compressed file; None if no compressed file was requested.
+        weights: Weights of the scales in `before` and `after`.
     """
 
     stopped: Stopped
@@ -60,7 +60,7 @@ class Result:
 
     @property
     def losses(self) -> tuple[float, float]:
-        """The loss before and after."""
+        """Return the mean loss before and after."""
         return mean_loss(self.before, self.weights), mean_loss(self.after, self.weights)
 
 
@@ -75,14 +75,22 @@ def execute(
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     run_id: str | None = None,
 ) -> Result:
-    """Run a prepared job and write its outputs: the PLY first, so that no failing report can lose it.
+    """Run a prepared job and write its outputs, the PLY first, so that a failing report cannot lose it.
 
-    Checkpoints are written every `checkpoint_seconds` and where the job ends early. One that cannot be written is a
-    warning as long as the job itself goes on. Every rank that takes part calls this; the callbacks are used on the
-    first one alone: `saved` is told the step of each checkpoint, `preview` is called after every step (see `Previews`).
+    Every participating rank must call this function. The callbacks are used on rank 0 only.
+
+    Args:
+        job: Prepared job.
+        progress: Callback for the progress of the steps.
+        stop: Callback that returns True to interrupt the job.
+        warn: Callback for warnings. A checkpoint that cannot be written is a warning while the job continues.
+        preview: Callback after every step; see `Previews`. None writes no previews.
+        saved: Callback that receives the step of each checkpoint.
+        checkpoint_seconds: Seconds between checkpoints. A job that ends early writes one more.
+        run_id: Identifier of this run, stored in checkpoints. None generates one.
 
     Raises:
-        OutputError: the PLY, or the checkpoint of an interrupted job, cannot be written.
+        OutputError: If the PLY, or the checkpoint of an interrupted job, cannot be written.
     """
     stylizer = job.stylizer
     first = stylizer.collectives.rank == 0
@@ -99,7 +107,7 @@ def execute(
     if first:
         callbacks.progress, callbacks.stop = progress, stop
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
-        callbacks.preview_seconds = 0.0  # when it is time for one, it knows itself
+        callbacks.preview_seconds = 0.0  # `Previews` decides itself when to write one
     stopped = run(stylizer, callbacks)
     if stopped == "interrupted":
         if checkpoint.error is not None:
@@ -109,14 +117,14 @@ def execute(
 
 
 def _make_room(outputs: Outputs) -> None:
-    """The folder of the outputs, without what an attempt that was killed has left there."""
+    """Create the output folder, and delete temporary files of an attempt that was killed."""
     outputs.ply.parent.mkdir(parents=True, exist_ok=True)
     for path in outputs.all:
         remove_leftovers(path)
 
 
 def _write_views(job: Job, warn: Warn) -> None:
-    """The views of an orbit as pictures, so that it can be seen at once whether they are the right ones."""
+    """Save images of an orbit's views, so that users can check the cameras before the job is done."""
     path = job.outputs.views
     if job.request.source.orbit is None or (job.resumed and path.exists()):
         return
@@ -128,10 +136,10 @@ def _write_views(job: Job, warn: Warn) -> None:
 
 
 class _CheckpointWriter:
-    """Saves a job's state; for `loop.Callbacks.checkpoint`.
+    """Checkpoint callback for `loop.Callbacks.checkpoint`.
 
     Attributes:
-        error: why the last one could not be written; None where it was.
+        error: Error of the last attempt to write a checkpoint; None if it succeeded.
     """
 
     def __init__(self, job: Job, run_id: str, saved: Callable[[int], None], warn: Warn) -> None:
@@ -140,7 +148,7 @@ class _CheckpointWriter:
         self.error: OutputError | None = None
 
     def __call__(self, stylizer: Stylizer) -> None:
-        """Write one, or warn."""
+        """Write a checkpoint; if that fails, warn and store the error."""
         job = self._job
         self.error = None
         checkpoint = Checkpoint(stylizer.state(), stylizer.plan, job.planned_ranks, self._run_id, versions())
@@ -153,7 +161,7 @@ class _CheckpointWriter:
 
 
 def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
-    """Write the PLY, then everything beside it. Every rank calls this."""
+    """Write the PLY, then all other outputs. Every rank must call this function."""
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.collectives.rank == 0
     stylizer.collectives.broadcast(lambda: _write_ply(job))
@@ -161,7 +169,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
     measure.at_the_end()
-    # Now that the views are prepared; before the first step it would have been waited for.
+    # The initial loss is evaluated here too: before the first step, preparing the views would delay the job.
     before, after = measure.evaluate(unstylized=True), measure.evaluate()
     error = _write_reports(job, stopped, before, after, packed) if first else None
     found = bought(stylizer, before)
@@ -177,13 +185,13 @@ def _write_ply(job: Job) -> None:
 
 
 def _only_colors_change(job: Job) -> bool:
-    """Whether the result has the rows of the scene's file, each with all that it had but for f_dc."""
+    """Return whether the result has the same rows as the scene's file, with only f_dc changed."""
     file, attenuation = job.scene_file, job.stylizer.settings.sh_attenuation
     return file.kept is None and file.copies is None and not (attenuation and file.scene.sh_degree)
 
 
 def _write_packed(job: Job) -> PackedLoss | None:
-    """Write the stylized scene in a packed form beside the PLY, and measure what that loses."""
+    """Write the stylized scene in a compressed format beside the PLY, and measure the loss of quality."""
     path, form, stylizer = job.outputs.packed, job.outputs.packed_form, job.stylizer
     if path is None or form is None:
         return None
@@ -196,7 +204,7 @@ def _write_packed(job: Job) -> PackedLoss | None:
 def _write_reports(
     job: Job, stopped: Stopped, before: Evaluation, after: Evaluation, packed: PackedLoss | None
 ) -> Exception | None:
-    """Write what lies beside the PLY; returns what went wrong, since the scene itself is there."""
+    """Write the reports beside the PLY. Return an error instead of raising it, since the scene itself is written."""
     stylizer, outputs = job.stylizer, job.outputs
     try:
         if job.request.colors and _only_colors_change(job):
@@ -212,6 +220,6 @@ def _write_reports(
         write_contact_sheet(outputs.sheet, stylizer)
         write_loss_chart(outputs.curves, report)
         write_page(outputs.page, report, outputs.sheet, outputs.views if outputs.views.exists() else None)
-    except Exception as error:  # whatever it is, it must not look as if the job itself had failed
+    except Exception as error:  # no error of a report may make the job itself fail
         return error
     return None

@@ -1,6 +1,7 @@
-"""What jobs read: scene, cameras, style, photos and network, the same for everybody who reads them.
+"""Readers of a job's inputs: scene, cameras, style, photos and network weights.
 
-The command line, the service's inspection and every rank of a job read through here.
+The command line, the inspection of the service and every rank of a job use these readers, so that all of them see the
+same inputs.
 """
 
 from __future__ import annotations
@@ -40,17 +41,17 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything that a job reads.
+    """All inputs of a job.
 
     Attributes:
-        weights: of the feature network.
-        style: pictures [H, W, 3] in 0..1.
-        scene_file: the scene, and what was left out of its file.
-        cameras: at the sizes that they are stylized at.
-        orbit: how they were chosen; None for those of files.
-        photos: content image of each camera; None for unstylized renders.
-        regions: of the scene; None where it has none.
-        fingerprint: of all of it, and of the settings: equal for the same job.
+        weights: Weights of the feature network.
+        style: Style images, [H, W, 3] in 0..1.
+        scene_file: Scene and the rows that were dropped from its file.
+        cameras: Cameras at the sizes at which the scene is stylized.
+        orbit: Orbit that generated the cameras; None if they come from a file.
+        photos: Content image of each camera; None for unstylized renders.
+        regions: Regions of the scene; None if the job has none.
+        fingerprint: Hash of all inputs and settings; equal for equal jobs.
     """
 
     weights: BackboneWeights
@@ -64,16 +65,16 @@ class Inputs:
 
     @property
     def load_photo(self) -> Callable[[int], Tensor] | None:
-        """Loads the photo of a camera by its index; None where there are no photos."""
+        """Return a function that loads the photo of a camera by its index; None if the job has no photos."""
         photos, cameras = self.photos, self.cameras
         return (lambda index: load_photo(photos[index], cameras[index])) if photos else None
 
 
 def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> Inputs:
-    """Read every input of a job. Every rank calls this.
+    """Read all inputs of a job. Every rank must call this function.
 
     Raises:
-        InvalidInputError: in one of its forms, for the first input that cannot be used; the same on every rank.
+        InvalidInputError: If an input cannot be used. Every rank raises the same error.
     """
     source, settings, images = request.source, request.settings, request.images
     weights = _same_weights(request.backbone, collectives)
@@ -98,10 +99,11 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
 def read_regions(
     request: StylizeRequest, file: SceneFile, cameras: Sequence[Camera], collectives: Collectives = ALONE
 ) -> Regions | None:
-    """The regions of a scene that were asked for; None where none were.
+    """Return the requested regions of a scene, or None if none are requested. Every rank must call this function.
 
     Raises:
-        InvalidInputError: a selection or a style cannot be used, or every Gaussian is kept; the same on every rank.
+        InvalidInputError: If a selection or a style cannot be used, or if every Gaussian is frozen. Every rank raises
+            the same error.
     """
     if not request.regions:
         return None
@@ -112,20 +114,20 @@ def read_regions(
         check_style_size(style, cameras, settings.style_scale)
         return style
 
-    # One rank selects for all: votes of masks take renders, and processors may round them differently.
+    # One rank selects for all: masks vote with renders, which different processors may round differently.
     return collectives.broadcast(
         lambda: select_regions(request.regions, file, cameras, near, load, settings.sh_attenuation)
     )
 
 
 def load_styles(files: Sequence[StyleFile]) -> StyleMixture:
-    """Read a style's pictures.
+    """Read the images of a style and normalize their weights.
 
     Raises:
-        ImageError: one cannot be used.
-        SettingsError: there are too many, or weights that are no shares.
+        ImageError: If an image cannot be used.
+        SettingsError: If there are too many images, or if the weights cannot be normalized.
     """
-    weights = normalized([file.weight for file in files])  # before anything is read
+    weights = normalized([file.weight for file in files])  # raises before any image is read
     names = tuple(file.path.name for file in files)
     return StyleMixture(tuple(load_image(file.path) for file in files), weights, names)
 
@@ -133,27 +135,31 @@ def load_styles(files: Sequence[StyleFile]) -> StyleMixture:
 def _cameras_on_all_ranks(
     source: SceneRequest, scene: Scene, collectives: Collectives
 ) -> tuple[list[Camera], Orbit | None]:
-    """`read_cameras_of`, the same on every rank: each reads a file, but processors may round an orbit differently."""
+    """Return the result of `read_cameras_of`, the same on every rank.
+
+    Every rank reads a camera file itself. An orbit is computed by rank 0 only, since processors may round differently.
+    """
     if source.cameras is None:
         return collectives.broadcast(lambda: read_cameras_of(source, scene))
     return together(collectives, lambda: read_cameras_of(source, scene))
 
 
 def read_scene_and_cameras(source: SceneRequest) -> tuple[SceneFile, list[Camera], Orbit | None]:
-    """Read a scene and the cameras that were asked for; see `read_cameras_of`.
+    """Read a scene and its requested cameras; see `read_cameras_of`.
 
     Raises:
-        SceneError, CameraError: they cannot be used.
+        SceneError: If the scene cannot be used.
+        CameraError: If the cameras cannot be used.
     """
     file = read_scene(source.scene, drop_invalid=source.drop_invalid)
     return file, *read_cameras_of(source, file.scene)
 
 
 def read_cameras_of(source: SceneRequest, scene: Scene) -> tuple[list[Camera], Orbit | None]:
-    """The cameras that were asked for, at their resolution, and the orbit that they are of, where they are.
+    """Return the requested cameras at the requested resolution, and their orbit (None if they come from a file).
 
     Raises:
-        CameraError: they cannot be used.
+        CameraError: If the cameras cannot be used.
     """
     made = None
     if source.cameras is not None:
@@ -169,7 +175,7 @@ def read_cameras_of(source: SceneRequest, scene: Scene) -> tuple[list[Camera], O
 
 
 def _orbit_request(source: SceneRequest) -> OrbitRequest:
-    """The orbit that was asked for."""
+    """Convert the orbit options of a request."""
     up = None
     if source.up != "auto":
         x, y, z = (float(name == source.up[-1]) * (-1.0 if source.up.startswith("-") else 1.0) for name in "xyz")
@@ -179,20 +185,22 @@ def _orbit_request(source: SceneRequest) -> OrbitRequest:
 
 
 def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:
-    """Prove that a camera sees a Gaussian; rendering ends at the first one that does.
+    """Check that at least one camera sees a Gaussian. Rendering stops at the first one that does.
 
     Raises:
-        CameraError: none does.
+        CameraError: If no camera sees a Gaussian.
     """
     if not any(sees_something(rasterizer.coverage(camera)) for camera in cameras):
         raise nothing_seen(len(cameras))
 
 
 def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
-    """Prove that a Gaussian's center lies in a view, and only where none does, render.
+    """Check that at least one camera sees a Gaussian, if possible without rendering.
+
+    A Gaussian whose center lies in a view suffices. Views are rendered only if there is none.
 
     Raises:
-        CameraError: no camera sees a Gaussian.
+        CameraError: If no camera sees a Gaussian.
     """
     means = scene.means.double()
     for camera in cameras:
@@ -206,10 +214,10 @@ def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float
 
 
 def together(collectives: Collectives, make: Callable[[], T]) -> T:
-    """What `make` returns on this rank, once it has succeeded on every rank.
+    """Call `make` on every rank, and return this rank's result once all ranks have succeeded.
 
     Raises:
-        SgsstError: of the first rank on which it was raised, on every rank.
+        SgsstError: If `make` raises it on a rank. Every rank raises the error of the lowest such rank.
     """
     value, error = None, None
     try:
@@ -223,16 +231,16 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
 
 
 def _same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
-    """The feature network's weights: those that the first rank finds, on every rank."""
+    """Load the weights of the feature network on every rank. Rank 0 chooses the network."""
     name = collectives.broadcast(lambda: load_network_weights(backbone).name)
     return together(collectives, lambda: load_network_weights(name))
 
 
 def _same_fingerprint(own: str | None, collectives: Collectives) -> str:
-    """The job's fingerprint, once everybody who has read the scene has found the same.
+    """Return the job's fingerprint, after checking that all ranks that read the scene computed the same one.
 
     Args:
-        own: this rank's; None where another rank of the same machine has read the scene for it.
+        own: Fingerprint of this rank; None if another rank of the same machine read the scene.
     """
     found = collectives.all_gather((own, socket.gethostname()))
     for other, host in found:

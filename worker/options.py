@@ -1,6 +1,7 @@
-"""What a job may be told beside its files and its settings: declared once, for the command line and for the API.
+"""Options of a job, declared once for the command line and the API.
 
-`StylizeOptions` is all that both take: how the scene is seen, every setting, and what is the job's own.
+`StylizeOptions` holds all options that both accept: those of the views, all settings of the method, and those of the
+job itself.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from sgsst_core.settings import (
 
 Backbone = Literal["auto", "vgg19", "vgg16"]
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
-#: How many views an orbit has.
+#: Number of views of an orbit.
 Views = Annotated[int, Ge(1), Le(2000)] | Literal["auto"]
-#: Settings that no preset changes, and that answers of the API have always shown.
+#: Settings that no preset changes. API responses always include their values.
 _SHOWN = ("preset", "seed", "precision")
 
 
 class ViewOptions(BaseModel):
-    """How a scene is seen."""
+    """Options that determine the cameras and how they see the scene."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -60,7 +61,7 @@ class ViewOptions(BaseModel):
 
 
 def _settings_to_choose() -> dict[str, Any]:
-    """A field for each setting, in which None leaves it to the preset."""
+    """Return a field for each setting. None leaves a setting to the preset."""
     fields: dict[str, Any] = {}
     for name, setting in declared(Settings).items():
         text = default_text(setting)
@@ -85,7 +86,7 @@ else:
 
 
 class StylizeOptions(_Chosen):
-    """What `sgsst stylize` and a job of the service may be told; what is left out is the preset's."""
+    """Options of `sgsst stylize` and of a job of the service. Options that are not given follow the preset."""
 
     backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 where it is installed, else VGG16.")
     compute_everything: bool = Field(False, description="Leave nothing out; slower, with the same result.")
@@ -99,23 +100,23 @@ class StylizeOptions(_Chosen):
     )
 
     def given_settings(self) -> dict[str, Any]:
-        """The settings that were given, by their names in `Settings`; without the preset."""
+        """Return the settings that were given, except the preset, by their names in `Settings`."""
         known = declared(Settings)
         given = {known[name].field: getattr(self, name) for name in self.model_fields_set & known.keys() - {"preset"}}
         given["keep"] = EVERYTHING if self.compute_everything else None
         return {name: value for name, value in given.items() if value is not None}
 
     def settings(self) -> Settings:
-        """The method's settings.
+        """Return the settings of the method.
 
         Raises:
-            SettingsError: values that contradict each other.
+            SettingsError: If values contradict each other.
         """
         return make_settings(self.preset, **self.given_settings())
 
 
 class RunOptions(BaseModel):
-    """How `sgsst stylize` runs a job. A service's operator says this for all jobs, so that the API does not take it."""
+    """Options of `sgsst stylize` that the API does not accept: a service's operator sets them for all jobs."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

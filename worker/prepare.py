@@ -1,6 +1,6 @@
-"""A job before its first step: every input read and checked, the checkpoint to go on from found, the work planned.
+"""Preparation of a job: read and check all inputs, find the checkpoint to resume from, and plan the work.
 
-Every rank goes through the same functions. Nothing is written and nothing is printed.
+Every rank calls the same functions. Nothing is written or printed.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ Warn = Callable[[str], None]
 
 @dataclass
 class Job:
-    """A job whose inputs have all been read and checked.
+    """Job whose inputs have been read and checked.
 
     Attributes:
-        resumed: checkpoint to go on from; None starts from the beginning.
-        planned_ranks: that there were when the plan was made.
-        workers: who takes part, and what happened to earlier attempts; for the report.
+        resumed: Checkpoint to resume from; None to start from the beginning.
+        planned_ranks: Number of ranks for which the plan was made.
+        workers: Participating ranks and lost attempts, as JSON for the report.
     """
 
     request: StylizeRequest
@@ -62,19 +62,21 @@ def prepare(
     warn: Warn = lambda line: None,
     show_planning: ShowPlanning | None = None,
 ) -> Job:
-    """Read and check every input; nothing is written. Every rank calls this.
+    """Read and check all inputs of a job, and plan it. Nothing is written. Every rank must call this function.
 
     Args:
-        collectives: of all ranks.
-        resume: None for what the request says.
-        warn: told of checkpoints that cannot be used.
-        show_planning: shows how far the survey of the views has come; not called where a checkpoint brings its plan.
+        request: Job to prepare.
+        collectives: Collectives of all ranks.
+        resume: Choice of the checkpoint to resume from; None follows the request.
+        warn: Callback for checkpoints that cannot be used.
+        show_planning: Callback for the progress of the survey of the views. It is not called if the checkpoint's plan
+            is used.
 
     Raises:
-        InvalidInputError: in one of its forms, for the first input that cannot be used; the same on every rank.
-        RankLeftOut: the job goes on without this rank.
+        InvalidInputError: If an input cannot be used. Every rank raises the same error.
+        RankLeftOut: If the plan does not use this rank.
     """
-    timer = Timer()  # of the program: nothing here is left to run on a GPU
+    timer = Timer()  # host time suffices: no GPU work is pending at the end of a part
     outputs = collectives.broadcast(lambda: check_request(request))
     with timer("reading"):
         inputs = read_inputs(request, collectives)
@@ -132,7 +134,7 @@ def prepare(
 def _refine(
     inputs: Inputs, settings: Settings, collectives: Collectives, show: ShowPlanning | None
 ) -> Refinement | None:
-    """How the scene is refined; None where nobody wants it."""
+    """Return how the scene is refined; None if `settings.refine` turns refinement off."""
     return refine(
         inputs.scene_file.scene,
         inputs.cameras,
@@ -146,10 +148,10 @@ def _refine(
 
 
 def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:
-    """The plan of a resumed job; None where there is none, or where it was made for another device.
+    """Return the plan of a resumed job, or None if there is none or it cannot be used here.
 
-    Nor can a plan made for fewer ranks say what more of them are good for. A GPU's rasterizer is tried before it is
-    relied upon: its kernels may have to be compiled here, which takes longer than ranks wait for each other in a step.
+    A plan made for another device or for fewer ranks cannot be used. A GPU rasterizer is tried first: compiling its
+    kernels may take longer than ranks wait for each other during a step.
     """
     if resumed is None or collectives.size > resumed.ranks:
         return None
@@ -173,7 +175,7 @@ def _workers_used(stylizer: Stylizer) -> dict[str, Any]:
 def _find_checkpoint(
     outputs: Outputs, job_id: str, settings: Settings, resume: Resume, warn: Warn
 ) -> Checkpoint | None:
-    """The checkpoint to go on from; None to start from the beginning."""
+    """Return the checkpoint to resume from; None to start from the beginning."""
     if not resume.wanted:
         return None
     checkpoints = outputs.checkpoints

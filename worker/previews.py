@@ -1,4 +1,4 @@
-"""Pictures of a running job."""
+"""Preview images of a running job."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from sgsst_core.files.images import save_jpg
 from sgsst_core.scene.camera import resized
 from sgsst_core.stylizing.stylizer import Stylizer
 
-#: Previews become rarer as a job goes on: this share of its time lies between two, so that there are never thousands.
+#: Minimum time between two previews, as a fraction of the job's elapsed time. It limits the number of previews.
 _SHARE = 0.05
-#: Longer side, pixels.
+#: Maximum length of a preview's longer side in pixels.
 _SIDE = 960
 
 
 class Previews:
-    """Writes the first evaluation view with its present colors now and then; for `loop.Callbacks.preview`.
+    """Preview callback for `loop.Callbacks.preview`.
 
-    Before the first step there is one, too, with the colors of a warm start: it shows in seconds where the
-    job goes.
+    A preview is a render of the first evaluation view with the current colors. Another one is written before the first
+    step with the colors of a warm start, which gives users a first impression of the result within seconds.
 
     Args:
-        folder: of the JPEGs, `step_0000123.jpg` and so on; made at the first of them.
-        seconds: between two, at least.
-        written: told the path of each.
-        warn: told why one is missing: a picture less is no reason to lose the job.
+        folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview.
+        seconds: Minimum seconds between two previews.
+        written: Callback that receives the path of each preview.
+        warn: Callback that receives the reason why a preview is missing. A missing preview does not fail the job.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Previews:
         self._started = self._last = time.monotonic()
 
     def __call__(self, stylizer: Stylizer) -> None:
-        """Write one, if it is time."""
+        """Write a preview if enough time has passed since the last one."""
         now = time.monotonic()
         if stylizer.step and now - self._last < max(self._seconds, _SHARE * (now - self._started)):
             return
@@ -63,7 +63,7 @@ class Previews:
         path.parent.mkdir(parents=True, exist_ok=True)
         colors = stylizer.shown() if stylizer.step else stylizer.transferred().to(stylizer.sh_dc.device)
         with torch.no_grad():
-            # The rasterizer's own render: other ranks take no part in it.
+            # Only this rank renders here, so the distributed renderer cannot be used.
             image = views.rasterizer.render(views.colors(index, colors), camera)
         save_jpg(path, image)
         return path

@@ -1,4 +1,4 @@
-"""Processes as the system sees them: telling them apart, and ending them for certain."""
+"""Identification and reliable termination of processes, and sockets bound to one address."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True)
 class ProcessId:
-    """A process of some machine: a number alone may belong to another one later.
+    """Unique identifier of a process. A process ID alone may be reused by another process.
 
     Attributes:
-        home: see `home`.
-        number: the process id.
-        started: when it started, seconds as psutil gives them.
+        home: Machine, process namespace and user; see the function `home`.
+        number: Process ID (PID).
+        started: Start time in seconds since the epoch, as psutil returns it.
     """
 
     home: tuple[str, ...]
@@ -32,11 +32,11 @@ class ProcessId:
 
     @staticmethod
     def of_this() -> ProcessId:
-        """The one that calls this."""
+        """Return the identifier of the current process."""
         return ProcessId(home(), os.getpid(), psutil.Process().create_time())
 
     def find(self) -> psutil.Process | None:
-        """The process, on its own machine; None where it is gone."""
+        """Return the process, or None if it has ended. Must be called on its own machine."""
         try:
             process = psutil.Process(self.number)
             return process if abs(process.create_time() - self.started) < 1 else None
@@ -45,7 +45,7 @@ class ProcessId:
 
 
 def home() -> tuple[str, ...]:
-    """Equal for processes that see each other: one kernel, one view of its processes, one user."""
+    """Return an identifier of the kernel, process namespace and user: equal for processes that can see each other."""
     if not sys.platform.startswith("linux"):
         return socket.gethostname(), str(os.geteuid())
     boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
@@ -53,7 +53,7 @@ def home() -> tuple[str, ...]:
 
 
 def kill(processes: Sequence[ProcessId], timeout: float = 10.0) -> None:
-    """End processes of this machine, stopped ones too, and wait until they are gone."""
+    """Kill processes of this machine, including suspended ones, and wait until they have ended."""
     found = [process for identity in processes if (process := identity.find()) is not None]
     for process in found:
         try:
@@ -64,17 +64,17 @@ def kill(processes: Sequence[ProcessId], timeout: float = 10.0) -> None:
 
 
 def die_with_parent() -> None:
-    """Let the system kill this process when its parent ends, even while it is stopped. Only Linux can."""
+    """Make the system kill this process when its parent ends, even while it is suspended. Linux only."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def interface_towards(address: str) -> str | None:
-    """The network interface over which this machine reaches an address; None where that cannot be told."""
+    """Return the network interface through which this machine reaches an address; None if it is unknown."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect((address, 9))  # sends nothing: only the route is looked up
+            probe.connect((address, 9))  # a UDP socket sends nothing here; it only looks up the route
         except OSError:
             return None
         own = probe.getsockname()[0]

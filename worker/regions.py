@@ -1,13 +1,13 @@
-"""Regions as users ask for them: on the command line, in JSON, and what both become. Imports no PyTorch.
+"""Region options of the command line and of JSON, converted to the same requests. Imports no PyTorch.
 
-SPEC, what a region selects, is one of
+SPEC is the selection of a region, one of
 
     box=X0,Y0,Z0,X1,Y1,Z1      between two opposite corners
     sphere=X,Y,Z,R             no farther than R from a point
     half-space=A,B,C,D         where A x + B y + C z >= D
     property=NAME>VALUE        by a property of the PLY; also >=, <, <=, =, !=
-    mask=FILE.npy              a flag for each Gaussian, in the file's order
-    masks=FOLDER               pictures of some views, white where the region is
+    mask=FILE.npy              one flag per Gaussian, in the file's order
+    masks=FOLDER               mask images of some views, white inside the region
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.settings import checked
 from worker.styles import MOST_PICTURES, StyleFile, parse_style
 
-#: Gaussians that no selection names.
+#: Name of the region of all Gaussians that no selection contains.
 REST = "rest"
-#: Regions beside the rest at most.
+#: Maximum number of regions, the rest excluded.
 MOST_REGIONS = 16
 _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,31}"
 _COMPARISON = re.compile(r"(?P<name>[^<>=!]+)(?P<sign>>=|<=|!=|>|<|=)(?P<value>.+)", re.DOTALL)
@@ -38,14 +38,14 @@ _HOW = "Give box=, sphere=, half-space=, property=, mask= or masks=: see `sgsst 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which Gaussians a region has.
+    """Selection of a region's Gaussians.
 
     Attributes:
-        kind: by what.
-        text: as it was given.
-        numbers: of a box, a sphere, a half-space, or that a property is compared with.
-        name, sign: of a property, and how it is compared.
-        path: of a mask, or of a folder of masks.
+        kind: Kind of selection.
+        text: SPEC as the user gave it.
+        numbers: Numbers of a box, sphere or half-space, or the value that a property is compared with.
+        name, sign: Property and comparison operator of a property selection.
+        path: Mask file, or folder of masks.
     """
 
     kind: Kind
@@ -58,14 +58,14 @@ class Selection:
 
 @dataclass(frozen=True)
 class RegionRequest:
-    """A region that was asked for.
+    """Request for one region.
 
     Attributes:
-        name: `REST` for the Gaussians that no region selects.
-        selection: None for the rest.
-        styles: pictures of its style; empty for the job's own.
-        weight: of its style in the loss.
-        freeze: Whether its Gaussians keep their colors.
+        name: Name; `REST` for the Gaussians that no region selects.
+        selection: Selection of the Gaussians; None for the rest.
+        styles: Images of the region's style; empty for the job's style.
+        weight: Weight of the region's style in the loss.
+        freeze: Whether the colors of its Gaussians stay unchanged.
     """
 
     name: str
@@ -76,7 +76,7 @@ class RegionRequest:
 
 
 class RegionOptions(BaseModel):
-    """A region in JSON."""
+    """One region in JSON."""
 
     model_config = ConfigDict(
         frozen=True,
@@ -110,17 +110,17 @@ class RegionOptions(BaseModel):
 
     @property
     def style_texts(self) -> list[str]:
-        """Its style files, as they were given."""
+        """Return the style files as they were given."""
         return [] if self.style is None else [self.style] if isinstance(self.style, str) else self.style
 
     def request(self, exists: Callable[[Path], bool] = Path.exists) -> RegionRequest:
-        """What is asked for.
+        """Convert these options to a request.
 
         Args:
-            exists: as for `parse_style`.
+            exists: Function that returns whether a file exists; see `parse_style`.
 
         Raises:
-            SettingsError: it makes no sense.
+            SettingsError: If the selection or a style is invalid.
         """
         selection = None if self.select is None else parse_selection(self.select, f"region {self.name}")
         styles = tuple(parse_style(text, exists) for text in self.style_texts)
@@ -128,13 +128,14 @@ class RegionOptions(BaseModel):
 
 
 def parse_selection(text: str, where: str) -> Selection:
-    """A SPEC.
+    """Parse a SPEC.
 
     Args:
-        where: it was given, for messages.
+        text: SPEC.
+        where: Option or region that holds it, for error messages.
 
     Raises:
-        SettingsError: it is none.
+        SettingsError: If it is not a valid SPEC.
     """
     kind, separator, value = text.partition("=")
     if separator and kind in _COUNTS:
@@ -176,16 +177,16 @@ def _number(text: str, whole: str, where: str) -> float:
 def region_options(
     regions: Sequence[str], styles: Sequence[str], weights: Sequence[str], frozen: Sequence[str]
 ) -> tuple[RegionOptions, ...]:
-    """Regions from the command line's texts.
+    """Parse the region options of the command line.
 
     Args:
-        regions: NAME:SPEC each.
-        styles: NAME=FILE[:WEIGHT] each; several of one name are mixed.
-        weights: NAME=WEIGHT each.
-        frozen: One NAME each.
+        regions: Texts `NAME:SPEC`.
+        styles: Texts `NAME=FILE[:WEIGHT]`; several styles of one region are mixed.
+        weights: Texts `NAME=WEIGHT`.
+        frozen: Names of regions whose colors stay unchanged.
 
     Raises:
-        SettingsError: they make no sense.
+        SettingsError: If a text is malformed, a name is used twice, or a region is unknown.
     """
     found: dict[str, RegionOptions] = {}
     for text in regions:
@@ -224,10 +225,10 @@ def region_options(
 def region_requests(
     options: Iterable[RegionOptions], exists: Callable[[Path], bool] = Path.exists
 ) -> tuple[RegionRequest, ...]:
-    """What some regions ask for, the rest first; see `RegionOptions.request`.
+    """Convert the options of all regions to requests, the rest first; see `RegionOptions.request`.
 
     Raises:
-        SettingsError: one makes no sense, there are too many, or two of one name.
+        SettingsError: If a region is invalid, there are too many regions, or two have the same name.
     """
     found = [each.request(exists) for each in options]
     names = [region.name for region in found]

@@ -1,4 +1,4 @@
-"""What a job is asked for and which files it writes, checked before anything is read."""
+"""Requests and output files of jobs, checked before any input is read."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from worker.styles import StyleFile
 
 
 class SceneRequest(ViewOptions):
-    """A scene and the cameras to see it with, as the user names them.
+    """Scene and cameras of a request.
 
     Attributes:
-        scene: 3DGS scene: PLY, compressed PLY, SPZ or .splat.
-        cameras: camera file or folder; None for an orbit.
+        scene: Path of the 3DGS scene: PLY, compressed PLY, SPZ or .splat.
+        cameras: Camera file or folder; None for an orbit.
     """
 
     scene: Path
@@ -28,25 +28,25 @@ class SceneRequest(ViewOptions):
 
     @staticmethod
     def of(scene: Path, cameras: Path | None, options: ViewOptions) -> SceneRequest:
-        """These files, seen as some options say, which may have others beside."""
+        """Return a request for these files with the view options of `options`, whose other fields are ignored."""
         seen = options.model_dump(include=set(ViewOptions.model_fields))
         return SceneRequest(scene=scene, cameras=cameras, **seen)
 
 
 @dataclass(frozen=True)
 class StylizeRequest:
-    """What `sgsst stylize` was asked for.
+    """Request for one stylization job.
 
     Attributes:
-        source: scene and cameras.
-        styles: style pictures, with their weights.
-        images: folder of photos for the content term; None for unstylized renders.
-        out: PLY to write, or packed file to write beside one: see `Outputs.of`.
-        backbone: feature network.
-        resume: go on from the checkpoint beside `out`.
-        settings: everything else.
-        regions: of the scene, that have a style of their own or are kept; from `region_requests`.
-        colors: write the stylized colors alone, too, where nothing else of the scene changes.
+        source: Scene and cameras.
+        styles: Style images and their weights.
+        images: Folder of photos for the content term; None for unstylized renders.
+        out: PLY to write, or compressed file to write beside a PLY; see `Outputs.of`.
+        backbone: Feature network.
+        resume: Whether to resume from the checkpoint beside `out`.
+        settings: Settings of the method.
+        regions: Regions with their own style or frozen colors, from `region_requests`.
+        colors: Whether to also write a file of the stylized colors alone, if nothing else of the scene changes.
     """
 
     source: SceneRequest
@@ -62,11 +62,11 @@ class StylizeRequest:
 
 @dataclass(frozen=True)
 class Outputs:
-    """The files of a job, named after its PLY so that jobs can share a folder.
+    """Output files of a job, named after its PLY so that jobs can share a folder.
 
     Attributes:
-        ply: the stylized scene.
-        packed: the same in a packed form, which its name's ending tells; None where nobody wants it.
+        ply: Stylized scene.
+        packed: Stylized scene in a compressed format, which the file name's ending determines; None if not requested.
     """
 
     ply: Path
@@ -74,10 +74,10 @@ class Outputs:
 
     @staticmethod
     def of(out: Path) -> Outputs:
-        """By the name that the user gave: a PLY's own, or that of a packed file beside it.
+        """Return the output files of a job, given the name of its PLY or of the compressed file beside it.
 
         Raises:
-            OutputError: it has another ending.
+            OutputError: If the name does not end in .ply, .compressed.ply or .spz.
         """
         form = form_of_name(out.name)
         if form is None:
@@ -88,7 +88,7 @@ class Outputs:
 
     @property
     def packed_form(self) -> PackedForm | None:
-        """Form of the packed file."""
+        """Return the format of the compressed file; None if there is none."""
         return None if self.packed is None else "spz" if form_of_name(self.packed.name) == "spz" else "compressed.ply"
 
     def _beside(self, suffix: str) -> Path:
@@ -96,66 +96,66 @@ class Outputs:
 
     @property
     def report(self) -> Path:
-        """The report."""
+        """Return the path of the report as JSON."""
         return self._beside(".report.json")
 
     @property
     def page(self) -> Path:
-        """The report for people."""
+        """Return the path of the report as an HTML page."""
         return self._beside(".report.html")
 
     @property
     def plan(self) -> Path:
-        """The plan."""
+        """Return the path of the plan as JSON."""
         return self._beside(".plan.json")
 
     @property
     def sheet(self) -> Path:
-        """The contact sheet."""
+        """Return the path of the contact sheet."""
         return self._beside(".before_after.jpg")
 
     @property
     def views(self) -> Path:
-        """The views of an orbit, before the start."""
+        """Return the path of the unstylized renders of an orbit's views."""
         return self._beside(".views.jpg")
 
     @property
     def curves(self) -> Path:
-        """The loss curves."""
+        """Return the path of the loss curves."""
         return self._beside(".loss.png")
 
     @property
     def colors(self) -> Path:
-        """The stylized colors alone."""
+        """Return the path of the stylized colors alone."""
         return self._beside(".colors.f16")
 
     @property
     def checkpoint(self) -> Path:
-        """The newest of the `checkpoints`."""
+        """Return the path of the newest checkpoint."""
         return self._beside(".checkpoint.safetensors")
 
     @property
     def all(self) -> list[Path]:
-        """Every file, but for the older checkpoint, which is never written itself."""
+        """Return all paths except the older checkpoint, which is only ever created by renaming."""
         found = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
         found.append(self.colors)
         return found if self.packed is None else [*found, self.packed]
 
     @property
     def checkpoints(self) -> Checkpoints:
-        """Where an unfinished job can go on from."""
+        """Return the checkpoints from which an unfinished job can resume."""
         return Checkpoints(self.checkpoint)
 
 
 @dataclass(frozen=True)
 class Resume:
-    """Whether a job goes on from a checkpoint.
+    """Choice of the checkpoint that a job resumes from.
 
     Attributes:
-        wanted: False starts from the beginning.
-        required: a checkpoint that is missing or cannot be used is an error; otherwise the job starts from the
+        wanted: Whether to resume; False starts from the beginning.
+        required: Whether a missing or unusable checkpoint is an error. If False, the job then starts from the
             beginning.
-        run: take only what this run of the program has written; None takes any of the same job.
+        run: Identifier of the run whose checkpoints are accepted; None accepts all checkpoints of the same job.
     """
 
     wanted: bool
@@ -164,10 +164,10 @@ class Resume:
 
 
 def check_choice(source: SceneRequest, images: Path | None = None) -> None:
-    """Prove that there is one source of cameras, and photos only of known ones.
+    """Check that cameras come from exactly one source, and that photos are given only with camera files.
 
     Raises:
-        CameraError: otherwise.
+        CameraError: If the options contradict each other or no cameras are given.
     """
     if source.cameras is None and source.orbit is None:
         raise CameraError(
@@ -184,20 +184,20 @@ def check_choice(source: SceneRequest, images: Path | None = None) -> None:
 
 
 def check_steps(settings: Settings) -> None:
-    """Prove that there is something to do.
+    """Check that there is at least one step.
 
     Raises:
-        SettingsError: otherwise.
+        SettingsError: If both numbers of steps are 0.
     """
     if not settings.steps_coarse + settings.steps_sos:
         raise SettingsError("Both numbers of steps are 0, so that nothing would change. Give some.")
 
 
 def check_request(request: StylizeRequest) -> Outputs:
-    """The output's file names, after a look at what can be checked without reading the inputs; creates nothing.
+    """Check what can be checked without reading the inputs, and return the output files. Creates nothing.
 
     Raises:
-        InvalidInputError: no steps, no cameras, or outputs that cannot be written.
+        InvalidInputError: If there are no steps or no cameras, or the outputs cannot be written.
     """
     check_steps(request.settings)
     check_choice(request.source, request.images)
@@ -214,10 +214,10 @@ def check_request(request: StylizeRequest) -> Outputs:
 
 
 def check_folder(folder: Path) -> None:
-    """Prove that a folder can be written to, or created, without creating it.
+    """Check that a folder is writable or can be created, without creating it.
 
     Raises:
-        OutputError: it cannot.
+        OutputError: If it is neither.
     """
     while not (folder.exists() or folder.is_symlink()) and folder != folder.parent:
         folder = folder.parent

@@ -1,4 +1,4 @@
-"""Regions of a scene that has been read: which Gaussians each selection names, and their styles' pictures."""
+"""Regions of a loaded scene: the selected Gaussians of each region, and its style images."""
 
 from __future__ import annotations
 
@@ -33,17 +33,21 @@ def select_regions(
     load: Callable[[Sequence[StyleFile]], StyleMixture],
     sh_attenuation: float = 0.0,
 ) -> Regions | None:
-    """The regions that were asked for; None where none were. Of regions that overlap, the later one has the Gaussians.
+    """Return the requested regions of a scene, or None if none are requested.
+
+    A Gaussian that several regions select belongs to the last of them.
 
     Args:
-        requests: see `worker.regions.region_requests`.
-        cameras: that masks are matched with, at the sizes that they are stylized at.
-        near: plane, as for stylizing.
-        load: reads the pictures of a style.
-        sh_attenuation: by which spherical harmonics fade.
+        requests: Requested regions; see `worker.regions.region_requests`.
+        file: Scene.
+        cameras: Cameras of the masks, at the sizes at which the scene is stylized.
+        near: Near plane in world units.
+        load: Function that reads the images of a style.
+        sh_attenuation: SH attenuation of the job, 0 to 1.
 
     Raises:
-        InvalidInputError: a file cannot be used, every Gaussian is kept, or some are and all are to fade.
+        InvalidInputError: If a file cannot be used, if every Gaussian is frozen, or if some are frozen although the
+            job has an SH attenuation, which would change them.
     """
     if not requests:
         return None
@@ -65,7 +69,7 @@ def select_regions(
 
 
 def select(selection: Selection, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
-    """[N] bool, which Gaussians of a scene a selection names; see `select_regions`."""
+    """Return whether a selection contains each Gaussian of a scene, [N] bool; see `select_regions`."""
     means, numbers, path = file.scene.means, selection.numbers, selection.path
     match selection.kind:
         case "box":
@@ -85,15 +89,15 @@ def select(selection: Selection, file: SceneFile, cameras: Sequence[Camera], nea
 
 
 def read_mask(path: Path, file: SceneFile) -> Tensor:
-    """A flag [N] for each Gaussian of the scene, from a flag of each row of its file.
+    """Read a mask with one flag per row of the scene's file, and return the flags of the scene's Gaussians, [N] bool.
 
     Raises:
-        SceneError: no .npy file, or of another shape or with other values than 0 and 1.
+        SceneError: If the file is not .npy, has another shape, or has values other than 0 and 1.
     """
     rows = len(file.scene) if file.kept is None else len(file.kept)
     try:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # the last of headers with open brackets
+    except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # the last one for an unclosed bracket
         raise SceneError(f"{path}: cannot be read as .npy: {error}. Write it with numpy.save.") from error
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "biuf":
         raise SceneError(f"{path}: holds no array of flags or numbers. Write it with numpy.save.")
@@ -108,10 +112,10 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
 
 
 def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
-    """[N] bool, which Gaussians masks of some views show: see `planning.masks`.
+    """Return whether the masks of some views contain each Gaussian, [N] bool; see `planning.masks`.
 
     Raises:
-        ImageError: no masks, or masks that cannot be used.
+        ImageError: If there are no masks, or if a mask cannot be used.
     """
     found = [(camera, path) for camera, path in zip(cameras, find_masks(folder, cameras), strict=True) if path]
     masks = [partial(_load_mask, path, camera) for camera, path in found]
@@ -123,5 +127,5 @@ def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], nea
 
 
 def _load_mask(path: Path, camera: Camera) -> Tensor:
-    """[H, W] in 0..1: white is in."""
+    """Load a mask, [H, W] in 0..1; white is inside."""
     return load_photo(path, camera).mean(dim=2)

@@ -1,4 +1,4 @@
-"""Style pictures as users name them: files, each with a weight behind a colon where it has one."""
+"""Parser of style options: image files with optional weights, FILE or FILE:WEIGHT."""
 
 from __future__ import annotations
 
@@ -10,32 +10,35 @@ from pathlib import Path
 
 from sgsst_core.errors import SettingsError
 
-#: Pictures of a style at most: more are a slip of the hand.
+#: Maximum number of images of a style. More are probably a mistake.
 MOST_PICTURES = 16
 _WEIGHTED = re.compile(r"(?P<path>.+):(?P<weight>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class StyleFile:
-    """A style picture's file, and its weight among others: any number above 0."""
+    """File of a style image, and its weight relative to the other images of the style (above 0)."""
 
     path: Path
     weight: float = 1.0
 
     @property
     def text(self) -> str:
-        """As `parse_style` takes it."""
+        """Return the text that `parse_style` parses to this file."""
         return str(self.path) if self.weight == 1 else f"{self.path}:{self.weight!r}"
 
 
 def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> StyleFile:
-    """FILE or FILE:WEIGHT. A file whose whole name ends like a weight is that file.
+    """Parse FILE or FILE:WEIGHT.
+
+    If a file with the whole text as its name exists, it is that file, even if the text ends like a weight.
 
     Args:
-        exists: tells whether there is a file.
+        text: Text to parse.
+        exists: Function that returns whether a file exists.
 
     Raises:
-        SettingsError: the weight is not above 0, or not finite.
+        SettingsError: If the weight is not finite or not above 0.
     """
     match = _WEIGHTED.fullmatch(text)
     if match is None or exists(Path(text)):
@@ -47,10 +50,10 @@ def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> Styl
 
 
 def parse_styles(texts: Sequence[str]) -> tuple[StyleFile, ...]:
-    """Every picture of a style; see `parse_style`.
+    """Parse all images of a style; see `parse_style`.
 
     Raises:
-        SettingsError: as there; there are too many; or there are none.
+        SettingsError: If a weight is invalid, or there are no images or too many.
     """
     if not 1 <= len(texts) <= MOST_PICTURES:
         raise SettingsError(f"There are {len(texts)} style pictures; a style has 1 to {MOST_PICTURES}.")

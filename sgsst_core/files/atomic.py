@@ -1,4 +1,4 @@
-"""Output files: whole or not at all."""
+"""Atomic writing of output files."""
 
 from __future__ import annotations
 
@@ -13,21 +13,23 @@ from pathlib import Path
 
 from sgsst_core.errors import OutputError
 
-#: What the system says when there is no room left; everything else that goes wrong inside `atomic_path` keeps its type.
+#: Error numbers of a full disk. Other errors inside `atomic_path` keep their type.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
 def atomic_path(target: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `target`; it becomes `target` when the block ends, and is removed if it raises.
+    """Yield the path of a temporary file that replaces `target` at the end of the block.
 
-    The temporary file exists already (empty), has the target's suffix and lies in the same folder. It is
-    flushed to disk, then renamed over the target, then the folder is flushed: after a power cut there is the old
-    file or the new one. A symbolic link keeps pointing where it did: what it points at is replaced. An existing
-    target's permissions are kept.
+    The temporary file is created empty in the folder of the target, with the same suffix. If the block raises, it is
+    deleted. Otherwise it is flushed to disk and renamed over the target, then the folder is flushed. After a power
+    failure, the target is therefore either the old or the new file.
+
+    If the target is a symbolic link, the file it points to is replaced. The permissions of an existing target are
+    kept.
 
     Raises:
-        OutputError: the folder is missing or not writable, the target is a folder, or the disk is full.
+        OutputError: If the folder is missing or not writable, the target is a folder, or the disk is full.
     """
     final = Path(os.path.realpath(target))
     if final.is_dir():
@@ -46,36 +48,36 @@ def atomic_path(target: Path) -> Iterator[Path]:
                 f"{target}: cannot be written: {error.strerror}. Free some space and run again."
             ) from error
         raise
-    except BaseException:  # KeyboardInterrupt too: nothing half-written stays
+    except BaseException:  # includes KeyboardInterrupt: no partial file may remain
         temporary.unlink(missing_ok=True)
         raise
     _flush_folder(final.parent)
 
 
 def remove_leftovers(target: Path) -> None:
-    """Delete what writers of `target` that were killed have left beside it. Nobody may be writing it now."""
+    """Delete temporary files of killed writers of `target`. No process may be writing it at the same time."""
     final = Path(os.path.realpath(target))
     for path in final.parent.glob(f".sgsst-{_tag(final)}-*.part*"):
         path.unlink(missing_ok=True)
 
 
 def ensure_writable_folder(path: Path) -> None:
-    """Create the folder where it is missing, and prove by a trial file that it can be written to.
+    """Create a folder if it is missing, and check with a temporary file that it is writable.
 
     Raises:
-        OutputError: it cannot be created, is not a folder, or is not writable.
+        OutputError: If it cannot be created, is not a folder, or is not writable.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = "there is a file of that name" if isinstance(error, FileExistsError) else error.strerror
         raise OutputError(f"{path}: cannot be used as output folder: {reason}. Name another folder.") from error
-    # os.access says yes to root, and on network mounts that are read-only: only writing tells.
+    # os.access is no proof: it returns True for root, and for read-only network mounts.
     _reserve(path / "trial").unlink()
 
 
 def _reserve(final: Path) -> Path:
-    """Create an empty file beside `final`, with the permissions that a newly written file gets."""
+    """Create an empty file beside `final`, with the default permissions of a new file."""
     temporary = final.with_name(f".sgsst-{_tag(final)}-{secrets.token_hex(6)}.part{final.suffix}")
     try:
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -87,7 +89,10 @@ def _reserve(final: Path) -> Path:
 
 
 def _tag(final: Path) -> str:
-    """What temporary files of a target have in common; its name itself may be as long as names can be."""
+    """Return the common part of the names of a target's temporary files.
+
+    It is a hash, because a name with an affix could exceed the maximum length of file names.
+    """
     return hashlib.sha256(os.fsencode(final.name)).hexdigest()[:8]
 
 
@@ -100,15 +105,15 @@ def _flush(path: Path) -> None:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make the rename itself durable, where the system can: the file is in place and whole either way."""
+    """Flush a folder to make a rename durable, if the system supports it. The file is complete either way."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:  # folders cannot be opened on Windows, nor without read permission
+    except OSError:  # on Windows and without read permission, folders cannot be opened
         return
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # file systems without fsync of folders
+        if error.errno != errno.EINVAL:  # raised by file systems that cannot flush folders
             raise
     finally:
         os.close(descriptor)

@@ -1,4 +1,4 @@
-"""The folder of what is fetched once for all jobs of a user."""
+"""Cache folder for files that are fetched once for all jobs of a user."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """Where weights are kept: $SGSST_CACHE, or `sgsst` in the platform's cache folder."""
+    """Return the folder of network weights: $SGSST_CACHE, or `sgsst` in the platform's cache folder."""
     if chosen := os.environ.get("SGSST_CACHE"):
         return Path(chosen).expanduser()
     if sys.platform == "darwin":

@@ -1,7 +1,7 @@
-"""Camera files: INRIA `cameras.json`, COLMAP sparse models, nerfstudio and Blender `transforms.json`.
+"""Readers of camera files: INRIA `cameras.json`, COLMAP sparse models, nerfstudio and Blender `transforms.json`.
 
-All become `Camera`: pinhole, world to camera, x right, y down, z forward, pixel centers at +0.5 (COLMAP's own
-convention; the JSON forms share it for the principal point).
+All formats are converted to `Camera`: pinhole, world to camera, x right, y down, z forward, pixel centers at +0.5. This
+is COLMAP's convention; the JSON formats share it for the principal point.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from sgsst_core.files.colmap_model import UNDISTORT, read_model
 from sgsst_core.files.images import image_size
 from sgsst_core.scene.camera import Camera
 
-#: Largest entry of R R^T - 1 that passes for a rotation written with few digits; it is then made exact.
+#: Largest entry of R R^T - 1 that is attributed to rounding in the file. Such matrices are replaced by exact rotations.
 ROTATION_TOLERANCE = 1e-3
-#: Largest distance of a quaternion's length from 1 that passes for one written with few digits.
+#: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
 QUATERNION_TOLERANCE = 0.01
 
 _FORMS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
-#: Camera's axes in OpenGL (x right, y up, z backward) to ours.
+#: Change of camera axes from OpenGL (x right, y up, z backward) to ours.
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-#: Models of transforms.json that are pinholes once their coefficients are 0.
+#: Camera models of transforms.json that are pinholes if all their distortion coefficients are 0.
 _PINHOLE_NAMES = (None, "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Read the cameras of a file or folder, whatever form they have.
+    """Read the cameras of a file or folder, whose format is detected.
 
-    A folder may be a COLMAP sparse model, a data set with one in sparse/0 or sparse, or one that holds
-    transforms.json or cameras.json. JSON keeps its own order, COLMAP's images are sorted by name.
+    A folder may be a COLMAP sparse model, a data set with one in sparse/0 or sparse, or a folder with transforms.json
+    or cameras.json. Cameras from JSON keep their order; COLMAP's images are sorted by name.
 
-    nerfstudio trains in a frame of its own: a scene exported by it fits these cameras only together with the
-    `dataparser_transforms.json` of the training run. Where a file of that name lies beside the transforms.json, it
-    is applied (with `applied_transform` and `applied_scale` accounted for as nerfstudio does). Otherwise the
-    poses are taken as they are, which is right for scenes trained in the file's own frame.
+    nerfstudio trains in its own coordinate frame, so a scene that it exported fits these cameras only together with the
+    `dataparser_transforms.json` of the training run. If a file of that name lies beside the transforms.json, it is
+    applied, and `applied_transform` and `applied_scale` are taken into account as nerfstudio does. Otherwise the poses
+    are used as they are, which is correct for scenes that were trained in the file's own frame.
 
     Raises:
-        CameraError: missing file, unknown form, no cameras, distorted model, or a value that cannot be: the message
-            names file and camera.
+        CameraError: If the file is missing, its format is unknown, it holds no cameras, a camera has distortion, or a
+            value is invalid. The message names the file and the camera.
     """
     if path.is_dir():
         return _read_folder(path)
@@ -76,12 +76,12 @@ def _load_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise CameraError(f"{path}: cannot be read: {error.strerror}. Check the path, or give {_FORMS}.") from error
-    except (ValueError, RecursionError) as error:  # bad JSON, or bytes that are no UTF-8
+    except (ValueError, RecursionError) as error:  # invalid JSON, or bytes that are not UTF-8
         raise CameraError(f"{path}: is neither JSON nor a COLMAP model ({error}). Give {_FORMS}.") from error
 
 
 def _numbered(path: Path, entries: list[Any], convert: Any) -> list[Camera]:
-    """Convert the entries of a JSON list, and say which one if one is wrong."""
+    """Convert the entries of a JSON list; error messages name the entry by its index."""
     if not entries:
         raise CameraError(f"{path}: holds no cameras. Export them again.")
     cameras = []
@@ -110,7 +110,7 @@ def _read_transforms(path: Path, content: Mapping[str, Any]) -> list[Camera]:
     def convert(where: str, frame: Mapping[str, Any]) -> Camera:
         name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
         where = f"{where} ({name!r})"
-        values = {**content, **frame}  # a frame's own values go first
+        values = {**content, **frame}  # values of the frame take precedence
         _refuse_distortion(where, values)
         size = _transforms_size(where, path.parent / name, values)
         pose = np.eye(4)
@@ -132,7 +132,7 @@ def _refuse_distortion(where: str, values: Mapping[str, Any]) -> None:
 
 
 def _transforms_size(where: str, image: Path, values: Mapping[str, Any]) -> tuple[int, int]:
-    """Width and height as given, else those of the image file (Blender's form has neither, nor the file's suffix)."""
+    """Return width and height from the file, else from the image. Blender's format has neither sizes nor suffixes."""
     if "w" in values and "h" in values:
         return _size(where, values, "w", "h")
     for candidate in (image, *(image.with_name(image.name + suffix) for suffix in (".png", ".jpg", ".jpeg"))):
@@ -167,10 +167,10 @@ def _transforms_intrinsics(
 
 
 def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
-    """The step from the file's poses [4, 4] to those that nerfstudio trained with.
+    """Return the function from the file's poses [4, 4] to the poses that nerfstudio trained with.
 
-    nerfstudio stores T = T0 A and S = s0 a, where A and a (`applied_transform`, `applied_scale`) are in the file's
-    poses already; the training poses are s0 T0 pose.
+    nerfstudio stores T = T0 A and S = s0 a, where A and a (`applied_transform`, `applied_scale`) are already part of
+    the file's poses. The training poses are s0 T0 pose.
     """
     companion = path.with_name("dataparser_transforms.json")
     if not companion.is_file():
@@ -219,7 +219,7 @@ def _read_colmap(folder: Path) -> list[Camera]:
 def _rotation_matrix(where: str, quaternion: tuple[float, float, float, float]) -> NDArray[Any]:
     """Convert a unit quaternion wxyz to a matrix [3, 3], rounded as COLMAP rounds it."""
     w, x, y, z = quaternion
-    if not abs(math.hypot(w, x, y, z) - 1) <= QUATERNION_TOLERANCE:  # that of length 0 would become the identity
+    if not abs(math.hypot(w, x, y, z) - 1) <= QUATERNION_TOLERANCE:  # length 0 would give the identity
         raise CameraError(f"{where}: its quaternion has length {math.hypot(w, x, y, z):.3g}, not 1. Export it again.")
     x2, y2, z2 = 2 * x, 2 * y, 2 * z
     return np.array(
@@ -238,7 +238,7 @@ def _camera(
     intrinsics: tuple[float, float, float, float],
     world_to_camera: NDArray[Any],
 ) -> Camera:
-    """The camera, after every check that all forms share."""
+    """Return the camera after the checks that apply to all formats."""
     fx, fy, cx, cy = intrinsics
     for key, value in (("width", size[0]), ("height", size[1]), ("focal length x", fx), ("focal length y", fy)):
         _positive(where, key, value)
@@ -249,7 +249,10 @@ def _camera(
 
 
 def _exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
-    """`matrix` [4, 4] with the rotation nearest to its upper left 3x3 (polar decomposition), which must be close."""
+    """Return `matrix` [4, 4] with its upper left 3x3 replaced by the nearest rotation (polar decomposition).
+
+    The two must agree within `ROTATION_TOLERANCE`.
+    """
     rotation = matrix[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if not error <= ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
@@ -262,7 +265,10 @@ def _exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
 
 
 def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
-    """World to camera of camera to world; the position stays exact while the rotation is made so."""
+    """Convert a pose from camera-to-world to world-to-camera.
+
+    The rotation is replaced by the nearest exact one; the camera's position does not change.
+    """
     if not np.isfinite(pose).all():
         raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
     rotation = _exact_rotation(where, pose)[:3, :3]
@@ -283,7 +289,7 @@ def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, 
     if key not in values:
         raise CameraError(f"{where}: has no {key!r}. Give {_FORMS}.")
     nested = [values[key]]
-    while nested:  # NumPy would take text for numbers, `1_0` too, and room for the longest text in every place
+    while nested:  # NumPy would parse text as numbers, even `1_0`, and allocate the longest text for every entry
         entry = nested.pop()
         if isinstance(entry, list):
             nested += entry
@@ -302,7 +308,7 @@ def _number(where: str, values: Mapping[str, Any], key: str) -> float:
     if key not in values:
         raise CameraError(f"{where}: has no {key!r}. Give {_FORMS}.")
     value = values[key]
-    # beyond 1e100 there is no length or angle, and an integer of JSON may be too long for a float
+    # no length or angle exceeds 1e100, and an integer in JSON may be too long for a float
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e100:
         raise CameraError(f"{where}: {key!r} is {str(value)[:40]}, not a finite number. Export the cameras again.")
     return float(value)

@@ -1,7 +1,7 @@
-"""Cameras and poses of COLMAP sparse models, binary or text, as COLMAP's "Output Format" page defines them.
+"""Reader of cameras and poses in COLMAP sparse models, binary or text, as COLMAP's "Output Format" page defines them.
 
-Only `cameras` and `images` are read. They hold everything a view needs: COLMAP writes each image's pose into `images`
-even where `rigs` and `frames` are there to derive it from. `points3D`, `rigs` and `frames` are never opened.
+Only `cameras` and `images` are read, which contain everything that a view needs: COLMAP writes the pose of each image
+into `images`, even if `rigs` and `frames` also determine it. `points3D`, `rigs` and `frames` are never opened.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ UNDISTORT = (
 )
 _AGAIN = "Export the model again."
 
-#: COLMAP's camera models by number: name and count of parameters.
+#: COLMAP's camera models by number: name and number of parameters.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -46,14 +46,14 @@ _MODELS = {
     17: ("EQUIRECTANGULAR", 2),
 }
 _PARAMETERS = dict(_MODELS.values())
-#: Stricter than `int` and `float`, which take `1_0` and digits of other scripts.
+#: Stricter than `int` and `float`, which accept `1_0` and digits of other scripts.
 _WHOLE = re.compile("[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """Intrinsics: the model's name, the size in pixels, and the parameters in the model's order."""
+    """Intrinsics of a camera: name of the model, size in pixels, and parameters in the model's order."""
 
     model: str
     width: int
@@ -63,13 +63,13 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A registered image.
+    """Registered image with its pose.
 
     Attributes:
         name: Path of the image, relative to COLMAP's image folder.
-        camera: Id of its camera.
+        camera: ID of its camera.
         rotation: Quaternion wxyz, world to camera, as stored.
-        translation: World to camera.
+        translation: Translation, world to camera.
     """
 
     name: str
@@ -79,10 +79,12 @@ class ColmapImage:
 
 
 def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
-    """Read the cameras by id, and the registered images in the file's order. Binary files win over text, as in COLMAP.
+    """Read the cameras by ID, and the registered images in the file's order.
+
+    Binary files take precedence over text files, as in COLMAP.
 
     Raises:
-        CameraError: A file is missing, truncated, or holds a value that is not allowed; names the file.
+        CameraError: If a file is missing, truncated, or has an invalid value. The message names the file.
     """
     if (folder / "cameras.bin").is_file():
         cameras = _by_id(folder / "cameras.bin", _binary(folder / "cameras.bin", _binary_camera))
@@ -110,7 +112,7 @@ def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
 
 
 def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]]) -> Iterator[tuple[int, T]]:
-    """Yield as many entries as the file declares, each read only once the file is known to hold it."""
+    """Yield as many entries as the file declares; raise EOFError for an entry beyond the end of the file."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         position = 8
         for _ in range(struct.unpack_from("<Q", data)[0]):
@@ -121,7 +123,7 @@ def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]]) ->
 
 
 def _binary_camera(data: mmap.mmap, position: int) -> tuple[int, ColmapCamera, int]:
-    """Fields: camera (uint32), model (int32), width and height (uint64), parameters (float64)."""
+    """Read a camera: ID (uint32), model (int32), width and height (uint64), parameters (float64)."""
     number, model, width, height = struct.unpack_from("<IiQQ", data, position)
     name, count = _MODELS[model]
     parameters = struct.unpack_from(f"<{count}d", data, position + 24)
@@ -129,7 +131,10 @@ def _binary_camera(data: mmap.mmap, position: int) -> tuple[int, ColmapCamera, i
 
 
 def _binary_image(data: mmap.mmap, position: int) -> tuple[int, ColmapImage, int]:
-    """Fields: image (uint32), pose (7 float64), camera (uint32), name up to a 0, points (uint64, 24 bytes each)."""
+    """Read an image: ID (uint32), pose (7 float64), camera (uint32), name (ends with a 0 byte), points.
+
+    The points are a count (uint64) and 24 bytes each; they are skipped.
+    """
     number, *pose, camera = struct.unpack_from("<I7dI", data, position)
     end_of_name = data.find(b"\0", position + 64)
     if end_of_name < 0:
@@ -140,7 +145,7 @@ def _binary_image(data: mmap.mmap, position: int) -> tuple[int, ColmapImage, int
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    """Lines: id, model's name, width, height, parameters."""
+    """Yield cameras from lines of ID, model name, width, height and parameters."""
     for where, line in _lines(path):
         words = line.split()
         model = words[1] if len(words) > 1 else ""
@@ -151,7 +156,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
-    """Two lines each: id, quaternion, translation, camera's id and name; then points, which may be none."""
+    """Yield images from pairs of lines: ID, quaternion, translation, camera ID and name; then points, if any."""
     lines = _lines(path, points_follow=True)
     for where, line in lines:
         words = line.split(maxsplit=9)
@@ -162,7 +167,10 @@ def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
 
 
 def _lines(path: Path, *, points_follow: bool = False) -> Iterator[tuple[str, str]]:
-    """Yield where each line is, for messages, and the line; skip blank lines, comments and, on request, points."""
+    """Yield the location of each line, for messages, and its text.
+
+    Blank lines and comments are skipped, and with `points_follow` also the line after each yielded one.
+    """
     with path.open("rb") as file:
         numbered = enumerate(file, start=1)
         for number, data in numbered:

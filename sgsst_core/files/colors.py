@@ -1,4 +1,4 @@
-"""Colors alone, for who has the rest of a scene already: 6 bytes a Gaussian."""
+"""Stylized colors alone, for clients that already have the scene: 6 bytes per Gaussian."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from torch import Tensor
 
 from sgsst_core.files.atomic import atomic_path
 
-#: The largest number that float16 holds.
+#: Largest finite float16 value.
 _MOST = 65504.0
-#: Gaussians that are converted at a time.
+#: Gaussians per converted block.
 _BLOCK_ROWS = 1 << 20
 
 
 def write_colors(path: Path, sh_dc: Tensor) -> None:
-    """Write f_dc_0..2 of each Gaussian, in their order, as little-endian float16: N x 3, nothing else.
+    """Write f_dc_0..2 of each Gaussian in order, as an N x 3 array of little-endian float16 without a header.
 
-    A value is rounded to the nearest, by 2^-11 of itself at most, or by 2^-25 where it is smaller than 2^-14; in the
-    color that is less than 0.04 of a gray level of 255 for every color between black and white. What is beyond
-    +-65504 becomes +-65504. The file appears whole or not at all.
+    Values are rounded to the nearest float16. The relative error is at most 2^-11, or the absolute error at most 2^-25
+    for values below 2^-14. For colors between black and white that is less than 0.04 gray levels of 255. Values beyond
+    +-65504 are clamped. The file is written atomically.
 
     Args:
-        path: file to write.
-        sh_dc: [N, 3], finite.
+        path: File to write.
+        sh_dc: Finite coefficients, [N, 3].
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: If the file cannot be written.
     """
     values = sh_dc.detach().cpu().numpy()
     with atomic_path(path) as temporary, temporary.open("wb") as output:

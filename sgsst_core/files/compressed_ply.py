@@ -1,8 +1,8 @@
-"""PlayCanvas' compressed PLY: 16 bytes for a Gaussian, and one for each coefficient of its spherical harmonics.
+"""PlayCanvas' compressed PLY: 16 bytes per Gaussian, and one byte per SH coefficient above degree 0.
 
-Positions and logarithms of scales have 11, 10 and 11 bits and colors 8, between bounds that 256 Gaussians share;
-opacities have 8 bits, rotations 3 times 10. Bytes of spherical harmonics are between -4 and 4. The layout is that of
-`splat-transform` (https://github.com/playcanvas/splat-transform).
+Positions and log scales have 11, 10 and 11 bits, and colors have 8 bits per channel, relative to bounds that a chunk of
+256 Gaussians shares. Opacities have 8 bits, rotations three times 10 bits. SH coefficients are bytes for the range -4
+to 4. The layout is that of `splat-transform` (https://github.com/playcanvas/splat-transform).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ Arrays = dict[str, NDArray[np.float32]]
 _BLOCK_ROWS = 256 * CHUNK_ROWS
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = (*bounds("", "xyz"), *bounds("scale_", "xyz"), *bounds("", "rgb"))
-#: As logarithms, e^20 and 1 / e^20: the format's writers keep scales between them.
+#: Largest absolute log scale: other writers of the format also clamp scales to e^-20..e^20.
 _LARGEST_SCALE = 20.0
 
 
 def _harmonics() -> NDArray[np.float64]:
-    """A byte stands for the middle of its step, the first and the last for the ends."""
+    """Return the value of each byte: the center of its step, or for the first and last byte the end of the range."""
     middle = (np.arange(256) + 0.5) / 256
     middle[0], middle[-1] = 0, 1
     return 8 * (middle - 0.5)
@@ -46,10 +46,16 @@ _HARMONICS = byte_table(_harmonics())
 
 
 def read_compressed_ply(path: Path, file: RowFile, header: SceneHeader, into: Arrays) -> None:
-    """Fill the arrays of a scene (float32, by the names of `Scene`'s tensors) from a file with such a header.
+    """Read a compressed PLY into the arrays of a scene.
+
+    Args:
+        path: Path of the file.
+        file: Open file.
+        header: Header of the file.
+        into: float32 arrays to fill, by the names of `Scene`'s tensors.
 
     Raises:
-        SceneError: the file was changed since its header was read.
+        SceneError: If the file has changed since its header was read.
     """
     assert header.ply is not None
     starts = element_offsets(path, header.ply)
@@ -79,7 +85,7 @@ def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
             np.stack([chunks[name].astype(np.float64) for name in side], axis=1)[chunk]
             for side in (names[:3], names[3:])
         )
-        with np.errstate(invalid="ignore", over="ignore"):  # bounds that are no numbers are found afterwards
+        with np.errstate(invalid="ignore", over="ignore"):  # non-finite results are found later
             return low * (1 - share) + high * share
 
     with np.errstate(over="ignore"):
@@ -94,7 +100,7 @@ def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
 
 
 def _three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """[n, 3] in 0..1 of 11, 10 and 11 bits."""
+    """Unpack 11, 10 and 11 bits to values in 0..1, [n, 3]."""
     return np.stack([(packed >> 21) / 2047, ((packed >> 11) & 1023) / 1023, (packed & 2047) / 2047], axis=1)
 
 
@@ -105,7 +111,7 @@ def _unpack_harmonics(rows: NDArray[Any], into: NDArray[np.float32]) -> None:
 
 
 def write_compressed_ply(output: BinaryIO, arrays: Arrays) -> None:
-    """Write a scene's arrays, Gaussians that are near each other together: bounds are the tighter."""
+    """Write the arrays of a scene. Gaussians are sorted along a curve, so that chunks are compact and bounds tight."""
     count, coefficients = arrays["sh_rest"].shape[:2]
     order = _along_curve(arrays["means"])
     output.write(_header(count, coefficients))
@@ -119,19 +125,19 @@ def write_compressed_ply(output: BinaryIO, arrays: Arrays) -> None:
         output.write(values.tobytes())
     if coefficients:
         for rows in blocks:
-            # channel by channel, as in PLY
+            # all coefficients of a channel together, as in PLY
             rest = arrays["sh_rest"][rows].astype(np.float64).transpose(0, 2, 1)
             output.write(np.clip(np.floor(rest * 32 + 128), 0, 255).astype(np.uint8).tobytes())
 
 
 def _along_curve(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Order of Gaussians along a Z-order curve of 21 bits an axis."""
+    """Return the indices that sort Gaussians along a Z-order curve with 21 bits per axis."""
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
     cells = np.where(high > low, high - low, 1)
     code = np.zeros(len(means), np.uint64)
     for axis in range(3):
         values = to_steps((means[:, axis] - low[axis]) / cells[axis], (1 << 21) - 1).astype(np.uint64)
-        # each bit is followed by two empty ones
+        # insert two empty bits after each bit
         for shift, mask in (
             (32, 0x1F00000000FFFF),
             (16, 0x1F0000FF0000FF),
@@ -154,7 +160,7 @@ def _header(count: int, coefficients: int) -> bytes:
 
 
 def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Bounds [chunks, 18] and packed values [n, 4] of Gaussians that begin with a chunk."""
+    """Return the bounds [chunks, 18] and packed values [n, 4] of Gaussians, the first of which starts a chunk."""
     starts = np.arange(0, len(arrays["means"]), CHUNK_ROWS)
     chunk = np.arange(len(arrays["means"])) // CHUNK_ROWS
     scales = np.clip(arrays["scales"], -_LARGEST_SCALE, _LARGEST_SCALE)

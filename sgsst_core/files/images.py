@@ -1,4 +1,4 @@
-"""Images: style pictures and photos in, PNG and JPEG out; float32 [H, W, 3] of sRGB values in 0..1 in between."""
+"""Readers and writers of images, which are float32 tensors [H, W, 3] of sRGB values in 0..1 in memory."""
 
 from __future__ import annotations
 
@@ -18,37 +18,40 @@ from sgsst_core.errors import ImageError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.scene.camera import Camera
 
-#: Pillow's own bound against decompression bombs (twice its warning level of 2^30 / 4 / 3 pixels): 179 megapixels, more
-#: than the largest camera backs have, and 2 GB as float32.
+#: Maximum number of pixels: Pillow's own limit against decompression bombs, twice its warning level of 2^30 / 4 / 3.
+#: 179 megapixels are more than the largest camera backs have, and 2 GB as float32.
 MAX_PIXELS = 2 * ((1 << 30) // 4 // 3)
-#: Formats whose decoding time is bounded by the pixels and bytes of a file. Others of Pillow's are not read: some have
-#: decoders in Python, or start other programs.
+#: Formats whose decoding time is bounded by the pixels and bytes of a file. Pillow's other formats are refused: some
+#: have decoders in Python, or start other programs.
 FORMATS = ("JPEG", "PNG", "GIF", "BMP", "WEBP", "TIFF", "AVIF")
-#: Each scan of a progressive JPEG goes over all of its pixels again, for a few bytes. Encoders write about 10.
+#: Maximum number of scans of a progressive JPEG. A scan of a few bytes makes the decoder process all pixels again.
+#: Encoders write about 10.
 MAX_JPEG_SCANS = 100
-#: How far the aspect of a photo may be off its camera's before it must be another photo, or a cropped one.
+#: Maximum relative difference between the aspects of a photo and its camera. A larger one means a wrong or cropped
+#: photo.
 ASPECT_TOLERANCE = 0.01
 
 _JPEG_QUALITY = 95
 _EXIF_ORIENTATION = 0x0112
 _JPEG_MARKER = re.compile(rb"\xff([\x01-\xfe])")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
-#: Markers that no segment follows: TEM, restarts and the start of the image.
+#: Markers without a segment: TEM, restarts and the start of the image.
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
 _SHOWN = 10
 
 
 def load_image(path: Path) -> Tensor:
-    """Read an image in one of `FORMATS`; of an animated one, the first frame.
+    """Read an image in one of `FORMATS`, or the first frame of an animated one.
 
-    EXIF orientation is applied, transparency composited on white; palettes, gray, 16 bit and CMYK become RGB.
+    The EXIF orientation is applied, and transparent images are composited on white. Palettes, gray, 16 bits and CMYK
+    are converted to RGB.
 
     Returns:
-        [H, W, 3] float32 in 0..1, sRGB values as stored (no linearization, no color profile).
+        Image [H, W, 3] float32 in 0..1, sRGB values as stored (no linearization, no color profile).
 
     Raises:
-        ImageError: missing, not an image, truncated, more than MAX_PIXELS, or a JPEG of more than MAX_JPEG_SCANS; size
-            and scans are checked before decoding.
+        ImageError: If the file is missing, not an image or truncated, or has more than MAX_PIXELS pixels or (JPEG)
+            MAX_JPEG_SCANS scans. Both limits are checked before decoding.
     """
     with _opened(path) as image:
         if image.format in ("JPEG", "MPO"):
@@ -58,31 +61,32 @@ def load_image(path: Path) -> Tensor:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as it is shown (EXIF orientation applied), from its header alone.
+    """Return width and height of an image with EXIF orientation applied, from its header alone.
 
     Raises:
-        ImageError: missing, not an image, or more than MAX_PIXELS.
+        ImageError: If the file is missing or not an image, or has more than MAX_PIXELS pixels.
     """
     with _opened(path) as image:
         width, height = image.size
-        # a PNG's EXIF may come behind its pixels, and Pillow would decode them all to look for it
+        # the EXIF data of a PNG may follow its pixels, and Pillow would decode all of them to find it
         known = "exif" in image.info or image.format != "PNG"
-        turned = known and image.getexif().get(_EXIF_ORIENTATION, 1) in (5, 6, 7, 8)  # those that swap the sides
+        turned = known and image.getexif().get(_EXIF_ORIENTATION, 1) in (5, 6, 7, 8)  # these swap width and height
         return (height, width) if turned else (width, height)
 
 
 def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """Find each camera's photo before long work starts; only headers are read.
+    """Find and check the photo of each camera. Only headers are read, so that errors occur before long work starts.
 
-    A camera's name matches a file with or without its extension, and with as many of its folders as it takes:
-    "images/cam0/0001.png" matches FOLDER/images/cam0/0001.png, else FOLDER/cam0/0001.jpg, else FOLDER/0001.jpg.
+    A camera's name matches a file with or without its extension. Leading folders of the name are dropped until a file
+    matches: "images/cam0/0001.png" matches FOLDER/images/cam0/0001.png, else FOLDER/cam0/0001.jpg, else
+    FOLDER/0001.jpg.
 
     Returns:
-        The photos' paths in the cameras' order, for `load_photo`.
+        Paths of the photos in the order of the cameras, for `load_photo`.
 
     Raises:
-        ImageError: photos are missing or ambiguous (the message says for which views), cannot be read, or have another
-            aspect than their camera.
+        ImageError: If a photo cannot be read or its aspect differs from its camera's, or if photos are missing or
+            ambiguous. The message names the views.
     """
     if not folder.is_dir():
         raise ImageError(f"{folder}: is not a folder of photos. Give the folder that the cameras' names refer to.")
@@ -103,10 +107,13 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
 
 
 def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Path | None]:
-    """The mask of each camera that has one, found by its name as photos are (`check_photos`); only headers are read.
+    """Find the masks of cameras by name, as `check_photos` finds photos. Only headers are read.
+
+    Returns:
+        Path of each camera's mask; None for a camera without one.
 
     Raises:
-        ImageError: there is none for any camera, or more than one for one, or one has another aspect than its camera.
+        ImageError: If no camera has a mask, a camera has several, or the aspect of a mask differs from its camera's.
     """
     if not folder.is_dir():
         raise ImageError(f"{folder}: is not a folder of masks. Give the folder that the cameras' names refer to.")
@@ -128,10 +135,10 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Path | None]:
 
 
 def load_photo(path: Path, camera: Camera) -> Tensor:
-    """Read a photo at its camera's size (antialiased bicubic): [height, width, 3] float32 in 0..1.
+    """Read a photo and resize it to its camera's size (antialiased bicubic): [height, width, 3] float32 in 0..1.
 
     Raises:
-        ImageError: as `load_image`, or another aspect than the camera's.
+        ImageError: If the photo cannot be read (see `load_image`), or its aspect differs from the camera's.
     """
     photo = load_image(path)
     _check_aspect(path, (photo.shape[1], photo.shape[0]), camera)
@@ -141,21 +148,21 @@ def load_photo(path: Path, camera: Camera) -> Tensor:
     small = torch.nn.functional.interpolate(
         planes, (camera.height, camera.width), mode="bicubic", antialias=True, align_corners=False
     )
-    return small[0].permute(1, 2, 0).clamp(0, 1).contiguous()  # bicubic overshoots at edges
+    return small[0].permute(1, 2, 0).clamp(0, 1).contiguous()  # bicubic interpolation overshoots at edges
 
 
 def save_png(path: Path, image: Tensor) -> None:
-    """Write [H, W, 3] as 8-bit PNG, clamped to 0..1 and rounded; the file appears whole or not at all.
+    """Write an image [H, W, 3] as an 8-bit PNG, atomically. Values are clamped to 0..1 and rounded.
 
     Raises:
-        OutputError: the file cannot be written.
-        ValueError: another shape, or NaN.
+        OutputError: If the file cannot be written.
+        ValueError: If the image has another shape, or NaN values.
     """
     _save(path, image, lambda picture, target: picture.save(target, format="PNG"))
 
 
 def save_jpg(path: Path, image: Tensor) -> None:
-    """Write [H, W, 3] as JPEG of high quality with full color resolution; otherwise as `save_png`."""
+    """Write an image [H, W, 3] as a high-quality JPEG without chroma subsampling; otherwise like `save_png`."""
     _save(
         path, image, lambda picture, target: picture.save(target, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
     )
@@ -163,10 +170,10 @@ def save_jpg(path: Path, image: Tensor) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """The image with its header read and its size checked; every way in which decoding fails is an ImageError."""
+    """Open an image and check its size. All errors of decoding inside the block become ImageError."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the bound below is ours
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
             opened = Image.open(path, formats=FORMATS)
         with opened as image:
             if image.width * image.height > MAX_PIXELS:
@@ -180,14 +187,17 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         ) from error
     except UnidentifiedImageError as error:
         raise ImageError(f"{path}: is not an image that can be read. Give a PNG or JPEG.") from error
-    except Exception as error:  # Pillow's decoders raise whatever their format's parser runs into
+    except Exception as error:  # Pillow's decoders raise many types
         if isinstance(error, OSError) and error.strerror:
             raise ImageError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
         raise ImageError(f"{path}: is truncated or corrupt ({error}). Give another copy.") from error
 
 
 def _check_scans(path: Path) -> None:
-    """Count the scans of a JPEG file; entropy-coded data holds no markers but restarts."""
+    """Check the number of scans of a JPEG file.
+
+    Searching for markers is reliable, because entropy-coded data contains no other markers than restarts.
+    """
     data = path.read_bytes()
     scans = position = 0
     while (found := _JPEG_MARKER.search(data, position)) and found[1][0] != _END_OF_IMAGE:
@@ -200,8 +210,8 @@ def _check_scans(path: Path) -> None:
 
 
 def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:
-    """[H, W, 3] of a decoded image of any mode."""
-    if image.mode.startswith(("I", "F")):  # more than 8 bits, always gray: Pillow would cut them off at 255
+    """Convert a decoded image of any mode to RGB, [H, W, 3]."""
+    if image.mode.startswith(("I", "F")):  # gray with more than 8 bits; Pillow would clip it at 255
         values: NDArray[np.float32] = np.asarray(image, dtype=np.float32)
         if not np.isfinite(values).all():
             raise ImageError(f"{path}: holds NaN or infinite pixels. Give another image.")
@@ -218,7 +228,7 @@ def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:
 
 
 def _full_scale(mode: str, largest: float) -> float:
-    """The value that is white. Only float and 32-bit images leave it open: then the usual range that holds them."""
+    """Return the value of white. For float and 32-bit images it is the smallest usual range that holds all values."""
     if mode.startswith("I;16"):
         return 65535.0
     ranges = (1.0, 255.0, 65535.0) if mode == "F" else (65535.0,)
@@ -226,7 +236,7 @@ def _full_scale(mode: str, largest: float) -> float:
 
 
 def _index_photos(folder: Path) -> dict[tuple[str, ...], list[Path]]:
-    """Every image file below the folder, by every tail of its relative path without extension."""
+    """Index all image files below a folder by every suffix of their relative path without extension."""
     extensions = Image.registered_extensions()
     index: dict[tuple[str, ...], list[Path]] = {}
     for path in sorted(folder.rglob("*")):
@@ -238,7 +248,10 @@ def _index_photos(folder: Path) -> dict[tuple[str, ...], list[Path]]:
 
 
 def _matching(index: dict[tuple[str, ...], list[Path]], folder: Path, name: str) -> list[Path]:
-    """The photos that fit a camera's name best: the longest tail first, then the exact extension, then no subfolder."""
+    """Return the photos that match a camera's name best.
+
+    The longest matching path wins, then files that are not in a further subfolder, then those with the exact extension.
+    """
     whole = PurePosixPath(name.replace("\\", "/"))
     known = whole.suffix.lower() in Image.registered_extensions()
     parts = tuple(part for part in (whole.with_suffix("") if known else whole).parts if part not in ("..", "/"))
@@ -251,7 +264,7 @@ def _matching(index: dict[tuple[str, ...], list[Path]], folder: Path, name: str)
 
 
 def _check_aspect(path: Path, size: tuple[int, int], camera: Camera) -> None:
-    # the camera's sides are whole pixels, so that a small one is off by up to half a pixel by itself
+    # the camera's sides are rounded to whole pixels, which changes the aspect of a small camera
     allowed = ASPECT_TOLERANCE + 0.5 / min(camera.width, camera.height)
     if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > allowed:
         raise ImageError(

@@ -1,4 +1,4 @@
-"""JSON files."""
+"""Atomic writing of JSON files."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from sgsst_core.files.atomic import atomic_path
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write values as JSON; the file appears whole or not at all.
+    """Write values as JSON, atomically.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     with atomic_path(path) as temporary:
-        # A file name that is no valid Unicode holds lone surrogates: as escapes they are what JSON means by them.
+        # File names that are not valid Unicode contain lone surrogates, which JSON can only represent as escapes.
         text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")

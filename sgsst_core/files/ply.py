@@ -1,10 +1,11 @@
-"""3DGS scenes in files: reading them, and writing PLYs back with new colors and nothing else changed.
+"""Reader of 3DGS scene files, and writer of PLYs that changes the colors and nothing else.
 
 The properties are those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023): x y z,
 f_dc_0..2, f_rest_* (channel-major: all coefficients of red first), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
-They may come in any order and numeric type, among any others.
+They may have any order and numeric type, and a file may have further properties.
 
-Packed scenes (`scene_headers`) are read as well; with new colors they become PLYs as trainers write them.
+Compressed scenes (`scene_headers`) are read as well. With new colors, they are written as PLYs with the layout of
+trainers.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.split import Refinement, piece_counts
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
-#: Rows handled at a time: 64k rows of 62 floats are 16 MB, so that memory stays small and the columns of a block are
-#: taken from the processor's cache instead of one pass over the file each.
+#: Rows per block. 64k rows of 62 floats are 16 MB: that needs little memory, and the columns of a block are taken from
+#: the CPU cache rather than in one pass over the file each.
 BLOCK_ROWS = 1 << 16
 
-#: Bytes that are read at a time: they stay in a core's second-level cache while their columns are taken apart.
+#: Bytes per read, which stay in the L2 cache of a core while they are split into columns.
 READ_BYTES = 1 << 20
-#: Spherical harmonics above degree 0 that are held in memory, in bytes: those of 1.4 million Gaussians of degree 3.
+#: Maximum bytes of SH coefficients above degree 0 in memory: those of 1.4 million Gaussians of degree 3.
 HELD_BYTES = 1 << 28
 
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -53,25 +54,25 @@ _BASE = {
     "scales": ("scale_0", "scale_1", "scale_2"),
     "sh_dc": _DC,
 }
-#: What differs between the parts of a Gaussian that was cut.
+#: Properties that differ between the pieces of a split Gaussian.
 _SHAPE = (*_BASE["means"], "opacity", *_BASE["scales"])
-#: As messages name them; f_rest_* follow.
+#: Order of the properties in messages; f_rest_* follow.
 _ORDER = (*itertools.chain(*_BASE.values()), "opacity")
 _REST_DEGREES = {3 * number: degree for degree, number in COEFFICIENTS.items()}
 
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A scene together with what is needed to write it back.
+    """Scene together with the information to write it back.
 
     Attributes:
-        path: the file.
-        scene: its Gaussians, without dropped ones.
-        header: the file's header; None of packed files that are no PLY.
-        kept: [rows] bool, which rows of the file the scene holds; None where it holds all.
-        stamp: size in bytes and time of last change (ns) of the file when it was read.
-        form: of the file.
-        copies: [N] int64, into how many Gaussians of the scene each of its file was cut; None where none was.
+        path: Path of the file.
+        scene: Gaussians of the file without dropped ones.
+        header: PLY header; None for other formats.
+        kept: Whether the scene contains each row of the file, [rows] bool; None if it contains all.
+        stamp: Size in bytes and modification time in ns of the file when it was read.
+        form: Format of the file.
+        copies: Number of Gaussians into which each Gaussian was split, [N] int64; None if none was split.
     """
 
     path: Path
@@ -83,10 +84,10 @@ class SceneFile:
     copies: NDArray[np.int64] | None = None
 
     def refined(self, refinement: Refinement | None) -> SceneFile:
-        """The same with the scene as it was refined; itself where it was not.
+        """Return the file with its scene refined; the file itself if no Gaussian was split.
 
         Raises:
-            SceneError: the file cannot hold places and sizes of smaller Gaussians.
+            SceneError: If the file stores positions, opacities or scales as integers.
         """
         if refinement is None or not refinement.split:
             return self
@@ -103,27 +104,27 @@ class SceneFile:
 
     @property
     def dropped(self) -> int:
-        """How many Gaussians of the file are not in the scene."""
+        """Return the number of the file's Gaussians that were dropped."""
         return 0 if self.kept is None else int(len(self.kept) - self.kept.sum())
 
 
 def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None = None) -> SceneFile:
-    """Read a 3DGS scene of SH degree 0 to 3, its form told by its content.
+    """Read a 3DGS scene of SH degree 0 to 3. The format is detected from the file's content.
 
     PLYs may be text or binary, with any order and numeric type of the properties. Compressed PLY, SPZ and .splat are
-    unpacked into memory.
+    decompressed into memory.
 
     Args:
-        path: the file.
-        drop_invalid: Whether Gaussians with NaN or infinite values, or a quaternion of length 0, are left out, of the
-            scene and later of the stylized file, instead of refusing the file. Properties that 3DGS does not use are
-            not looked at.
-        held_bytes: spherical harmonics above degree 0 that take more stay in the file (`StoredHarmonics`), where it
-            has them as trainers write them: `stays_in_file`. None is `HELD_BYTES`.
+        path: Path of the file.
+        drop_invalid: Whether to drop Gaussians with NaN or infinite values, or with a quaternion of length 0, from the
+            scene and the stylized file. If False, such a file is refused. Properties that 3DGS does not use are not
+            checked.
+        held_bytes: Maximum bytes of SH coefficients above degree 0 in memory. Larger ones stay in the file
+            (`StoredHarmonics`) if its layout allows that; see `stays_in_file`. None is `HELD_BYTES`.
 
     Raises:
-        SceneError: missing, truncated or lying file, not a 3DGS scene, no Gaussians, invalid values, or the file was
-            changed while it was read.
+        SceneError: If the file cannot be read, is truncated, is not a 3DGS scene, has a wrong header, no Gaussians or
+            invalid values, or has changed while it was read.
     """
     declared = read_scene_header(path)
     if declared.form != "ply":
@@ -152,7 +153,7 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
 
 
 def _read_packed(path: Path, header: SceneHeader, drop_invalid: bool) -> SceneFile:
-    """Read a scene that is no plain PLY."""
+    """Read a scene in any format other than plain PLY."""
     file = RowFile(path)
     stamp = file.stamp
     into = _Columns(header.count, header.sh_degree, None)
@@ -174,9 +175,10 @@ def _read_packed(path: Path, header: SceneHeader, drop_invalid: bool) -> SceneFi
 
 
 def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
-    """Whether a scene's spherical harmonics above degree 0 are not held in memory: they would take more than that.
+    """Return whether a scene's SH coefficients above degree 0 stay in its file, rather than being loaded into memory.
 
-    They can stay where they lie in the file as in those of 3DGS trainers: little-endian, all float32, in their order.
+    They do if they would take more than `held_bytes` and the file has the layout of 3DGS trainers: binary
+    little-endian, float32 coefficients, in order.
     """
     names = [prop.name for prop in header.vertex.properties]
     if header.text or header.byte_order != "<" or "f_rest_0" not in names:
@@ -192,23 +194,26 @@ def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
 
 
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
-    """Write the scene's PLY again with new f_dc_0..2; every other byte comes back as it was, but for f_rest_* where
-    they fade. A scene of a packed file becomes a PLY as `write_scene` writes it.
+    """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
 
-    Where a value is still what the file holds (in float32), its bytes stay too. Rows that were dropped at reading
-    are absent, and a row stands once for each part of a Gaussian that was cut, with place, size and opacity of its own;
-    both change the count in the header. The file appears whole or not at all.
+    Even a color keeps its bytes if its value in float32 does not change. The rest of the file changes in three cases:
+
+    - With an SH attenuation, f_rest_* change.
+    - Dropped rows are absent, and the count in the header is adjusted.
+    - Each piece of a split Gaussian has its own row with its own position, scale and opacity; so the count changes too.
+
+    A scene in another format is written as a PLY by `write_scene`.
 
     Args:
-        source: what `read_scene` gave.
-        target: file to write; may be the source itself.
-        sh_dc: [N, 3], finite, N = len(source.scene).
-        sh_attenuation: by how much f_rest_* fade, 0 to 1: see `Scene.faded`.
+        source: File from `read_scene`.
+        target: File to write; may be the source itself.
+        sh_dc: Finite coefficients, [N, 3] with N = len(source.scene).
+        sh_attenuation: SH attenuation of f_rest_*, 0 to 1; see `Scene.attenuated`.
 
     Raises:
-        SceneError: the source file was changed since it was read, or cannot hold faded coefficients.
-        OutputError: the target cannot be written.
-        ValueError: sh_dc has the wrong shape or non-finite values.
+        SceneError: If the source file has changed since it was read, or cannot store attenuated coefficients.
+        OutputError: If the target cannot be written.
+        ValueError: If sh_dc has the wrong shape or non-finite values.
     """
     if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
         raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
@@ -231,10 +236,10 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
 
 
 def write_scene(path: Path, scene: Scene) -> None:
-    """Write a scene as a binary little-endian float32 3DGS PLY with the usual order of properties (normals are 0).
+    """Write a scene as a binary little-endian float32 3DGS PLY with the usual order of properties. Normals are 0.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     sh_rest = held(scene.sh_rest)
     coefficients = int(sh_rest.shape[1])
@@ -251,7 +256,7 @@ def write_scene(path: Path, scene: Scene) -> None:
             for part in parts:
                 width = part[0].numel()
                 block = part[start : start + len(rows)] if len(part) == len(scene) else part
-                if block.ndim == 3:  # channel by channel
+                if block.ndim == 3:  # all coefficients of a channel together
                     block = block.transpose(1, 2)
                 rows[:, column : column + width] = block.detach().cpu().reshape(len(block), width).numpy()
                 column += width
@@ -259,25 +264,28 @@ def write_scene(path: Path, scene: Scene) -> None:
 
 
 def write_packed(path: Path, scene: Scene, form: PackedForm) -> None:
-    """Write a scene in a packed form to a file, which appears whole or not at all; see `pack_scene`.
+    """Write a scene in a compressed format to a file, atomically; see `pack_scene`.
 
     Raises:
-        OutputError: the file cannot be written, or the form cannot hold the scene.
+        OutputError: If the file cannot be written, or the format cannot represent the scene.
     """
     with atomic_path(path) as temporary, temporary.open("wb") as output:
         pack_scene(output, scene, form, path)
 
 
 def pack_scene(output: BinaryIO, scene: Scene, form: PackedForm, target: Path) -> None:
-    """Write a scene in a packed form, without bands of spherical harmonics that are 0 in all Gaussians.
+    """Write a scene in a compressed format to a stream.
 
-    Rows may come in another order than the scene's.
+    SH bands that are 0 in all Gaussians are omitted. The order of the Gaussians may change.
 
     Args:
-        target: Name of the output, for messages.
+        output: Stream to write to.
+        scene: Scene to write.
+        form: Compressed format.
+        target: Path of the output, for messages.
 
     Raises:
-        OutputError: The form cannot hold the scene.
+        OutputError: If the format cannot represent the scene.
     """
     scene = scene.without_zero_bands()
     arrays = {field.name: held(getattr(scene, field.name)).detach().cpu().float().numpy() for field in fields(scene)}
@@ -288,7 +296,7 @@ def pack_scene(output: BinaryIO, scene: Scene, form: PackedForm, target: Path) -
 
 
 def _check_properties(path: Path, header: PlyHeader) -> int:
-    """SH degree of the scene; refuses what is no 3DGS scene before any data is read."""
+    """Check that a PLY is a 3DGS scene before any data is read, and return its SH degree."""
     vertex = header.vertex if "vertex" in header.names else None
     kinds = {prop.name: prop.kind for prop in vertex.properties if not prop.length_kind} if vertex else {}
     missing = [name for names in (*_BASE.values(), ("opacity",)) for name in names if name not in kinds]
@@ -320,7 +328,7 @@ def _check_properties(path: Path, header: PlyHeader) -> int:
 
 
 def _what_else(header: PlyHeader) -> str:
-    """Best guess at what a PLY without Gaussians is, and what to do about it."""
+    """Guess what a PLY without Gaussians contains, for the error message."""
     vertex = header.vertex if "vertex" in header.names else None
     names = {prop.name for prop in vertex.properties} if vertex else set()
     if "face" in header.names:
@@ -331,7 +339,7 @@ def _what_else(header: PlyHeader) -> str:
 
 
 def _row_layout(path: Path, header: PlyHeader, stamp: tuple[int, int], offset: int) -> RowLayout:
-    """Where a file of which `stays_in_file` is true has its spherical harmonics."""
+    """Return the layout of the SH coefficients in a file for which `stays_in_file` is True."""
     fields = header.vertex.dtype(header.byte_order).fields
     assert fields is not None
     count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in fields)
@@ -345,9 +353,9 @@ class _Flaws:
 
     Attributes:
         start: First row of the block.
-        valid: [n] bool, rows without invalid values.
-        counts: Numbers of NaN and of infinite values, by property that has some.
-        unrotated: [n] bool, rows whose quaternion has length 0, which is no rotation.
+        valid: Whether each row has only valid values, [n] bool.
+        counts: Numbers of NaN and infinite values, by property with invalid values.
+        unrotated: Whether the quaternion of each row has length 0, which is no rotation, [n] bool.
     """
 
     start: int
@@ -357,15 +365,16 @@ class _Flaws:
 
 
 class _Columns:
-    """The scene's arrays, filled with blocks of the file's rows, and what is wrong with the values.
+    """Arrays of a scene, filled with blocks of the file's rows, and the invalid values that were found.
 
     Args:
-        degree: of the spherical harmonics that are held.
-        stored: where others stay in the file, they are only looked at.
+        count: Number of rows.
+        degree: SH degree of the coefficients to load.
+        stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
 
     Attributes:
-        arrays: float32, by name of the scene's tensor.
-        flaws: of the blocks that have some.
+        arrays: float32 arrays by the names of the scene's tensors.
+        flaws: Invalid values of each block that has some.
     """
 
     def __init__(self, count: int, degree: int, stored: RowLayout | None) -> None:
@@ -383,15 +392,15 @@ class _Columns:
         self.flaws: list[_Flaws] = []
 
     def take(self, start: int, rows: NDArray[Any]) -> None:
-        """Copy a structured block of rows that starts at some row of the file; several threads may."""
+        """Copy a structured block of rows to the arrays from row `start` on. Thread-safe for different blocks."""
         part = slice(start, start + len(rows))
-        with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite, and is counted
+        with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite and is reported as such
             for name, target in self._targets.items():
                 target[part] = rows[name]
         self.check(start, len(rows), rows)
 
     def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:
-        """Note invalid values in so many rows, which are given where columns stay in the file."""
+        """Record invalid values in `count` rows from `start` on; `rows` is required if columns stay in the file."""
         part = slice(start, start + count)
         blocks = [array[part] for array in self.arrays.values()]
         if self._stored is not None and rows is not None:
@@ -418,7 +427,7 @@ class _Columns:
 
 
 def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: _Columns) -> None:
-    """Read element vertex block by block, on as many cores as PyTorch was told to use where there are many blocks."""
+    """Read the vertex element in blocks. Large files are read with as many threads as PyTorch uses."""
     dtype, count = header.vertex.dtype(header.byte_order), header.vertex.count
     step = max(1, READ_BYTES // dtype.itemsize)
 
@@ -439,7 +448,7 @@ def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: _Columns) 
 
 
 class _AsciiHeader(io.BufferedReader):
-    """The file as plyfile wants it: it refuses headers with other than ASCII characters, which comments do have."""
+    """File whose header has only ASCII characters, as plyfile requires. Comments may contain others."""
 
     def __init__(self, path: Path, header_bytes: int) -> None:
         super().__init__(io.FileIO(path))
@@ -451,10 +460,10 @@ class _AsciiHeader(io.BufferedReader):
 
 
 def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
-    """Read element vertex of a text file: [rows] structured array."""
+    """Read the vertex element of a text file as a structured array [rows]."""
     with path.open("rb") as file:
         file.seek(len(header.raw))
-        if any(b"_" in block for block in iter(lambda: file.read(READ_BYTES), b"")):  # Python reads 1_0 as 10
+        if any(b"_" in block for block in iter(lambda: file.read(READ_BYTES), b"")):  # Python parses 1_0 as 10
             raise SceneError(
                 f"{path}: cannot be read as PLY: there is a '_' among its numbers. Export the scene again."
             )
@@ -468,7 +477,7 @@ def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
 
 
 def _valid_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool) -> NDArray[np.bool_] | None:
-    """Which of so many rows to keep, None for all; raises unless the others may be dropped."""
+    """Return whether each row is valid, [count] bool, or None if all are; raise an error if rows may not be dropped."""
     if not flaws:
         return None
     kept = np.ones(count, dtype=np.bool_)
@@ -500,7 +509,7 @@ def _valid_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool)
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
-    """Size in bytes and time of last change (ns) of a file, by which it is known again."""
+    """Return the size in bytes and the modification time in ns of a file, to detect changes."""
     try:
         status = path.stat()
     except OSError as error:
@@ -509,7 +518,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 
 def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
-    """The source's header, with the number of rows written where some were dropped or cut."""
+    """Return the source's header, with the new number of rows if Gaussians were dropped or split."""
     raw = header.raw
     if source.kept is None and source.copies is None:
         return raw
@@ -517,12 +526,12 @@ def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
     return raw[:start] + str(len(source.scene)).encode() + raw[stop:]
 
 
-#: By name of the property, a value for each Gaussian of the scene.
+#: Values of all Gaussians of the scene by name of the property.
 _NewColumns = dict[str, NDArray[np.float32]]
 
 
 def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
-    """What may differ from the file: colors [N, 3], and of a scene that was refined, shapes."""
+    """Return the columns that may differ from the file: the new colors and, for a refined scene, the shapes."""
     columns = dict(zip(_DC, colors.numpy().T, strict=True))
     if source.copies is not None:
         columns["opacity"] = source.scene.opacities.numpy()
@@ -532,7 +541,7 @@ def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
 
 
 def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
-    """For each block of the file's so many rows: their number, how often each is written, which Gaussians these are."""
+    """Yield for each block of the file's rows: their number, how often each is written, and the slice of Gaussians."""
     position = gaussian = 0
     for start in range(0, rows, BLOCK_ROWS):
         count = min(BLOCK_ROWS, rows - start)
@@ -581,7 +590,7 @@ def _write_binary(
 
 
 def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
-    """Copy `count` bytes, or all that are left."""
+    """Copy `count` bytes, or all remaining bytes if it is None."""
     while count is None or count > 0:
         data = file.read(1 << 20 if count is None else min(count, 1 << 20))
         if not data:
@@ -604,7 +613,7 @@ def _write_text(
     names = (*columns, *(attenuation.names if attenuation else ()))
     slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in names]
     file.seek(len(header.raw))
-    # latin-1 gives every byte back as it came, newline="" every line end
+    # latin-1 preserves every byte, and newline="" every line end
     lines = io.TextIOWrapper(file, "latin-1", newline="")
     for _ in range(sum(element.count for element in before)):
         output.write(lines.readline().encode("latin-1"))
@@ -621,10 +630,13 @@ def _write_text(
 def _changed_line(
     line: str, slots: list[tuple[int, str]], values: NDArray[Any], attenuation: ShAttenuation | None
 ) -> str:
-    """A row of text with some of its tokens replaced where their value changes, others that fade; all spacing stays.
+    """Return a row of text with new values. Tokens whose value does not change, and all spacing, stay as they are.
 
     Args:
-        slots: place and kind of the tokens: those that have a value first.
+        line: Row of text.
+        slots: Index and NumPy code of each changed token: those of `values` first, then those to attenuate.
+        values: New values of the first slots.
+        attenuation: SH attenuation of the other slots; None if there are none.
     """
     tokens = list(re.finditer(r"\S+", line))
     if attenuation is not None:
@@ -633,7 +645,7 @@ def _changed_line(
     for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):
         token = tokens[slot]
         if np.float32(token[0]) != value:
-            # shortest text that reads back as the same number, in the precision that the file declares
+            # shortest text that parses to the same number in the precision that the file declares
             text = str(value) if kind == "f4" else repr(float(value))
             line = line[: token.start()] + text + line[token.end() :]
     return line

@@ -1,4 +1,4 @@
-"""Single properties of a scene's Gaussians, whatever else the file has of them."""
+"""Reader of single properties of a scene's Gaussians, including those that 3DGS does not use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sgsst_core.files.ply import SceneFile, file_stamp, text_vertices
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.scene.stored_harmonics import changed
 
-#: Properties of every scene, by the names that PLYs have for them: what holds it, and the column there.
+#: Properties of every scene by their names in PLY files: field of `Scene`, and column of its tensor.
 _OWN = {
     **{name: ("means", column) for column, name in enumerate("xyz")},
     **{f"scale_{column}": ("scales", column) for column in range(3)},
@@ -22,11 +22,12 @@ _OWN = {
 
 
 def read_property(file: SceneFile, name: str) -> Tensor:
-    """A property [N] of the scene's Gaussians: float32 of those of all scenes, else as the file has it (integers as
-    float64).
+    """Return a property of the scene's Gaussians, [N].
+
+    Properties that every scene has are float32. Others have the file's dtype, except integers, which become float64.
 
     Raises:
-        SceneError: the file has no such number of each Gaussian, or was changed since it was read.
+        SceneError: If the file has no such numeric property, or has changed since it was read.
     """
     if name in _OWN:
         field, column = _OWN[name]

@@ -1,7 +1,7 @@
-"""PLY headers: what a file declares, checked against its size before anything is read or allocated.
+"""Parser of PLY headers, which are checked against the size of the file before anything is read or allocated.
 
-The format is that of Greg Turk, "The PLY Polygon File Format" (1994), with the type names (`float32`, `int8`, ...) that
-came later, and LF, CR LF or CR line ends.
+The format is that of Greg Turk, "The PLY Polygon File Format" (1994). The newer type names (`float32`, `int8`, ...) are
+accepted too, as are LF, CR LF and CR line ends.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 
 from sgsst_core.errors import SceneError
 
-#: A 3DGS header takes 2 kB. A megabyte leaves room for long comments, and keeps a file that is no PLY from being
-#: searched to its end for `end_header`.
+#: Maximum size of a header. A 3DGS header takes 2 kB; a megabyte allows long comments. The limit avoids searching a
+#: whole file that is not a PLY for `end_header`.
 MAX_HEADER_BYTES = 1 << 20
 
 _TYPES = {
@@ -30,7 +30,7 @@ _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": "
 
 @dataclass(frozen=True)
 class PlyProperty:
-    """One `property` line; `kind` and `length_kind` are numpy codes such as f4, the latter for lists only."""
+    """Property of an element; `kind` and `length_kind` are NumPy codes such as f4, the latter for lists only."""
 
     name: str
     kind: str
@@ -39,7 +39,7 @@ class PlyProperty:
 
 @dataclass(frozen=True)
 class PlyElement:
-    """One `element` line with its properties; `count_span` is where the header's bytes hold the count."""
+    """Element with its properties; `count_span` is the position of its count in the bytes of the header."""
 
     name: str
     count: int
@@ -48,15 +48,15 @@ class PlyElement:
 
     @property
     def has_lists(self) -> bool:
-        """Whether rows differ in length."""
+        """Return whether the element has list properties, so that its rows differ in length."""
         return any(prop.length_kind for prop in self.properties)
 
     def dtype(self, byte_order: str) -> np.dtype:
-        """One row as it lies in a binary file; only for elements without lists."""
+        """Return the dtype of a row in a binary file; only for elements without lists."""
         return np.dtype([(prop.name, byte_order + prop.kind) for prop in self.properties])
 
     def least_row_bytes(self, text: bool) -> int:
-        """Bytes that a row takes at least; in text a value is a digit and a separator, a list may be empty."""
+        """Return the minimum bytes of a row. Text values have at least a digit and a separator; lists may be empty."""
         if text:
             return 2 * len(self.properties)
         return sum(np.dtype(prop.length_kind or prop.kind).itemsize for prop in self.properties)
@@ -64,12 +64,12 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What the header says.
+    """Parsed header of a PLY file.
 
     Attributes:
-        byte_order: "<", ">" or, in text files, "".
-        raw: the header's bytes, `end_header` and its line end included; the data starts at len(raw).
-        elements: in the file's order.
+        byte_order: "<" or ">"; "" for text files.
+        raw: Bytes of the header, including the line end of `end_header`; the data starts at len(raw).
+        elements: Elements in the file's order.
     """
 
     byte_order: str
@@ -78,25 +78,25 @@ class PlyHeader:
 
     @property
     def text(self) -> bool:
-        """Whether the data is text ("ascii")."""
+        """Return whether the data is text ("ascii")."""
         return not self.byte_order
 
     @property
     def names(self) -> list[str]:
-        """The elements' names, in the file's order."""
+        """Return the names of the elements in the file's order."""
         return [element.name for element in self.elements]
 
     @property
     def vertex(self) -> PlyElement:
-        """The element that holds the Gaussians; raises ValueError where there is none."""
+        """Return the element of the Gaussians; raise ValueError if there is none."""
         return self.elements[self.names.index("vertex")]
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Parse the header of a PLY file, and nothing behind it.
+    """Parse the header of a PLY file without reading its data.
 
     Raises:
-        SceneError: missing or unreadable file, no PLY header, or a line that the format does not know.
+        SceneError: If the file cannot be read, has no PLY header, or its header has an invalid line.
     """
     try:
         with path.open("rb") as file:
@@ -127,7 +127,7 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
                 pass
             case ["format", name, "1.0"] if name in _BYTE_ORDERS and byte_order is None:
                 byte_order = _BYTE_ORDERS[name]
-            # 18 digits are more than any file holds, and keep int() away from its limit on long strings
+            # 18 digits are more than any file needs, and stay below the limit of int() on long strings
             case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count) and byte_order is not None:
                 stop = position + len(line.rstrip())
                 elements.append((name, int(count), (stop - len(count), stop), {}))
@@ -169,19 +169,21 @@ def _check_elements(path: Path, elements: tuple[PlyElement, ...]) -> None:
 
 
 def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
-    """Check that the file holds what its header declares; nothing is allocated for it.
+    """Check that a file is as long as its header declares, without allocating memory for the data.
+
+    Rows of text have no fixed length, so text files are only checked against a lower bound. Parsing the rows reveals
+    other errors.
 
     Returns:
-        Where each element's rows start, bytes from the start of a binary file; empty for text, whose rows have no
-        fixed length: there the check is a lower bound, and the rest shows when the rows are parsed.
+        Byte offset of each element's rows by name in a binary file; empty for text.
 
     Raises:
-        SceneError: the file is shorter than declared.
+        SceneError: If the file is shorter than declared.
     """
     size = path.stat().st_size
     position = len(header.raw)
     least = sum(element.count * element.least_row_bytes(header.text) for element in header.elements)
-    if position + least - (1 if header.text else 0) > size:  # the last line may go without its line end
+    if position + least - (1 if header.text else 0) > size:  # the last line may lack its line end
         declared = ", ".join(f"{element.count} {element.name}" for element in header.elements)
         raise SceneError(
             f"{path}: the header declares {declared}, which takes at least {least} bytes, but only {size - position} "
@@ -202,7 +204,7 @@ def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
 
 
 def _end_of_lists(path: Path, element: PlyElement, byte_order: str, position: int) -> int:
-    """Step over rows of differing length, each list's own length read and believed only as far as the file goes."""
+    """Return the end of an element with lists. Each list's length is read and checked against the size of the file."""
     steps = [
         (struct.Struct(byte_order + np.dtype(prop.length_kind).char) if prop.length_kind else None, np.dtype(prop.kind))
         for prop in element.properties

@@ -1,6 +1,6 @@
-"""Numbers of few bits that packed scene files have in common: opacities, and rotations by their smallest three parts.
+"""Quantization that compressed scene formats share: opacities, and rotations as their smallest three components.
 
-All computing is float64, so that nothing but the files' own rounding is lost.
+All computations use float64, so that the format's own rounding is the only loss.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: Of degree 0, what a coefficient adds to a color.
+#: SH basis function of degree 0: contribution of a coefficient to a color.
 SH_C0 = 0.28209479177387814
 
-#: A quarter of a step from the end: what 0 and 255 of 255 stand for, since full and no opacity have no finite logit.
-#: Both are within the rounding of such files, and no picture of 8 bits shows a difference.
+#: Opacities of exactly 0 and 1 have no finite logit, so they are read as 0.25/255 and 1 - 0.25/255. The difference is
+#: below the rounding of these formats, and invisible in 8-bit images.
 _NEARLY = 0.25 / 255
 _LEAST_THREE = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def byte_table(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """[256] float32, what each byte stands for."""
+    """Convert the value of each byte to float32, [256]."""
     return values.astype(np.float32)
 
 
@@ -29,24 +29,27 @@ def _logits() -> NDArray[np.float64]:
     return np.log(share / (1 - share))
 
 
-#: [256] float32, logit of an opacity of so many 255ths.
+#: Logit of the opacity i / 255 for each byte i, [256] float32.
 OPACITY_LOGITS = byte_table(_logits())
 
 
 def opacity_bytes(logits: NDArray[Any]) -> NDArray[Any]:
-    """[n] uint8, opacities in 255ths of logits [n]; infinite ones are 0 and 255."""
-    # by tanh, which neither overflows nor loses small values
+    """Convert logits [n] to opacities in 255ths, [n] uint8. Infinite logits become 0 and 255."""
+    # tanh neither overflows nor loses small values
     return np.rint(127.5 * (1 + np.tanh(0.5 * logits.astype(np.float64)))).astype(np.uint8)
 
 
 def to_steps(values: NDArray[Any], most: int) -> NDArray[np.uint32]:
-    """uint32, values of 0..1 in that many steps, to the nearest; what lies beyond is taken to the end."""
+    """Quantize values in 0..1 to the nearest of the steps 0..most, as uint32. Other values are clamped."""
     steps: NDArray[np.uint32] = np.rint(np.clip(values, 0, 1) * most).astype(np.uint32)
     return steps
 
 
 def with_largest(index: NDArray[Any], three: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[n, 4] unit quaternions of which one part, by its index [n], is left out because the others [n, 3] tell it."""
+    """Restore unit quaternions [n, 4] from three components [n, 3] and the index [n] of the omitted one.
+
+    The omitted component is positive, and follows from the unit length.
+    """
     rows = np.arange(len(index))
     found = np.empty((len(index), 4))
     found[rows[:, None], _LEAST_THREE[index]] = three
@@ -55,9 +58,10 @@ def with_largest(index: NDArray[Any], three: NDArray[np.float64]) -> NDArray[np.
 
 
 def without_largest(quats: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Index [n] of the largest part of quaternions [n, 4], and the other three [n, 3] with that one made positive.
+    """Return the index [n] of the largest component of quaternions [n, 4], and the other three components [n, 3].
 
-    Quaternions are normalized; one of length 0 becomes that of no rotation, if its first part is the real one.
+    Quaternions are normalized, and their sign is chosen so that the largest component is positive. A quaternion of
+    length 0 is restored as (1, 0, 0, 0), which is the identity if the real part comes first.
     """
     values = quats.astype(np.float64)
     largest = np.abs(values).argmax(axis=1)

@@ -1,7 +1,7 @@
-"""What scene files declare, told by their content and checked against their size before anything is read or allocated.
+"""Reader of scene file headers, which detects the format and checks the header against the size of the file.
 
-Beside PLY these are PlayCanvas' compressed PLY, Niantic's SPZ (versions 1 to 4) and antimatter15's .splat. Only headers
-are read, and no PyTorch is needed for them. The layouts follow the programs that define them:
+The formats are PLY, PlayCanvas' compressed PLY, Niantic's SPZ (versions 1 to 4) and antimatter15's .splat. Nothing is
+allocated for the data, and PyTorch is not imported. The layouts follow the programs that define them:
 https://github.com/playcanvas/splat-transform, https://github.com/nianticlabs/spz, https://github.com/antimatter15/splat.
 """
 
@@ -20,41 +20,41 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.ply_header import PlyElement, PlyHeader, element_offsets, read_header
 
 Form = Literal["ply", "compressed.ply", "spz", "splat"]
-#: Files that are written beside a PLY, as names end.
+#: Compressed formats that can be written beside a PLY, by the ending of the file name.
 PackedForm = Literal["compressed.ply", "spz"]
 PACKED_FORMS: tuple[PackedForm, ...] = ("compressed.ply", "spz")
 
-#: Coefficients of one color above degree 0, by the degree of the spherical harmonics.
+#: SH coefficients per color channel above degree 0, by SH degree.
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
-#: Gaussians that share the bounds of a compressed PLY.
+#: Gaussians per chunk of a compressed PLY, which share their bounds.
 CHUNK_ROWS = 256
-#: Bytes of a Gaussian in a .splat file.
+#: Bytes per Gaussian in a .splat file.
 SPLAT_BYTES = 32
 
-#: What a byte of a deflate stream can become at most: 258 bytes of each two bits.
+#: Maximum compression ratio of deflate: 258 bytes for every two bits.
 _DEFLATE_RATIO = 1032
 _CONVERT = "Convert it first: `splat-transform scene.{form} scene.ply` (https://github.com/playcanvas/splat-transform)."
 _SPZ_MAGIC = b"NGSP"
-#: Bytes that tell the form of a file: all records of .splat that are looked at.
+#: Bytes from which the format is detected. For .splat they hold 256 records.
 _HEAD_BYTES = 256 * SPLAT_BYTES
 _KSPLAT_HEADER_BYTES = 4096
 
 
 def form_of_name(name: str) -> Form | None:
-    """The form that a file to be written has by its name's ending; None for those that are not written."""
+    """Return the format of an output file by the ending of its name; None if the ending is not supported."""
     lower = name.lower()
     packed: Form | None = next((form for form in PACKED_FORMS if lower.endswith(f".{form}")), None)
     return packed or ("ply" if lower.endswith(".ply") else None)
 
 
 def packed_name(ply: str, form: PackedForm) -> str:
-    """Name of the packed file beside a PLY."""
+    """Return the name of the compressed file beside a PLY."""
     return f"{ply.removesuffix('.ply')}.{form}"
 
 
 @dataclass(frozen=True)
 class SpzSection:
-    """A stream of an SPZ file of version 4: where its bytes are, and how many they become."""
+    """Compressed stream of an SPZ file of version 4: byte offset, compressed size and decompressed size."""
 
     offset: int
     compressed: int
@@ -63,13 +63,14 @@ class SpzSection:
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """What an SPZ file says of itself.
+    """Header of an SPZ file.
 
     Attributes:
-        version: 1 to 4.
-        fractional_bits: of the positions' fixed point numbers; version 1 has 16-bit floats instead.
-        sections: bytes of positions, alphas, colors, scales, rotations and spherical harmonics, when decompressed.
-        streams: of version 4, one for each section that is not empty; the others are one gzip stream.
+        version: Version of the format, 1 to 4.
+        fractional_bits: Fractional bits of the fixed-point positions; unused in version 1, which has 16-bit floats.
+        sections: Decompressed bytes of positions, opacities, colors, scales, rotations and spherical harmonics.
+        streams: Streams of version 4, one per section that is not empty. Empty for other versions, which have one gzip
+            stream.
     """
 
     version: int
@@ -80,15 +81,15 @@ class SpzHeader:
 
 @dataclass(frozen=True)
 class SceneHeader:
-    """What a scene file declares.
+    """Header of a scene file in any format.
 
     Attributes:
-        form: of the file.
-        count: Gaussians; 0 for a PLY without any, which `read_scene` refuses.
-        sh_degree: of the spherical harmonics, 0 to 3; of a PLY it is not looked at here, and 0.
-        size: bytes of the file.
-        ply: the header, of the two forms of PLY.
-        spz: the header, of SPZ.
+        form: Format of the file.
+        count: Number of Gaussians; 0 for a PLY without any, which `read_scene` refuses.
+        sh_degree: SH degree, 0 to 3; always 0 for a plain PLY, where it is not determined here.
+        size: Size of the file in bytes.
+        ply: PLY header of a plain or compressed PLY; None for other formats.
+        spz: SPZ header; None for other formats.
     """
 
     form: Form
@@ -100,16 +101,17 @@ class SceneHeader:
 
     @property
     def float_values(self) -> int:
-        """Numbers that a Gaussian of a packed form becomes."""
+        """Return the number of float values per Gaussian after decompression."""
         return 14 + 3 * COEFFICIENTS[self.sh_degree]
 
 
 def read_scene_header(path: Path) -> SceneHeader:
-    """Tell a scene file's form by its content. Packed ones are proved to hold what they declare, as far as their size
-    can tell; of a PLY nothing but the header is looked at: see `element_offsets`.
+    """Detect the format of a scene file from its content, and read its header.
+
+    The size of a compressed scene is checked against its header. That of a plain PLY is not: see `element_offsets`.
 
     Raises:
-        SceneError: missing file, truncated or lying file, or none of the forms that can be read.
+        SceneError: If the file cannot be read, is truncated, has a wrong header, or has an unsupported format.
     """
     try:
         with path.open("rb") as file:
@@ -163,7 +165,7 @@ def _ply(path: Path, size: int) -> SceneHeader:
 
 
 def bounds(prefix: str, axes: str) -> tuple[str, ...]:
-    """Names of a compressed PLY's lower and upper bounds: all lower ones first."""
+    """Return the names of a compressed PLY's bounds, the lower bounds of all axes first."""
     return tuple(f"{side}_{prefix}{axis}" for side in ("min", "max") for axis in axes)
 
 
@@ -178,7 +180,7 @@ def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, .
 
 
 def _sh_degree(path: Path, header: PlyHeader, count: int) -> int:
-    """Degree that a compressed PLY has spherical harmonics of, in an element of their own."""
+    """Return the SH degree of a compressed PLY, given its separate element of SH coefficients."""
     if "sh" not in header.names:
         return 0
     element = header.elements[header.names.index("sh")]
@@ -196,7 +198,7 @@ def _sh_degree(path: Path, header: PlyHeader, count: int) -> int:
 
 
 def _gzipped_spz(path: Path, head: bytes, size: int) -> SceneHeader:
-    """Versions 1 to 3: header and sections in one gzip stream."""
+    """Read the header of version 1 to 3, which stores header and sections in one gzip stream."""
     try:
         start = zlib.decompressobj(31).decompress(head, 16)
     except zlib.error as error:
@@ -214,7 +216,7 @@ def _gzipped_spz(path: Path, head: bytes, size: int) -> SceneHeader:
 
 
 def _spz_4(path: Path, head: bytes, size: int) -> SceneHeader:
-    """Version 4: a plain header, and a zstd stream for each section."""
+    """Read the header of version 4, which is uncompressed and followed by one zstd stream per section."""
     version, count, degree, fractional_bits, sections = _spz_header(path, head, (4,))
     if len(head) < 32:
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
@@ -243,7 +245,7 @@ def _spz_4(path: Path, head: bytes, size: int) -> SceneHeader:
 
 
 def _spz_header(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, tuple[int, ...]]:
-    """Version, Gaussians, degree, fractional bits, and the bytes of all sections."""
+    """Parse the common header: version, number of Gaussians, SH degree, fractional bits, and bytes of all sections."""
     if len(head) < 16:
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
     version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
@@ -269,12 +271,13 @@ def _spz_header(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int
     return version, count, degree, fractional_bits, sections
 
 
-# --- .splat, and forms that are not read -----------------------------------------------------------------------------
+# --- .splat, and unsupported formats ---------------------------------------------------------------------------------
 
 
 def _looks_like_splat(head: bytes) -> bool:
-    """Whether records of .splat fit: it has no header. Nearly all have finite places, positive sizes that are not
-    absurd, and rotations of length 1.
+    """Return whether the data looks like .splat records. The format has no header.
+
+    Nearly all records must have finite positions, plausible sizes, and rotations of length 1.
     """
     rows = splat_rows(head[: len(head) // SPLAT_BYTES * SPLAT_BYTES])
     if not len(rows):
@@ -286,7 +289,7 @@ def _looks_like_splat(head: bytes) -> bool:
 
 
 def splat_rows(data: bytes | np.ndarray) -> np.ndarray:
-    """Records of .splat: position and scale [3] float32, color with alpha [4] and rotation (wxyz) [4] bytes."""
+    """Return .splat records: position and scale ([3] float32), color with alpha and rotation wxyz ([4] uint8)."""
     kinds = [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
     return np.frombuffer(data, np.dtype(kinds))
 
@@ -301,7 +304,7 @@ def _splat(path: Path, size: int) -> SceneHeader:
 
 
 def _refuse_others(path: Path, head: bytes, size: int) -> None:
-    """Name the converter of forms that are known but not read."""
+    """Raise an error that names a converter if the file has a known but unsupported format."""
     convert = _CONVERT.format(form="sog")
     if head.startswith(b"PK\x03\x04"):
         raise SceneError(f"{path}: is a ZIP archive, as .sog scenes are, which cannot be read. {convert}")
@@ -313,7 +316,10 @@ def _refuse_others(path: Path, head: bytes, size: int) -> None:
 
 
 def _looks_like_ksplat(head: bytes, size: int) -> bool:
-    """Version 0.x, as many sections as fit, Gaussians, one of three levels of compression."""
+    """Return whether the data looks like a .ksplat header.
+
+    Its version is 0.x, its compression level is 0 to 2, and its numbers of sections and Gaussians fit the file size.
+    """
     if size < _KSPLAT_HEADER_BYTES or head[0] != 0 or head[1] < 1:
         return False
     sections, filled, _, count, level = struct.unpack_from("<IIIIH", head, 4)

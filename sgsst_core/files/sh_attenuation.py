@@ -1,6 +1,7 @@
-"""Spherical harmonics that fade as a scene's rows are written again: `f_rest_*` times one factor, in float32.
+"""SH attenuation of written scenes: `f_rest_*` are multiplied by one factor in float32.
 
-What is written is what a job has optimized with: `Scene.faded` multiplies the same float32 numbers by the same one.
+The written coefficients equal those that the job optimized with, since `Scene.attenuated` multiplies the same float32
+values by the same factor.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from sgsst_core.scene.gaussians import attenuation_factor
 
 @dataclass(frozen=True)
 class ShAttenuation:
-    """What fades in rows of a file.
+    """SH attenuation of the rows of a file.
 
     Attributes:
-        names: of the properties, in the file's order.
-        factor: float32's value; 0 makes every coefficient 0, without a sign.
+        names: Names of the SH properties in the file's order.
+        factor: Factor, rounded to float32. With 0, all coefficients become positive zeros.
     """
 
     names: tuple[str, ...]
@@ -32,13 +33,13 @@ class ShAttenuation:
 
     @staticmethod
     def of(header: PlyHeader, attenuation: float) -> ShAttenuation | None:
-        """Of a file's vertices; None where nothing changes."""
+        """Return the attenuation for a file's vertices; None if nothing changes."""
         names = tuple(prop.name for prop in header.vertex.properties if re.fullmatch(r"f_rest_\d+", prop.name))
         factor = attenuation_factor(attenuation)
         return ShAttenuation(names, factor) if names and factor != 1 else None
 
     def apply(self, rows: NDArray[Any]) -> None:
-        """Fade a structured block of rows, in place."""
+        """Attenuate a structured block of rows in place."""
         if not len(rows):
             return
         dtype = rows.dtype
@@ -48,7 +49,7 @@ class ShAttenuation:
             dtype[name] == np.dtype("<f4") and dtype.fields[name][1] == first + 4 * place
             for place, name in enumerate(self.names)
         )
-        if packed and first % 4 == 0 and dtype.itemsize % 4 == 0:  # as trainers write them: one pass over the rows
+        if packed and first % 4 == 0 and dtype.itemsize % 4 == 0:  # the layout of trainers: one pass over the rows
             table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
             part = table[:, first // 4 : first // 4 + len(self.names)]
             part[:] = self.attenuated(part)
@@ -57,18 +58,20 @@ class ShAttenuation:
             rows[name] = self.attenuated(rows[name].astype(np.float32))
 
     def attenuated(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Float32 values after fading."""
+        """Return the attenuated values in float32."""
         return values * np.float32(self.factor) if self.factor else np.zeros_like(values)
 
 
 def check_sh_attenuation(path: Path, header: PlyHeader | None, attenuation: float) -> None:
-    """Prove that a file can hold faded coefficients.
+    """Check that a file can store attenuated coefficients.
 
     Args:
-        header: None for what is no PLY: it becomes one, of float32.
+        path: Path of the file, for messages.
+        header: Header of the file; None if it is not a PLY. Such scenes are written as a float32 PLY.
+        attenuation: SH attenuation, 0 to 1.
 
     Raises:
-        SceneError: they are stored as integers.
+        SceneError: If the coefficients are stored as integers.
     """
     if header is None or "vertex" not in header.names or not attenuation:
         return

@@ -1,6 +1,6 @@
-"""antimatter15's .splat: 32 bytes for a Gaussian, without spherical harmonics above degree 0.
+"""Reader of antimatter15's .splat format: 32 bytes per Gaussian, without spherical harmonics above degree 0.
 
-Position and standard deviations are float32; color, opacity and rotation (wxyz) have 8 bits each.
+Positions and standard deviations are float32. The components of color, opacity and rotation (wxyz) have 8 bits each.
 """
 
 from __future__ import annotations
@@ -16,10 +16,15 @@ _BLOCK_ROWS = 1 << 16
 
 
 def read_splat(file: RowFile, header: SceneHeader, into: Arrays) -> None:
-    """Fill the arrays of a scene (float32, by the names of `Scene`'s tensors). A size of 0 becomes minus infinity.
+    """Read a .splat file into the arrays of a scene. A standard deviation of 0 becomes a log scale of minus infinity.
+
+    Args:
+        file: Open file.
+        header: Header of the file.
+        into: float32 arrays to fill, by the names of `Scene`'s tensors.
 
     Raises:
-        SceneError: the file was changed since its header was read.
+        SceneError: If the file has changed since its header was read.
     """
     for start in range(0, header.count, _BLOCK_ROWS):
         part = slice(start, min(start + _BLOCK_ROWS, header.count))
@@ -27,7 +32,7 @@ def read_splat(file: RowFile, header: SceneHeader, into: Arrays) -> None:
         file.read(start * SPLAT_BYTES, data)
         rows = splat_rows(data)
         into["means"][part] = rows["position"]
-        with np.errstate(divide="ignore", invalid="ignore"):  # found afterwards
+        with np.errstate(divide="ignore", invalid="ignore"):  # invalid values are found later
             into["scales"][part] = np.log(rows["scale"].astype(np.float64))
         into["sh_dc"][part] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
         into["opacities"][part] = OPACITY_LOGITS[rows["color"][:, 3]]

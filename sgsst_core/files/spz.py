@@ -1,11 +1,12 @@
-"""Niantic's SPZ: 16 to 20 bytes for a Gaussian and one for each coefficient of its spherical harmonics, compressed.
+"""Niantic's SPZ: 16 to 20 bytes per Gaussian and one byte per SH coefficient above degree 0, all compressed.
 
-Positions are fixed point numbers of 24 bits; logarithms of scales, colors, opacities and spherical harmonics have 8
-bits, rotations 3 times 8 or, from version 3 on, 10. Values lie attribute by attribute, and are unpacked as they come
-out of the stream: what it becomes is never in memory at once. The layout is that of https://github.com/nianticlabs/spz.
+Positions are 24-bit fixed-point numbers. Log scales, colors, opacities and SH coefficients have 8 bits, rotations three
+times 8 bits or, from version 3 on, 10 bits. The file stores one attribute after the other. They are converted while the
+stream is decompressed, so the decompressed data is never in memory as a whole. The layout is that of
+https://github.com/nianticlabs/spz.
 
-SPZ has x to the right, y up and z backwards, a 3DGS PLY y down and z forwards: positions, rotations and spherical
-harmonics are turned by half a turn about x on the way in and out.
+The axes of SPZ are x right, y up, z backward; those of a 3DGS PLY are x right, y down, z forward. Positions, rotations
+and spherical harmonics are therefore rotated by 180 degrees about x when they are read or written.
 """
 
 from __future__ import annotations
@@ -28,37 +29,44 @@ from sgsst_core.scene.stored_harmonics import RowFile
 
 _BLOCK_ROWS = 1 << 16
 _READ_BYTES = 1 << 18
-#: What may follow the Gaussians in a gzip stream: extensions, which are passed over.
+#: Maximum bytes of extensions after the Gaussians in a gzip stream. Extensions are skipped.
 _EXTENSION_BYTES = 1 << 20
-#: Of zstd, as its own program takes at most without being told to.
+#: Maximum window of zstd, the default limit of its command-line program.
 _WINDOW_BYTES = 1 << 27
 
-#: Signs of half a turn about x: of positions, of rotations (wxyz), and of real spherical harmonics of degree 1 to 3,
-#: which are odd in y and z together as often as their polynomials have those factors.
+#: Sign changes of a rotation by 180 degrees about x: for positions, rotations (wxyz), and real spherical harmonics of
+#: degree 1 to 3. An SH function changes its sign if its polynomial has an odd total power of y and z.
 _FLIP = np.array([1, -1, -1], np.float32)
 _FLIP_QUATS = np.array([1, 1, -1, -1], np.float32)
 _FLIP_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 _SCALES = byte_table(np.arange(256) / 16 - 10)
-#: Degree 0; a wider range than 0..1 of colors.
+#: SH coefficients of degree 0, whose range exceeds that of the colors 0..1.
 _COLORS = byte_table((np.arange(256) / 255 - 0.5) / 0.15)
 _HARMONICS = byte_table((np.arange(256) - 128) / 128)
 _FIRST_BYTES = byte_table(np.arange(256) / 127.5 - 1)
 
-#: Fractional bits that are written at most: finer than float32 is about the origin of a scene of a few units.
+#: Maximum number of fractional bits in written positions. In a scene of a few units, they are finer than float32.
 _MOST_BITS = 20
 
-#: Files are 2 % larger than at zlib's own 6, in a third of the time: spherical harmonics are nearly noise.
+#: Compression level. Files are 2 % larger than at zlib's default level 6 but take a third of the time, because
+#: spherical harmonics are almost noise.
 _DEFLATE_LEVEL = 4
 
 Take = Callable[[int], bytes]
 
 
 def read_spz(path: Path, file: RowFile, header: SceneHeader, into: Arrays) -> None:
-    """Fill the arrays of a scene (float32, by the names of `Scene`'s tensors).
+    """Read an SPZ file into the arrays of a scene.
+
+    Args:
+        path: Path of the file, for messages.
+        file: Open file.
+        header: Header of the file.
+        into: float32 arrays to fill, by the names of `Scene`'s tensors.
 
     Raises:
-        SceneError: a stream is damaged, ends early or holds more than the header declares, or the file was changed.
+        SceneError: If a stream is damaged or not as long as the header declares, or the file has changed.
     """
     spz = header.spz
     assert spz is not None
@@ -83,11 +91,11 @@ def read_spz(path: Path, file: RowFile, header: SceneHeader, into: Arrays) -> No
         for start in range(0, header.count, _BLOCK_ROWS):
             part = array[start : start + _BLOCK_ROWS]
             part[:] = values(np.frombuffer(take(len(part) * each), np.uint8))
-    next(streams, None)  # the end of the last one, where its checksum is compared
+    next(streams, None)  # reach the end of the last stream, where its checksum is verified
 
 
 def _gzip_stream(path: Path, file: RowFile, size: int, sections: int) -> Iterator[Take]:
-    """The same stream for every section."""
+    """Yield a reader of the one gzip stream for each section."""
     inflate = zlib.decompressobj(31)
     position = 0
 
@@ -123,7 +131,7 @@ def _gzip_stream(path: Path, file: RowFile, size: int, sections: int) -> Iterato
 
 
 def _zstd_streams(path: Path, file: RowFile, streams: tuple[SpzSection, ...]) -> Iterator[Take]:
-    """A stream for each section; each has to end where its section does."""
+    """Yield a reader of each section's own stream, and check that the stream ends with its section."""
     for stream in streams:
         decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
         with decompressor.stream_reader(_Part(file, stream), read_size=_READ_BYTES) as reader:  # type: ignore[arg-type]
@@ -147,7 +155,7 @@ def _zstd_streams(path: Path, file: RowFile, streams: tuple[SpzSection, ...]) ->
 
 
 class _Part:
-    """Some bytes of a file, for a reader of streams."""
+    """File-like object for a byte range of a file."""
 
     def __init__(self, file: RowFile, part: SpzSection) -> None:
         self._file, self._position, self._end = file, part.offset, part.offset + part.compressed
@@ -189,7 +197,7 @@ def _halves(data: NDArray[np.uint8]) -> NDArray[Any]:
 
 def _fixed_point(data: NDArray[np.uint8], fractional_bits: int) -> NDArray[Any]:
     low, middle, high = data.reshape(-1, 3).astype(np.int32).T
-    values = (low | middle << 8 | high << 16) << 8 >> 8  # the highest of 24 bits is the sign
+    values = (low | middle << 8 | high << 16) << 8 >> 8  # bit 23 is the sign
     return np.ldexp(values.astype(np.float32), -fractional_bits).reshape(-1, 3) * _FLIP
 
 
@@ -199,7 +207,7 @@ def _first_three(data: NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
-    """Sign and 9 bits each; the parts are in the order xyzw."""
+    """Decode rotations of version 3 and later: components with a sign and 9 bits, in the order xyzw."""
     packed = data.view("<u4")
     three = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1)
     values = np.where(three & 512, -1.0, 1.0) * (three & 511) / 511 * np.sqrt(0.5)
@@ -212,13 +220,15 @@ def _unpack_harmonics(data: NDArray[np.uint8], degree: int) -> NDArray[Any]:
 
 
 def write_spz(output: BinaryIO, arrays: Arrays, target: Path) -> None:
-    """Write a scene's arrays as version 3, which most programs read, with all 8 bits of the spherical harmonics.
+    """Write the arrays of a scene as SPZ version 3, which most programs can read, with all 8 bits of SH coefficients.
 
     Args:
-        target: for messages.
+        output: Stream to write to.
+        arrays: Arrays of the scene by the names of `Scene`'s tensors.
+        target: Path of the output, for messages.
 
     Raises:
-        OutputError: positions are too far from the origin.
+        OutputError: If a position is too far from the origin.
     """
     count, coefficients = arrays["sh_rest"].shape[:2]
     bits = _fractional_bits(arrays["means"], target)
@@ -241,7 +251,7 @@ def write_spz(output: BinaryIO, arrays: Arrays, target: Path) -> None:
 
 
 def _fractional_bits(means: NDArray[np.float32], target: Path) -> int:
-    """As many as leave room for the position that is farthest from the origin."""
+    """Return the largest number of fractional bits that can represent the position farthest from the origin."""
     farthest = max(float(np.abs(means).max()), 2.0**-30)
     bits = min(_MOST_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
     if bits < 1:

@@ -1,4 +1,4 @@
-"""The distance of palettes that no term of a loss is made of."""
+"""Tests of the color distance between image and style, which is independent of all loss terms."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_pixels_in_another_order_have_the_same_palette() -> None:
 
 
 def test_two_colors_are_as_far_apart_as_on_the_mean_direction() -> None:
-    """A difference d has mean square d^2 / 3 along directions of equal share in all of space; 64 of them are drawn."""
+    """Along uniformly distributed directions, a difference d has the mean square d^2 / 3. Here 64 are sampled."""
     first, second = torch.full((4, 4, 3), 0.2), torch.tensor([0.9, 0.5, 0.2]).expand(7, 3, 3)
     found = sliced_distance([first, first], _palette(second))
     assert found == pytest.approx(255 * math.hypot(0.7, 0.3) / math.sqrt(3), rel=0.1)
@@ -40,4 +40,4 @@ def test_what_no_gaussian_covers_does_not_count() -> None:
     on_black[~covered], on_white[~covered] = 0.0, 1.0
     seen = picture[covered][:, None]
     assert sliced_distance([on_black, on_white], _palette(seen)) == pytest.approx(0, abs=1e-4)
-    assert sliced_distance([on_black, on_black], _palette(seen)) > 10  # as if the black were the object's
+    assert sliced_distance([on_black, on_black], _palette(seen)) > 10  # uncovered black pixels would count

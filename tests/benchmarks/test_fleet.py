@@ -1,4 +1,4 @@
-"""A small fleet in simulation: nothing is lost, nobody is left waiting, and the same seed gives the same fleet."""
+"""Tests of a small simulated fleet: no job is lost or waits forever, and equal seeds give equal fleets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The forecast's arithmetic, where the answer is known."""
+"""Tests of the forecast's arithmetic in cases with known results."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from benchmarks import forecast
 from benchmarks.forecast import JOBS, LAUNCHES, SHARES, Job, Part, Passes, make_loss, statistics, step_seconds
 from benchmarks.work import Counted, Work, meta
 
-#: A scene and views that fit the memory whole.
+#: Job whose scene and views fit into memory.
 SMALL = Job((96, 128), 1000, 4.0, 3)
-#: Multiplications and additions of VGG19 to relu5_1 for a pixel: 9 products for each pair of channels, by block.
+#: Floating-point operations of VGG19 up to relu5_1 per pixel, by block: 9 multiply-adds for each pair of channels.
 FLOP = 2 * 9 * (
     (3 * 64 + 64 * 64)
     + (64 * 128 + 128 * 128) / 4
@@ -61,7 +61,7 @@ def test_statistics_are_made_of_the_upper_pairs() -> None:
     assert statistics(64, 1000, 4).operations == 2 * 64**2 * 1000
     assert statistics(512, 1000, 4).operations == 2 * 512**2 * 1000 * 36 / 64
     large = statistics(512, 10**6, 2)
-    assert large.bytes > 8 * 512 * 10**6 * 2  # eight times over: it outgrows the cache
+    assert large.bytes > 8 * 512 * 10**6 * 2  # eight passes, since it does not fit into the cache
 
 
 def test_features_decide_how_products_are_rounded() -> None:

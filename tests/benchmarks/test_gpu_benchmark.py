@@ -1,4 +1,4 @@
-"""`python -m benchmarks.gpu` in small sizes: every part runs, and what it writes is what readers of it expect."""
+"""Tests of `python -m benchmarks.gpu` in small sizes: all parts run, and the results have the expected fields."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PASSES = {"forward_seconds", "backward_seconds"}
 
 
 def benchmark(folder: Path, *options: str) -> tuple[int, dict[str, Any]]:
-    """Exit status and what was written."""
+    """Run the benchmark; return its exit status and the written results."""
     out = folder / "gpu.json"
     command = [sys.executable, "-m", "benchmarks.gpu", "--quick", "--out", str(out), *options]
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}

@@ -1,4 +1,4 @@
-"""The random search draws the same jobs everywhere, and tells of those that break a bound."""
+"""Tests of the random search: it draws the same jobs on all machines, and reports those that exceed a bound."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ def test_a_search_says_how_jobs_ended() -> None:
 @pytest.mark.parametrize(
     ("number", "how"),
     [
-        (248, "ImageError"),  # features to match, of a style of one column, at half size alone
-        (3278, "within its bounds"),  # a maximum that is nearly tied after half size was averaged
-        (452, "within its bounds"),  # weights of some views kept, in half precision
-        (468, "within its bounds"),  # features that are matched but for rounding
-        (1262, "within its bounds"),  # content that has changed by 500 times its rounding
-        (2768, "within its bounds"),  # and by less than it
-        (691, "within its bounds"),  # pixels that differ by less than the rounding of what goes into the network
-        (737, "within its bounds"),  # and by little more than that of their mean
-        (667, "within its bounds"),  # and in their last bit
-        (4237, "within its bounds"),  # a picture whose features are within a hundredth of the style's
-        (5810, "within its bounds"),  # a layer whose deviation is a ten thousandth of its mean
-        (7447, "within its bounds"),  # content that has changed by some 1e4 roundings, and counts 1e12 times
-        (12096, "within its bounds"),  # all pixels within 4e-7
+        (248, "ImageError"),  # feature matching at half size only, with a style one pixel wide
+        (3278, "within its bounds"),  # a nearly tied maximum at half size
+        (452, "within its bounds"),  # blend weights of some views cached in half precision
+        (468, "within its bounds"),  # features that equal their matches except for rounding
+        (1262, "within its bounds"),  # content that changed by 500 times its rounding error
+        (2768, "within its bounds"),  # content that changed by less than its rounding error
+        (691, "within its bounds"),  # pixels that differ by less than the rounding error of the network's input
+        (737, "within its bounds"),  # pixels that differ by little more than the rounding error of their mean
+        (667, "within its bounds"),  # pixels that differ in their last bit
+        (4237, "within its bounds"),  # an image whose features differ from the style's by at most 1 %
+        (5810, "within its bounds"),  # a layer whose standard deviation is 1e-4 of its mean
+        (7447, "within its bounds"),  # content that changed by 1e4 rounding errors, with a weight of 1e12
+        (12096, "within its bounds"),  # all pixels within a range of 4e-7
         (7963, "within its bounds"),  # pixels whose means at half size are rounded by a tenth of their deviation
-        (6575, "within its bounds"),  # a picture and a style that are black
+        (6575, "within its bounds"),  # a black image and a black style
     ],
 )
 def test_what_it_found_stays_mended(number: int, how: str) -> None:
@@ -52,7 +52,7 @@ def test_what_it_found_stays_mended(number: int, how: str) -> None:
 
 
 def test_what_breaks_a_bound_or_ends_in_any_other_way_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = {"steps_coarse": 0, "steps_sos": 1, "content_weight": 0}  # whose rounding would be another bound
+    settings = {"steps_coarse": 0, "steps_sos": 1, "content_weight": 0}  # content has a bound of its own
     style = torch.rand(30, 26, 3, generator=torch.Generator().manual_seed(1))
     job = situations.Situation(situations.crowd(20), style, settings)
     assert outcome(job) == ("within its bounds", None)

@@ -1,1 +1,1 @@
-"""A pretend CUDA device: what can be shown of a GPU without one. See `device` and `runtime`."""
+"""Simulated CUDA device for tests on machines without a GPU; see `device` and `runtime`."""

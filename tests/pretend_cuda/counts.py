@@ -1,4 +1,4 @@
-"""What a device was asked to do, and by which line of the project."""
+"""Counters of a device's work by the line of the project that caused it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _WATCHED = tuple(str(_ROOT / folder) + "/" for folder in ("sgsst_core", "worker"
 
 @dataclass
 class Counts:
-    """Launches of kernels, waits of the host for the device, bytes copied between the two: by the line that asked.
+    """Kernel launches, waits of the host for the device, and bytes copied between them, by line of the project.
 
-    Lines are "sgsst_core/loss/sos.py:310"; work that no line of the project asked for stands under "?".
+    Keys are lines such as "sgsst_core/loss/sos.py:310", or "?" for work that no line of the project caused.
     """
 
     launches: Counter[str] = field(default_factory=Counter)
@@ -23,17 +23,17 @@ class Counts:
     copies: Counter[str] = field(default_factory=Counter)
 
     def clear(self) -> None:
-        """Count from nothing."""
+        """Reset all counters."""
         for counter in (self.launches, self.waits, self.copies):
             counter.clear()
 
     def copy(self) -> Counts:
-        """What was counted until now."""
+        """Return a copy of the counters."""
         return Counts(Counter(self.launches), Counter(self.waits), Counter(self.copies))
 
 
 def calling_line() -> str:
-    """The innermost line of the project on the stack."""
+    """Return the innermost line of the project on the call stack."""
     frame = sys._getframe(1)
     while frame is not None:
         name = frame.f_code.co_filename

@@ -1,8 +1,9 @@
-"""Tensors that say "cuda:0", compute on the CPU, and count what a GPU would have been asked for.
+"""Tensors that report "cuda:0" as their device but compute on the CPU, and count the work that a GPU would get.
 
-Every operation of PyTorch on such a tensor passes through `dispatch`, which refuses to mix devices as CUDA does, and
-counts kernels, waits of the host and copies. What an operation launches is counted from its name: one kernel, but for
-those in `_KERNELS`, and none where it only makes a view or reserves memory. Libraries may launch a few more.
+Every PyTorch operation on such a tensor passes through `dispatch`, which refuses to mix devices as CUDA does and counts
+kernels, waits of the host and copies. The number of kernels follows from the name of the operation. It is one, except
+for operations in `_KERNELS`, and zero if the operation only creates a view or allocates memory. Libraries on a GPU may
+launch a few more.
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ from torch.utils._pytree import tree_leaves, tree_map
 from tests.pretend_cuda.counts import Counts, calling_line
 
 DEVICE = torch.device("cuda", 0)
-#: Of this process.
+#: Counters of this process.
 counts = Counts()
 
 
 class _Capture(threading.local):
-    """What is being captured by a thread: the others go on as ever.
+    """State of a graph capture, which affects one thread only.
 
     Attributes:
-        recorders: told of every operation: it, its arguments and its result, all with the CPU's tensors.
+        recorders: Callbacks for each operation, its arguments, its keyword arguments and its result, all with CPU
+            tensors.
     """
 
     def __init__(self) -> None:
@@ -40,7 +42,7 @@ class _Capture(threading.local):
 
 capture = _Capture()
 
-#: Operations without a kernel: they make a view, or reserve memory, or only ask.
+#: Operations without a kernel: they create a view, allocate memory or query a property.
 _NO_KERNEL = {
     "view", "_unsafe_view", "_reshape_alias", "permute", "transpose", "t", "slice", "select", "unsqueeze", "squeeze",
     "expand", "alias", "detach", "split", "split_with_sizes", "unbind", "as_strided", "diagonal", "lift_fresh",
@@ -48,19 +50,20 @@ _NO_KERNEL = {
     "empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided", "_local_scalar_dense", "is_same_size",
     "record_stream", "is_pinned", "view_as_real", "sym_size", "sym_stride", "narrow",
 }  # fmt: skip
-#: Kernels of operations that launch several: a bias is added by itself, sorts take several passes.
+#: Numbers of kernels of operations that may launch several: sorts take several passes. The bias of a convolution is
+#: counted separately.
 _KERNELS = {"sort": 6, "topk": 4, "nonzero": 3, "cumsum": 2, "cat": 1}
-#: Operations after which the host waits for the device, because the size or the value of their result is asked for.
+#: Operations after which the host waits for the device, because it needs the size or the value of their result.
 _WAITS = {
     "_local_scalar_dense", "nonzero", "masked_select", "equal", "unique_consecutive", "_unique2", "unique_dim",
     "bincount", "repeat_interleave", "is_nonzero", "linalg_lstsq", "histc",
 }  # fmt: skip
-#: Operations that take tensors of the CPU beside the device's.
+#: Operations that accept CPU tensors together with those of the device.
 _MIXED = {"copy_", "_to_copy", "index", "index_put_", "index_put", "_index_put_impl_", "_pin_memory"}
 
 
 class PretendTensor(Tensor):
-    """A tensor on the pretend device: `host`, on the CPU, holds its values."""
+    """Tensor on the simulated device; `host` holds its values on the CPU."""
 
     host: Tensor
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
@@ -87,7 +90,7 @@ class PretendTensor(Tensor):
     __array__ = numpy
 
     def record_stream(self, stream: Any) -> None:
-        """Nothing is done later, so that nothing is freed too early."""
+        """Do nothing: operations run immediately, so no memory is freed too early."""
 
     def tolist(self) -> Any:
         return self.cpu().tolist()
@@ -98,7 +101,7 @@ class PretendTensor(Tensor):
 
 
 def inner(value: Any) -> Any:
-    """The CPU's tensor in place of the device's; anything else as it is."""
+    """Return the CPU tensor of a tensor on the device; return any other value unchanged."""
     return value.host if isinstance(value, PretendTensor) else value
 
 
@@ -109,23 +112,23 @@ def wait(line: str | None = None) -> None:
 
 
 def refuse_in_capture(what: str) -> None:
-    """Fail as CUDA does where something is done that a graph cannot hold.
+    """Raise an error as CUDA does for an operation that a graph cannot contain.
 
     Raises:
-        RuntimeError: a graph is being captured.
+        RuntimeError: If a graph is being captured.
     """
     if capture.recorders:
         raise RuntimeError(f"operation not permitted when stream is capturing: {what}")
 
 
 def launch(kernels: int = 1) -> None:
-    """Count kernels; those that a graph captures are not launched."""
+    """Count kernel launches. Kernels that a graph captures are not launched."""
     if not capture.recorders:
         counts.launches[calling_line()] += kernels
 
 
 def dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """One operation of PyTorch, computed on the CPU and counted as CUDA would do it."""
+    """Run an operation of PyTorch on the CPU, and count the work that CUDA would do."""
     name = func._schema.name.removeprefix("aten::")
     leaves = tree_leaves((args, kwargs))
     on_device = [leaf for leaf in leaves if isinstance(leaf, PretendTensor)]
@@ -150,7 +153,7 @@ def dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def _wrapped(func: Any, result: Any, leaves: list[Any]) -> Any:
-    """The result on the device: an argument that was changed in place is the very same object."""
+    """Wrap a result as a tensor on the device. An argument that was changed in place is returned as the same object."""
     changed = {id(leaf.host): leaf for leaf in leaves if isinstance(leaf, PretendTensor)}
 
     def wrap(value: Any) -> Any:
@@ -186,7 +189,7 @@ def _count(name: str, func: Any, args: Any, kwargs: dict[str, Any], to_device: b
     if name in ("index", "index_put_", "index_put", "_index_put_impl_"):
         for index in args[1]:
             if isinstance(index, PretendTensor) and index.dtype == torch.bool:
-                wait()  # how many are true
+                wait()  # for the number of True values
             elif isinstance(index, Tensor) and not isinstance(index, PretendTensor):
                 _count_copy(index, waits=True)
     if name == "_to_copy" and isinstance(args[0], PretendTensor) != to_device:
@@ -201,7 +204,7 @@ def _count(name: str, func: Any, args: Any, kwargs: dict[str, Any], to_device: b
 
 
 def _count_copy(source: Tensor, *, waits: bool) -> None:
-    """A copy between host and device; scalars of the CPU travel with a launch."""
+    """Count a copy between host and device. CPU scalars need no wait, since they are passed with the launch."""
     refuse_in_capture("a copy between host and device")
     counts.copies[calling_line()] += source.numel() * source.element_size()
     if waits and not (source.dim() == 0 and not isinstance(source, PretendTensor)):
@@ -209,7 +212,7 @@ def _count_copy(source: Tensor, *, waits: bool) -> None:
 
 
 def _is_staged(host: Tensor) -> bool:
-    """Whether a copy without wait can be had: of pinned memory, and of so little that the driver takes it along."""
+    """Return whether a copy can be asynchronous: from pinned memory, or so small that the driver stages it."""
     return _is_pinned(host) or (not isinstance(host, PretendTensor) and host.numel() * host.element_size() <= 1 << 16)
 
 
@@ -218,14 +221,14 @@ def _is_pinned(tensor: Tensor) -> bool:
 
 
 class _Factories(TorchDispatchMode):
-    """Sends what makes new tensors on the device to `dispatch` too."""
+    """Mode that also sends operations to `dispatch` that create tensors on the device."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return dispatch(func, args, kwargs or {})
 
 
 class _Moves(TorchFunctionMode):
-    """What PyTorch cannot send to a device for which it was not built, before it gets that far."""
+    """Mode that intercepts calls that would fail in a PyTorch built without CUDA before they reach `dispatch`."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
@@ -253,7 +256,7 @@ def _is_cuda(device: Any) -> bool:
 
 
 def _to(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-    """`Tensor.to`, whose device may be the pretend one."""
+    """Replace `Tensor.to`, with support for the simulated device."""
     copy = kwargs.pop("copy", False)
     device, dtype, non_blocking, memory_format = torch._C._nn._parse_to(*args, **kwargs)
     device = tensor.device if device is None else device
@@ -268,7 +271,7 @@ def _to(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
 
 @contextmanager
 def modes() -> Iterator[None]:
-    """Within the block, and in threads that begin in it, tensors may be made on the pretend device."""
+    """Allow tensors on the simulated device within the block, and in threads that start in it."""
     _let_tensors_be_on_cuda()
     run = threading.Thread.run
 
@@ -285,10 +288,10 @@ def modes() -> Iterator[None]:
 
 
 def _let_tensors_be_on_cuda() -> None:
-    """Give PyTorch a guard of CUDA devices where it was built without: that of the CPU, which does nothing.
+    """Register the device guard of the CPU, which does nothing, for CUDA if PyTorch was built without CUDA.
 
-    Indexing and a few more operations ask for one before they get as far as `dispatch`. A guard is a pointer in a table
-    by kind of device (c10/core/impl/DeviceGuardImplInterface.h), for CUDA the second one.
+    Indexing and a few other operations need a guard before they reach `dispatch`. Guards are pointers in a table by
+    device type (c10/core/impl/DeviceGuardImplInterface.h); that of CUDA is the second one.
     """
     library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / "libc10.so"))
     guards = (ctypes.c_void_p * 2).in_dll(library, "_ZN3c104impl26device_guard_impl_registryE")

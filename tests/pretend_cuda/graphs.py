@@ -1,4 +1,4 @@
-"""CUDA graphs of the pretend device."""
+"""CUDA graphs of the simulated device."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from tests.pretend_cuda import device
 
 @contextmanager
 def plainly() -> Iterator[None]:
-    """Without the device's modes: what the interpreter computes with is its own."""
+    """Disable the modes of the device within the block, for computations of the interpreter itself."""
     with torch._C.DisableTorchFunction(), torch.utils._python_dispatch._disable_current_modes():
         yield
 
 
 class CUDAGraph:
-    """Operations that were captured, to be done again with the very same tensors.
+    """Captured operations, which a replay repeats on the same tensors.
 
-    Capturing computes nothing on a GPU. Here it does, and what it has computed is made unusable at its end: numbers are
-    NaN until a replay has made them.
+    On a GPU, capturing computes nothing. Here the operations do run during capture, so their results are set to NaN at
+    its end. Only a replay makes them valid.
     """
 
     def __init__(self, keep_graph: bool = False) -> None:
@@ -32,7 +32,7 @@ class CUDAGraph:
         self._done = False
 
     def record(self, func: Any, args: Any, kwargs: Any, result: Any) -> None:
-        """Hold an operation, but for those that only make a view or reserve memory, which stays where it is."""
+        """Store an operation. Views and allocations are skipped, since their memory stays where it is."""
         schema = getattr(func, "_schema", None)
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
         places = {tensor.untyped_storage().data_ptr() for tensor in given}
@@ -48,7 +48,7 @@ class CUDAGraph:
         self._steps.append((func, args, kwargs, into))
 
     def end(self) -> None:
-        """Nothing more is captured."""
+        """End the capture, and invalidate the results that it computed."""
         self._done = True
         with plainly():
             for tensor in self._written:
@@ -57,7 +57,7 @@ class CUDAGraph:
         self._written.clear()
 
     def replay(self) -> None:
-        """All operations, in one launch."""
+        """Repeat all operations; counts as one launch."""
         if not self._done:
             raise RuntimeError("Called CUDAGraph::replay without a preceding successful capture.")
         device.refuse_in_capture("another graph")
@@ -74,7 +74,7 @@ class CUDAGraph:
 def graph(
     cuda_graph: CUDAGraph, pool: Any = None, stream: Any = None, capture_error_mode: str = "global"
 ) -> Iterator[None]:
-    """As `torch.cuda.graph`: what this thread asks of the device in the block is captured."""
+    """Capture the work of this thread within the block, as `torch.cuda.graph` does."""
     device.refuse_in_capture("another capture")
     device.wait()
     device.capture.recorders.append(cuda_graph.record)

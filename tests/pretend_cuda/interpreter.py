@@ -1,4 +1,4 @@
-"""Triton's interpreter takes its time for every kernel: tests of something else do without some of them."""
+"""Replacement of Triton kernels by PyTorch in tests of other parts, because Triton's interpreter is slow."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ from sgsst_core.loss import terms
 
 
 def leave_out_kernels(patch: pytest.MonkeyPatch) -> None:
-    """Let statistics and style loss be computed by PyTorch alone."""
+    """Compute statistics and style loss with PyTorch only."""
     for module in (fused_statistics, terms):
         patch.setattr(module, "has_kernels", lambda device, channels: False)

@@ -1,4 +1,4 @@
-"""`torch.cuda` and Triton's launches for the pretend device: events, streams, memory."""
+"""Replacements of `torch.cuda` (events, streams, memory) and of Triton's launches for the simulated device."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from tests.pretend_cuda import device
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.graphs import CUDAGraph, graph, plainly
 
-#: Bytes of the pretend device's memory.
+#: Bytes of the simulated device's memory.
 MEMORY = 140 << 30
 
 
 class Stream:
-    """All streams are one: what is asked for is done at once."""
+    """Stream of the simulated device. All streams are the same, and operations run immediately."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.device = device.DEVICE
 
     def wait_event(self, event: Event) -> None:
-        """Nothing is left to wait for."""
+        """Do nothing: all operations are already complete."""
 
     def wait_stream(self, stream: Stream) -> None:
-        """Likewise."""
+        """Do nothing: all operations are already complete."""
 
     def record_event(self, event: Event | None = None) -> Event:
-        """An event at this moment."""
+        """Record an event and return it."""
         event = event or Event()
         event.record(self)
         return event
 
     def synchronize(self) -> None:
-        """The host waits."""
+        """Count a wait of the host."""
         device.wait()
 
     def query(self) -> bool:
-        """Whether all is done."""
+        """Return whether all work is complete."""
         return True
 
 
 class Event:
-    """A moment on the host's clock."""
+    """Event with a time of the host's clock."""
 
     def __init__(self, enable_timing: bool = False, blocking: bool = False, **_: Any) -> None:
         self._timed = enable_timing
@@ -56,24 +56,24 @@ class Event:
         self.read = False
 
     def record(self, stream: Stream | None = None) -> None:
-        """Now."""
+        """Record the current time."""
         if self._timed:
             device.refuse_in_capture("an event with timing")
         self._moment = time.perf_counter()
 
     def wait(self, stream: Stream | None = None) -> None:
-        """The stream waits, not the host."""
+        """Do nothing: a stream waits, not the host."""
 
     def query(self) -> bool:
-        """Whether it has come."""
+        """Return whether the event has been recorded."""
         return self._moment is not None
 
     def synchronize(self) -> None:
-        """The host waits."""
+        """Count a wait of the host."""
         device.wait()
 
     def elapsed_time(self, end: Event) -> float:
-        """Milliseconds; both events must have been recorded, with timing."""
+        """Return the milliseconds to a later event. Both must have been recorded with timing."""
         if not (self._timed and end._timed):
             raise ValueError("Both events must be created with argument 'enable_timing=True'.")
         if self._moment is None or end._moment is None:
@@ -82,14 +82,14 @@ class Event:
 
 
 class _Selected(nullcontext[None]):
-    """As `torch.cuda.device`: there is one device, which is selected already."""
+    """Replacement of `torch.cuda.device`. The only device is always selected."""
 
     def __init__(self, to: Any) -> None:
         super().__init__()
 
 
 def _set_device(to: Any) -> None:
-    """As `torch.cuda.set_device`: it takes a number or a device with one."""
+    """Replace `torch.cuda.set_device`, which requires an index or a device with an index."""
     torch.cuda._utils._get_device_index(to)
 
 
@@ -101,7 +101,7 @@ def _count_launch(original: Any) -> Any:
                 raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
             device.launch()
         values, named = [device.inner(arg) for arg in args], {name: device.inner(arg) for name, arg in kwargs.items()}
-        # While a graph is captured, what its inputs hold means nothing.
+        # While a graph is captured, the values of its inputs are meaningless.
         with plainly(), np.errstate(all="ignore" if device.capture.recorders else None):
             result = original(executor, *values, **named)
         for record in device.capture.recorders:
@@ -113,7 +113,7 @@ def _count_launch(original: Any) -> Any:
 
 @contextmanager
 def pretend_cuda() -> Iterator[Counts]:
-    """Within the block there is a CUDA device; what it is asked for is counted from nothing."""
+    """Provide a simulated CUDA device within the block, and yield its counters, which start at zero."""
     from triton.runtime.interpreter import GridExecutor
 
     properties = mock.Mock(total_memory=MEMORY, multi_processor_count=132, L2_cache_size=50 << 20, name="pretend")

@@ -1,4 +1,4 @@
-"""The pretend device behaves as CUDA does in what it is there to show."""
+"""Tests that the simulated device behaves like CUDA in the respects that other tests rely on."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_what_cuda_refuses_is_refused(counts: Counts) -> None:
     with pytest.raises(ValueError, match="index"):
         torch.cuda.set_device(torch.device("cuda"))
     torch.cuda.set_device(torch.device("cuda", 0))
-    assert float((there + torch.tensor(1.0)).sum()) == 21.0  # scalars of the CPU may be mixed in
+    assert float((there + torch.tensor(1.0)).sum()) == 21.0  # CUDA accepts CPU scalars
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Whole jobs on a pretend CUDA device: what would stop one on a GPU, and what a step asks of it."""
+"""Tests of whole jobs on a simulated CUDA device: they run, and their steps need few waits, copies and launches."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from worker.styles import StyleFile
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
-#: Bytes of a handful of numbers.
+#: Maximum bytes of a few scalars.
 SCALARS = 256
 
 
@@ -41,7 +41,7 @@ def counts() -> Iterator[Counts]:
 
 
 def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 32), **settings: Any) -> StylizeRequest:
-    """A job of two tiny views in two scales or more, a few steps in each phase."""
+    """Write the inputs of a job with two tiny views at two or more scales and a few steps per phase; return it."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True)
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
@@ -54,7 +54,7 @@ def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 3
 
 
 def go_on(job: Job, steps: int | None = None) -> Result:
-    """Run a job; with `steps`, ask it to stop after so many."""
+    """Run a job, or with `steps` interrupt it after that many steps."""
     return execute(
         job,
         progress=lambda progress: None,
@@ -73,7 +73,7 @@ def go_on(job: Job, steps: int | None = None) -> Result:
     ],
 )
 def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, settings: dict[str, Any]) -> None:
-    """Survey, plan, both phases, measuring, checkpoint, another process that goes on with it, report."""
+    """Run survey, plan, both phases, measurements, a checkpoint, a resumed job and the report."""
     asked = request_(tmp_path, scan=scan, preset=preset, **settings)
     first = prepare(asked)
     plan = first.stylizer.plan
@@ -93,7 +93,7 @@ def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, se
 @pytest.mark.slow
 @pytest.mark.parametrize("scan", [False, True])
 def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: Path, scan: bool) -> None:
-    """One wait more where a view comes for the first time, and its lists are built."""
+    """The first step of a view has one more wait, because it builds the tile intersections."""
     settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}
     stylizer = prepare(request_(tmp_path, scan=scan, size=(64, 48), **settings)).stylizer
     assert stylizer.scale_count(0) == 3
@@ -110,7 +110,7 @@ def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: P
 
 
 def in_regions(asked: StylizeRequest) -> StylizeRequest:
-    """The job with a region of another style, and one that is kept."""
+    """Return the job with a region that has its own style and a frozen region."""
     options = region_options(
         ["right:half-space=1,0,0,0", "low:half-space=0,1,0,1"], [f"right={asked.styles[0].path}"], ["right=3"], ["low"]
     )
@@ -149,9 +149,9 @@ def test_losses_of_regions_are_those_of_the_cpu(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("scan", [False, True])
 def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> None:
-    """With VGG19, the larger network, on three scales. The number is the same for views of any size.
+    """The larger network, VGG19, takes fewer than 500 launches on three scales, for views of any size.
 
-    Over a drawn surround, content features take a forward pass of their own.
+    A random training background would need another forward pass for the content features.
     """
     weighted: dict[str, Any] = {"position_weights": "on" if scan else "off", "training_background": "background"}
     settings = make_settings(steps_coarse=0, steps_sos=2, coarsest_side=16, **weighted)
@@ -168,7 +168,7 @@ def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> No
 
 @pytest.mark.slow
 def test_losses_are_those_of_the_cpu(tmp_path: Path) -> None:
-    """Of the same steps: every kernel in its place, with the numbers that it was given."""
+    """Equal losses show that all kernels run in the right order with the right arguments."""
     asked = request_(tmp_path, scan=True, size=(64, 48))
     expected = prepare(asked).stylizer
     with pretend_cuda():

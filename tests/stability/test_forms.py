@@ -1,4 +1,4 @@
-"""Hard cases of packed scene files and of orbits."""
+"""Hard cases of compressed scene files and of orbits."""
 
 from __future__ import annotations
 

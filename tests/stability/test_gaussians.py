@@ -1,4 +1,4 @@
-"""Hard cases of the Gaussians: values, shapes, opacities and places that overflow, cancel or divide by zero."""
+"""Hard cases of Gaussians: values, shapes, opacities and positions that overflow, cancel or divide by zero."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_stays_within_its_bound(case: Case) -> None:
 
 
 def test_the_cut_offs_are_met_to_the_ulp() -> None:
-    """One float32 ulp below 1/255 is skipped, one above is kept: by the fast projection and by the reference alike."""
+    """The fast projection and the reference both skip one float32 ulp below 1/255, and draw one ulp above."""
     scene = gaussians._opacities_at_the_cut()
     for index, visible in ((0, 0), (2, 1), (3, 1)):
         one = scene.subset(torch.tensor([index]))

@@ -1,4 +1,4 @@
-"""Hard cases of whole jobs: the smallest ones that have everything."""
+"""Hard cases of whole jobs: the smallest jobs that use all features."""
 
 from __future__ import annotations
 

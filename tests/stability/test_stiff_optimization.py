@@ -1,4 +1,4 @@
-"""Hard cases of the optimizer: gradients of all sizes, steps too large or too many, resuming."""
+"""Hard cases of the optimizer: gradients of all magnitudes, steps too large or too many, resuming."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.stability.hard_cases import check
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
 
 
-#: Of some ten seconds each.
+#: Cases that take about ten seconds each.
 LONG = ("100,000 steps", "total weights from 1e-6 to 1e2 in one scene")
 CASES = [
     pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.name in LONG else [])
@@ -27,7 +27,7 @@ def test_stays_within_its_bound(case: Case) -> None:
 
 
 def test_hardly_seen_gaussians_move_as_fast_as_well_seen_ones() -> None:
-    """Why their colors run away: Adam's steps know no size."""
+    """Adam's steps do not depend on the magnitude of the gradient, which is why such colors diverge."""
     stylizer = optimization._stylizer(
         optimization._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5)), 3, learning_rate=0.05, bounded=False
     )

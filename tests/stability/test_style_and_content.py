@@ -1,4 +1,4 @@
-"""Hard cases of style and content: pictures without texture or with nothing else, channels without variance."""
+"""Hard cases of style and content: images without texture or with extreme values, and channels without variance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_stays_within_its_bound(case: Case) -> None:
 
 
 def test_the_one_pass_variance_fails_where_ours_does_not() -> None:
-    """Beside every bound that holds, what the usual formula gives: the case would not be hard otherwise."""
+    """Show that the case is hard: the usual one-pass formula gives NaN where ours stays within its bound."""
     result = pictures._ratio(4, False)
     assert result.passed
     lost = int(result.note.split("NaN in ")[1].split()[0])

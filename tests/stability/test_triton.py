@@ -1,7 +1,7 @@
-"""Hard cases through the kernels of GPUs: on a GPU where there is one, else in Triton's interpreter.
+"""Hard cases of the GPU kernels, run on a GPU if there is one, else in Triton's interpreter.
 
-The interpreter takes milliseconds for what a GPU does in microseconds, so that what thousands of Gaussians show is
-shown by hundreds here, and by all of them where `sgsst bench stability` runs on a GPU.
+The interpreter takes milliseconds where a GPU takes microseconds. Cases of thousands of Gaussians are therefore reduced
+to hundreds here; `sgsst bench stability` runs them in full size on a GPU.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from tests.stability.hard_cases import check
 pytest.importorskip("triton")
 pytestmark = [
     pytest.mark.usefixtures("one_thread"),
-    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # the interpreter's: what is not finite is the case itself
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # the cases contain non-finite values
     *([pytest.mark.gpu] if torch.cuda.is_available() else []),
 ]
-#: Below, in a smaller size; files are read before any rasterizer is chosen.
+#: Parts of the names of cases that run in a smaller size below, or that test file readers rather than rasterizers.
 SMALLER = ("5000", "thousands", "needles", "4096 x 16", "in the file")
 
 
 def rendered_cases() -> list[Case]:
-    """Those that compare rasterizers, but for the large ones."""
+    """Return the cases that compare rasterizers, except the large ones."""
     found = [
         case
         for module in (gaussians, views)
@@ -44,7 +44,7 @@ def rendered_cases() -> list[Case]:
 
 
 def needles() -> Scene:
-    """At every angle of the view, each a million times longer than wide."""
+    """Return Gaussians at 36 angles in the view, each a million times longer than wide."""
     half = torch.arange(36) * math.pi / 36 / 2
     quats = torch.stack([half.cos(), 0.05 * (3 * half).sin(), torch.zeros(36), half.sin()], dim=1)
     scales = torch.tensor([1e3, 1e-3, 1e-3]).log().repeat(36, 1)
@@ -52,7 +52,7 @@ def needles() -> Scene:
 
 
 def around_the_camera() -> Scene:
-    """The camera is inside every one of them; centers just behind the near plane and farther away."""
+    """Return Gaussians that contain the camera, with centers just behind the near plane and farther away."""
     means = torch.tensor([[0.0, 0.0, 0.21], [0.5, -0.5, 0.3], [-3.0, 2.0, 1.0], [0.0, 1.0, 2.0]])
     sizes = torch.tensor([0.5, 3.0, 30.0, 1e4]).log()
     return replace(repeated(4, logit=-1.0), means=means, scales=sizes[:, None].repeat(1, 3))

@@ -1,4 +1,4 @@
-"""Hard cases of the views: sizes, fields of view, nothing to see, and more to see than fits."""
+"""Hard cases of views: sizes, fields of view, empty views, and views with too many intersections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A job from files to files on one rank: what it goes on from, and what it does where the disk is full."""
+"""Tests of jobs on one rank, from input files to output files, including resuming and a full disk."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 def go_on(
     job: Job, steps: int | None = None, checkpoint_seconds: float = 60.0, warnings: list[str] | None = None
 ) -> Result:
-    """Run a job; with `steps`, ask it to stop after so many."""
+    """Run a job, or with `steps` interrupt it after that many steps."""
     made = 0
 
     def count(progress: object) -> None:
@@ -77,7 +77,7 @@ def test_planning_is_shown_and_a_resumed_job_follows_the_plan_of_the_first(
 
 
 def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: StylizeRequest) -> None:
-    """As if the first attempt had run on a GPU that is not there any more."""
+    """The checkpoint is that of a job on a GPU that no longer exists."""
     first = prepare(request_)
     go_on(first, steps=3)
     kept = load_checkpoint(first.outputs.checkpoint, first.fingerprint)
@@ -153,14 +153,14 @@ def test_a_damaged_checkpoint_costs_what_came_after_the_one_before(request_: Sty
     warnings: list[str] = []
     again = prepare(request_, resume=Resume(True), warn=warnings.append)
     assert again.resumed is not None
-    # The last one was written when the job was asked to stop, the one before after the same step.
+    # Both checkpoints are of step 4: the last one was written when the job was interrupted.
     assert again.resumed.state.step == 4
     assert len(warnings) == 1
     assert "not a readable checkpoint" in warnings[0]
 
 
 def test_a_rasterizer_that_does_not_work_here_is_planned_anew(request_: StylizeRequest) -> None:
-    """The checkpoint of a machine with another GPU, or with a compiler."""
+    """The checkpoint is that of a machine with another GPU, or with a compiler."""
     if drawing_problem("cuda") is None:
         pytest.skip("it works")
     job = prepare(request_)
@@ -191,7 +191,7 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
 ) -> None:
     from sgsst_core.stylizing import checkpoint
 
-    monkeypatch.setattr(checkpoint, "_write", checkpoint._write)  # put back what the fault leaves
+    monkeypatch.setattr(checkpoint, "_write", checkpoint._write)  # undone after the test, unlike the fault's own change
     fault = Fault(0, "checkpoint", 2, "full")
     fault.write(request_)
     fault.arm(request_)
@@ -209,7 +209,7 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
 
 
 def with_scene(request: StylizeRequest, scene: Scene, **options: object) -> StylizeRequest:
-    """The same job of another scene, with its colors alone as well."""
+    """Return the same job with another scene and a file of its colors alone."""
     write_scene(request.source.scene, scene)
     return replace(request, source=request.source.model_copy(update=options), colors=True)
 

@@ -1,4 +1,4 @@
-"""Regions as users ask for them."""
+"""Tests of region options on the command line and in JSON."""
 
 from __future__ import annotations
 

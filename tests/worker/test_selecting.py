@@ -1,4 +1,4 @@
-"""Regions of a scene that has been read."""
+"""Tests of regions of a loaded scene."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def file(tmp_path: Path) -> SceneFile:
 
 
 def with_property(path: Path, values: np.ndarray, *, text: bool = False, order: str = "<") -> None:
-    """The PLY with one more property, `extra`."""
+    """Add a property `extra` to a PLY."""
     rows = PlyData.read(path)["vertex"].data
     kinds = [*rows.dtype.descr, ("extra", values.dtype.newbyteorder("=").str)]
     more = np.empty(len(rows), kinds)
@@ -128,7 +128,7 @@ def test_masks_that_cannot_be_used(tmp_path: Path, file: SceneFile, array: Any, 
 
 
 def test_masks_of_some_views(tmp_path: Path) -> None:
-    """White where the scene's right half is drawn: the views' names find them, one view needs none."""
+    """The masks are white where the right half of the scene is drawn. One of the views has no mask."""
     scene: Scene = wall()
     file = read_scene(write_files(tmp_path, scene)[0])
     views, folder = cameras(), tmp_path / "masks"

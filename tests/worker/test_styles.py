@@ -1,4 +1,4 @@
-"""Style pictures as users name them."""
+"""Tests of style options."""
 
 from pathlib import Path
 

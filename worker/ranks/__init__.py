@@ -1,10 +1,10 @@
-"""A job on several ranks, whatever becomes of them.
+"""Fault-tolerant execution of one job on several ranks, which Ray starts as processes.
 
-The driver: `attempts` starts sets of ranks until the job has ended, and `failure_policy` decides what to do when one
-was lost. It goes through `cluster` (Ray, started or joined), `placement` (by `host_memory`), `starting`, `polling`,
-`listener` (who is told) and `ending`; `rank_group` is what it knows of the present set. `sweeper` cleans up after a
-killed driver or rank.
+The driver starts sets of ranks until the job has ended (`attempts`), and decides what to do when a rank is lost
+(`failure_policy`). It opens Ray (`cluster`), reserves resources (`placement`, `host_memory`), starts, polls and ends
+ranks (`starting`, `polling`, `ending`) and reports events (`listener`). `rank_group` holds the state of the current
+set. `sweeper` cleans up after a killed driver or rank.
 
-A rank: `rank` is its process, `process_group` what carries tensors between ranks, `geometry` the scene that the ranks
-of a machine share.
+`rank` is the process of a rank, `process_group` exchanges tensors between ranks, `messages` encodes other values, and
+`geometry` shares the scene between the ranks of a machine.
 """

@@ -1,7 +1,7 @@
-"""One job on several ranks, whatever becomes of them: start them, watch them, and go on from the last checkpoint.
+"""Driver of a job on several ranks: start the ranks, watch them, and resume from the last checkpoint after a failure.
 
-An attempt is one set of ranks. When one of them dies, hangs or is killed for memory, all the others are ended, and
-the next attempt goes on with as many as there is room for, where `failure_policy` says so.
+An attempt is one set of ranks. When one of them dies, hangs or is killed for lack of memory, all others are ended. If
+`failure_policy` allows it, the next attempt resumes the job with as many ranks as the cluster has resources for.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
     from worker.request import Resume, StylizeRequest
     from worker.workplace import Workplace
 
-#: Seconds that a stopping job has to finish its step and to save it.
+#: Seconds that an interrupted job has to finish its step and save a checkpoint.
 STOP_SECONDS = 10.0
-#: Seconds that the other ranks have to end, once the first one has.
+#: Seconds that the other ranks have to end after rank 0 is done.
 _LAST_WORDS = 5.0
 
 
 @dataclass(frozen=True)
 class WorkerOptions:
-    """How ranks are watched.
+    """Options of running and watching ranks.
 
     Attributes:
-        rank_timeout: seconds without an answer after which a rank counts as lost.
-        checkpoint_seconds: between checkpoints.
-        preview_folder: of pictures of the running job, as rank 0's machine sees it; None for none.
-        preview_seconds: between two pictures, at least.
-        actor: what runs a rank.
-        resume_required: whether a checkpoint that a request asks for, and that cannot be used, is an error.
-        workplace: of ranks on machines that share no folder; None for this process's working folder.
+        rank_timeout: Seconds without an answer after which a rank counts as lost.
+        checkpoint_seconds: Seconds between checkpoints.
+        preview_folder: Folder of preview images on rank 0's machine; None writes no previews.
+        preview_seconds: Minimum seconds between two previews.
+        actor: Class of the Ray actor that runs a rank.
+        resume_required: Whether it is an error if the job is to be resumed but no checkpoint can be used.
+        workplace: Workplace for ranks on machines without a shared folder; None for this process's working folder.
     """
 
     rank_timeout: float = RunOptions().rank_timeout
@@ -61,17 +61,16 @@ class WorkerOptions:
 
 @dataclass
 class LostAttempt:
-    """A set of ranks that was lost.
+    """Lost attempt, as the report lists it.
 
     Attributes:
-        ranks: how many there were.
-        first_step: at which they began; None where they never did.
-        last_step: that they made.
-        saved_step: of the checkpoint that the next attempt goes on from.
-        reason: why they were lost.
-        seconds_lost: from the last checkpoint before the loss (or the attempt's beginning) to the next attempt's first
-            step.
-        seconds_to_resume: the part of it from the loss on.
+        ranks: Number of ranks.
+        first_step: Step at which the attempt started; None if it failed before.
+        last_step: Last completed step.
+        saved_step: Step of the checkpoint that the next attempt resumes from.
+        reason: Reason of the loss.
+        seconds_lost: Seconds from the last checkpoint (or the start of the job) to the first step of the next attempt.
+        seconds_to_resume: Seconds from the loss to the first step of the next attempt.
     """
 
     ranks: int
@@ -85,13 +84,13 @@ class LostAttempt:
 
 @dataclass(frozen=True)
 class RanksResult:
-    """How a job on several ranks ended.
+    """Result of a job on several ranks.
 
     Attributes:
-        result: as on one rank; None where the job was interrupted and did not end its step in time.
-        step, total: the last one made, and of all; 0 where the first was never made.
-        saved: step of the last checkpoint; None where there is none.
-        attempts: that were lost on the way.
+        result: Result of the job; None if it was interrupted and did not finish its step in time.
+        step, total: Last completed step and number of all steps; both are 0 if the job was never prepared.
+        saved: Step of the last checkpoint; None if there is none.
+        attempts: Attempts that were lost.
     """
 
     result: Result | None
@@ -102,7 +101,7 @@ class RanksResult:
 
     @property
     def interrupted(self) -> bool:
-        """Whether it is unfinished."""
+        """Return whether the job is unfinished."""
         return self.result is None or self.result.stopped == "interrupted"
 
 
@@ -114,14 +113,18 @@ def stylize_on_ranks(
     options: WorkerOptions | None = None,
     cluster: Cluster | None = None,
 ) -> RanksResult:
-    """Run one job on up to `workers` ranks, as often as it takes.
+    """Run one job on up to `workers` ranks, in as many attempts as necessary.
 
     Args:
-        cluster: an open one, which stays open; None opens one for this job, which takes the main thread.
+        request: Job to run.
+        workers: Maximum number of ranks.
+        listener: Callbacks for the events of the job; None for none.
+        options: Options of running and watching ranks; None for the defaults.
+        cluster: Open cluster, which stays open. None opens one for this job, which requires the main thread.
 
     Raises:
-        SgsstError: of the job itself, as one rank would raise it.
-        RanksFailedError: the ranks were lost again and again, or failed for a reason that is no error of the job.
+        SgsstError: If the job itself fails, as it would on one rank.
+        RanksFailedError: If ranks are lost too often, or fail for a reason that is not an error of the job.
     """
     if cluster is None:
         with Cluster(workers) as own:
@@ -130,7 +133,7 @@ def stylize_on_ranks(
 
 
 class _Attempts:
-    """All attempts at one job."""
+    """Sequence of attempts at one job."""
 
     def __init__(
         self, request: StylizeRequest, workers: int, listener: Listener, options: WorkerOptions, cluster: Cluster
@@ -143,15 +146,15 @@ class _Attempts:
         self._lost: list[LostAttempt] = []
         self._relay = Relay(listener, self._tell_resumed)
         self._group = RankGroup(self._leave_out)
-        self._let_go = False  # of GPUs that Ray still takes for its own
+        self._let_go = False  # whether GPUs were released that this Ray still counts as its own
         self._lost_at = time.monotonic()
 
     def run(self) -> RanksResult:
-        """Attempt after attempt, until the job has ended.
+        """Start attempts until the job has ended.
 
         Raises:
-            Exception: that the policy says to raise.
-            RanksFailedError: nothing is gained by another attempt.
+            Exception: If the failure policy raises a rank's error.
+            RanksFailedError: If the failure policy gives up.
         """
         while True:
             before = self._relay.farthest
@@ -182,10 +185,10 @@ class _Attempts:
     # --- one attempt -----------------------------------------------------------------------------------------------
 
     def _attempt(self) -> Result | None:
-        """Start ranks and watch them to their end; None where they had to be stopped by force.
+        """Start ranks and watch them until they end. Return None if they had to be killed after an interruption.
 
         Raises:
-            AttemptFailedError: it ended before the job.
+            AttemptFailedError: If the attempt ends before the job.
         """
         import ray
 
@@ -246,7 +249,7 @@ class _Attempts:
         )
 
     def _scene_bytes(self) -> int:
-        """Of the scene once it is read and refined; 0 where nothing is known of it before ranks look."""
+        """Return the estimated bytes of the refined scene in memory; 0 if its file is not visible from here."""
         workplace, scene = self._options.workplace, self._request.source.scene
         try:
             size = workplace.scene_bytes if workplace else scene_bytes(scene.name, scene.stat().st_size)
@@ -255,7 +258,7 @@ class _Attempts:
         return int(size * self._request.settings.refine)
 
     def _resume(self) -> Resume:
-        """The first attempt does what the user asked for; later ones go on from what this job has saved."""
+        """Return the checkpoint to resume from: the user's choice for the first attempt, then the job's own."""
         from worker.request import Resume
 
         if not self._lost:
@@ -263,12 +266,12 @@ class _Attempts:
         return Resume(True, required=False, run=None if self._request.resume else self._run_id)
 
     def _workplace(self) -> Workplace | None:
-        """Of the next ranks: they go on from what those before have stored."""
+        """Return the workplace of the next attempt, with the files that earlier attempts have stored."""
         workplace = self._options.workplace
         return workplace and workplace.after(self._relay.stored)
 
     def _leave_out(self, rank: RankHandle) -> None:
-        """End a rank that the plan does without, and let go of its GPU."""
+        """End a rank that the plan does not use, and release its GPU."""
         end_rank(rank)
         assert rank.place is not None
         if not rank.place.gpus:
@@ -276,13 +279,13 @@ class _Attempts:
         others = [other for other in self._group.handles if other.place and not other.left_out]
         kept = [gpu for other in others if other.place for gpu in other.place.gpus]
         self._workers = len(kept)
-        if self._cluster.local:  # the GPU may be another process's from now on, and this Ray would give it out again
+        if self._cluster.local:  # another process may use the GPU from now on, but this Ray would assign it again
             self._let_go = True
             os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(kept)
         self._listener.left_out(rank.place.gpus)
 
     def _tell_resumed(self) -> None:
-        """Tell of the first step after a loss, and what the loss has cost."""
+        """Report the first step after a loss, and record how long the recovery took."""
         if not self._lost or self._lost[-1].seconds_to_resume:
             return
         now = time.monotonic()

@@ -1,7 +1,7 @@
-"""Ray for the time of some jobs: one of its own on this machine, or a cluster that is there already.
+"""Context manager that starts a local Ray instance or joins an existing Ray cluster.
 
-A Ray of its own listens on loopback, requires a secret token, and leaves nothing behind: neither when it is closed nor
-when the process that started it is killed.
+A local instance listens on loopback and requires a secret token. Its processes and files are removed when it is
+closed, and also when the process that started it is killed.
 """
 
 from __future__ import annotations
@@ -22,25 +22,26 @@ from sgsst_core.errors import ClusterAwayError, RanksFailedError
 from worker.ranks import sweeper
 from worker.ranks.failure_policy import first_line
 
-#: Of Ray's object store: tensors travel through torch.distributed and scenes through files, so that next to nothing
-#: lies there. Ray would take 30 % of all memory.
+#: Size of Ray's object store in bytes. The default is 30 % of all memory, but the store holds almost nothing here:
+#: torch.distributed exchanges tensors, and scenes are read from files.
 OBJECT_STORE_BYTES = 512 << 20
-#: The longest folder for which the names of Ray's sockets fit what the system allows (107 bytes).
+#: Maximum length of the folder's path, so that the paths of Ray's sockets stay within the system's limit of 107 bytes.
 _LONGEST_FOLDER = 40
-#: Of every Ray that this process starts: Ray reads it once.
+#: Token of every Ray instance that this process starts. Ray reads the token only once.
 _SECRET = secrets.token_hex(32)
-#: Processes without which a Ray of one machine cannot go on.
+#: Processes that a local Ray instance cannot lose.
 _DAEMONS = ("raylet", "gcs_server")
 
 
 class Cluster:
-    """Ray, started or joined; a context manager that closes it.
+    """Ray instance or cluster, as a context manager.
 
-    Ray ends with the thread that started it, so `open` belongs on the main thread of a process that lives on.
+    Ray ends with the thread that started it, so `open` must be called on the main thread.
 
     Args:
-        workers: most ranks that will be asked for at once.
-        address: of a cluster; None for the environment's RAY_ADDRESS, and where there is none, a Ray of this machine.
+        workers: Maximum number of ranks that run at once.
+        address: Address of a Ray cluster; None for the environment variable RAY_ADDRESS. If neither is given, a local
+            instance is started.
     """
 
     def __init__(self, workers: int, address: str | None = None) -> None:
@@ -52,7 +53,7 @@ class Cluster:
 
     @property
     def local(self) -> bool:
-        """Whether it is this machine's own."""
+        """Return whether this is a local instance rather than a cluster."""
         return self.address is None
 
     def __enter__(self) -> Cluster:
@@ -65,10 +66,11 @@ class Cluster:
         self.close()
 
     def open(self) -> None:
-        """Start or join it.
+        """Start the local instance or join the cluster.
 
         Raises:
-            RanksFailedError: it cannot be started, or reached (ClusterAwayError).
+            RanksFailedError: If the local instance cannot be started.
+            ClusterAwayError: If the cluster cannot be joined.
         """
         if threading.current_thread() is not threading.main_thread():
             raise RuntimeError("Ray must be started on the main thread: it ends with the thread that started it")
@@ -79,7 +81,7 @@ class Cluster:
             else:
                 self._join()
         finally:
-            for number, handler in before.items():  # Ray puts handlers of its own in their place
+            for number, handler in before.items():  # Ray replaces the signal handlers
                 signal.signal(number, handler)
 
     def _join(self) -> None:
@@ -88,7 +90,7 @@ class Cluster:
         _silence_ray()
         try:
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
-        except Exception as error:  # Ray has many for this, some of them plain ones
+        except Exception as error:  # Ray raises many types here, some of them built-in ones
             raise ClusterAwayError(
                 f"The Ray cluster at {self.address} cannot be joined: {first_line(error)}. Check RAY_ADDRESS, or "
                 "leave it out for workers on this machine."
@@ -101,7 +103,7 @@ class Cluster:
         # machines can reach. Ray reads the variable when it is imported.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_worker_niceness", "0")  # ranks are the work itself, not something beside it
+        os.environ.setdefault("RAY_worker_niceness", "0")  # ranks are not background work
         import ray
 
         _silence_ray()
@@ -133,11 +135,11 @@ class Cluster:
         self._daemons = [process for process in started if process.name() in _DAEMONS]
 
     def alive(self) -> bool:
-        """Whether Ray's own processes on this machine run; of a cluster that was joined, nothing is known."""
+        """Return whether the daemons of a local instance run. Always True for a cluster, whose state is unknown."""
         return all(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in self._daemons)
 
     def close(self) -> None:
-        """Leave it; where it is this machine's own, end it with everything that runs in it."""
+        """Disconnect from Ray; end a local instance and all its processes."""
         import ray
 
         ray.shutdown()
@@ -151,10 +153,10 @@ class Cluster:
 
 
 def _silence_ray() -> None:
-    """Keep Ray from printing what becomes of its processes: what matters is told in this program's words.
+    """Keep Ray from printing errors of its processes, since this program reports them itself.
 
-    `log_to_driver=False` silences the workers, but not Ray's own errors, which go to standard output by way of this
-    function.
+    `log_to_driver=False` silences the workers, but not Ray's own errors. Ray prints those with the function that is
+    replaced here.
     """
     import ray._private.worker as worker
 

@@ -1,4 +1,4 @@
-"""Ending ranks, whatever state they are in: a stopped process does not listen to Ray."""
+"""Termination of ranks in any state: Ray alone cannot end a suspended process."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from worker.ranks.rank import RankPlace
 from worker.ranks.rank_group import RankGroup, RankHandle
 from worker.workplace import Workplace
 
-#: Seconds for processes on other machines to end.
+#: Seconds to wait for processes on other machines to end.
 _REMOTE_SECONDS = 5.0
 
 
 def end_ranks(group: RankGroup, cluster: Cluster, workplace: Workplace | None = None) -> None:
-    """End every rank of an attempt, and give its place back; what they leave in a workplace is removed."""
+    """End all ranks of an attempt, release their resources, and delete the folders that they leave in a workplace."""
     kill([rank.place.process for rank in group.handles if rank.place and rank.place.process.home == home()])
     if cluster.alive():
-        # What cannot be reached any more cannot be ended either, and its own node's daemon does it.
+        # A rank that cannot be reached cannot be ended from here; the daemon of its node ends it.
         with contextlib.suppress(Exception):
             _end_remote(group, workplace)
     if workplace is not None:
@@ -29,7 +29,7 @@ def end_ranks(group: RankGroup, cluster: Cluster, workplace: Workplace | None = 
 
 
 def end_rank(rank: RankHandle) -> None:
-    """End one rank, wherever it is, and wait until what it held of a GPU is free; its place is given back to Ray."""
+    """End one rank on any machine, wait until its GPU memory is free, and return its resources to Ray."""
     import ray
 
     assert rank.place is not None
@@ -55,7 +55,7 @@ def _end_remote(group: RankGroup, workplace: Workplace | None) -> None:
 
 
 def _kill_on(place: RankPlace) -> Any:
-    """A Ray task that ends processes on a rank's node."""
+    """Return a Ray task that ends processes on the node of a rank."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 

@@ -1,8 +1,8 @@
-"""What to do when an attempt at a job has failed: a pure function of what has happened so far.
+"""Policy after a failed attempt: start another one, raise an error, or give up.
 
-Errors of the job itself would come again, and are raised at once. Whatever else ends an attempt is tried again, as long
-as attempts come further: an error that comes twice at the same step is raised, and too many attempts in vain are given
-up.
+An error of the job itself would occur again, so it is raised at once. After any other failure the job is tried again,
+as long as attempts make progress. An error that occurs twice at the same step is raised, and the policy gives up after
+several attempts in a row without progress.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from typing import Literal
 
 from sgsst_core.errors import RanksDriftedError, SgsstError
 
-#: Attempts in a row that come no further than those before them.
+#: Maximum number of attempts in a row without progress.
 MOST_ATTEMPTS = 3
 
 
 @dataclass(frozen=True)
 class Failure:
-    """What ended an attempt.
+    """Cause of a failed attempt.
 
     Attributes:
-        kind: "job" for an error of the job itself; "loss" for ranks that died, fell silent or failed for a reason of
-            their own.
-        reason: in a few words, without full stop.
-        error: that a rank raised; None where it had no time for one.
+        kind: "job" for an error of the job itself; "loss" for ranks that died, stopped answering or failed for another
+            reason.
+        reason: Short description without a full stop.
+        error: Error that a rank raised; None if it died before it raised.
     """
 
     kind: Literal["job", "loss"]
@@ -35,12 +35,12 @@ class Failure:
 
 @dataclass(frozen=True)
 class FailedAttempt:
-    """An attempt that has failed.
+    """Outcome of a failed attempt, for `decide`.
 
     Attributes:
-        failure: that ended it.
-        last_step: that it made, or went on from.
-        progressed: whether it made a step, or saved a checkpoint, beyond those of all attempts before.
+        failure: Cause of the failure.
+        last_step: Last completed step, or the step that the attempt started from.
+        progressed: Whether it completed a step or saved a checkpoint beyond those of all earlier attempts.
     """
 
     failure: Failure
@@ -50,21 +50,21 @@ class FailedAttempt:
 
 @dataclass(frozen=True)
 class TryAgain:
-    """Start another attempt; `sentence` tells what has happened."""
+    """Decision to start another attempt; `sentence` describes the failure."""
 
     sentence: str
 
 
 @dataclass(frozen=True)
 class RaiseError:
-    """End the job with an error as a rank raised it."""
+    """Decision to end the job with the error that a rank raised."""
 
     error: Exception
 
 
 @dataclass(frozen=True)
 class GiveUp:
-    """End the job, because nothing is gained by another attempt; `sentence` tells why."""
+    """Decision to end the job because another attempt is unlikely to help; `sentence` states the reason."""
 
     sentence: str
 
@@ -73,10 +73,11 @@ Decision = TryAgain | RaiseError | GiveUp
 
 
 def failure_of(error: Exception, rank: str) -> Failure:
-    """What an error that a rank raised means for the attempt.
+    """Classify an error that a rank raised.
 
     Args:
-        rank: its name, for the reason.
+        error: Error of the rank.
+        rank: Name of the rank, for the reason.
     """
     if isinstance(error, SgsstError) and not isinstance(error, RanksDriftedError):
         return Failure("job", str(error), error)
@@ -84,10 +85,10 @@ def failure_of(error: Exception, rank: str) -> Failure:
 
 
 def decide(attempts: Sequence[FailedAttempt]) -> Decision:
-    """What to do after the last of these attempts.
+    """Decide how to continue after the last of these attempts.
 
     Args:
-        attempts: all of the job, in their order; at least one.
+        attempts: All failed attempts of the job in order; at least one.
     """
     last = attempts[-1]
     failure = last.failure
@@ -107,13 +108,13 @@ def decide(attempts: Sequence[FailedAttempt]) -> Decision:
 
 
 def _came_again(attempts: Sequence[FailedAttempt]) -> bool:
-    """Whether the last two attempts ended at the same step for the same reason."""
+    """Return whether the last two attempts ended at the same step for the same reason."""
     ends = [(attempt.failure.reason, attempt.last_step) for attempt in attempts[-2:]]
     return len(ends) == 2 and ends[0] == ends[1]
 
 
 def _in_vain(attempts: Sequence[FailedAttempt]) -> int:
-    """Attempts without progress since the last one that made some."""
+    """Count the attempts since the last one that made progress."""
     count = 0
     for attempt in reversed(attempts):
         if attempt.progressed:
@@ -123,6 +124,6 @@ def _in_vain(attempts: Sequence[FailedAttempt]) -> int:
 
 
 def first_line(error: BaseException) -> str:
-    """An error in a few words, without full stop."""
+    """Return the first line of an error's message without its full stop, or the error's type if it has no message."""
     lines = str(error).strip().splitlines()
     return lines[0].rstrip(".") if lines else type(error).__name__

@@ -1,10 +1,11 @@
-"""The scene on every rank, read once on each machine.
+"""Shared scene: read once on each machine, and mapped by all ranks there.
 
-The lowest rank of a machine reads the PLY and lays the arrays into memory that has no name: a memory file, which the
-machine's other ranks open through the reader's process and map. Nobody can leave it behind, because the system frees it
-with the last process that uses it. Pages are mapped copy-on-write, so that ranks share them, and no rank can change
-what another one sees. Spherical harmonics of a large scene stay in its file, which each rank opens: the system keeps
-what is read of it once for all of them.
+The lowest rank of a machine reads the scene and copies its arrays to an anonymous memory file (memfd). The other ranks
+open that file through the /proc entry of the reader and map it copy-on-write: ranks share the pages, but cannot change
+each other's data. The system frees the memory with the last process that uses it, so nothing can leak.
+
+The spherical harmonics of a large scene stay in its file, which every rank opens. The system's page cache holds them
+once for all ranks.
 """
 
 from __future__ import annotations
@@ -30,42 +31,45 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from worker.processes import home
 
-#: Bytes that a rank needs for each Gaussian beside the scene and the optimizer: its place in a view (center, conic,
-#: depth, extent, sorting keys), its color there, and both colors' gradients.
+#: Bytes per Gaussian that a rank needs beside the scene and the optimizer: projection to a view (center, conic, depth,
+#: extent, sorting keys), color in the view, and gradients of both colors.
 VIEW_BYTES = 96
-#: Array starts are multiples of this, so that every type finds its alignment.
+#: Arrays start at multiples of this many bytes, so that every dtype is aligned.
 _ALIGNMENT = 64
 
-_Layout = dict[str, tuple[int, tuple[int, ...], str]]  # by name: offset, shape, numpy type
+_Layout = dict[str, tuple[int, tuple[int, ...], str]]  # offset, shape and numpy dtype by name
 
 
 @dataclass(frozen=True)
 class _Shared:
-    """Where the other ranks of a machine find the scene: a memory file of a process, and what lies where in it."""
+    """Location of a shared scene: the memory file of a process, and the layout of its arrays."""
 
     process: int
     descriptor: int
     size: int
     layout: _Layout
     file: SceneFile  # without its arrays
-    harmonics: tuple[Any, ...] | None  # arguments of those that stay in the file: other machines must not open it
+    harmonics: tuple[Any, ...] | None  # arguments of StoredHarmonics, since other machines must not open the file
 
 
 def read_shared_scene(
     path: Path, collectives: Collectives, *, drop_invalid: bool = False, growth: float = 1.0
 ) -> tuple[SceneFile, bool]:
-    """Read a scene once on each machine. Every rank calls this.
+    """Read a scene once on each machine. Every rank must call this function.
 
     Args:
-        growth: by which the number of its Gaussians may yet grow: room is wanted for all, and no more of their
-            spherical harmonics than of others' are held.
+        path: Scene file.
+        collectives: Collectives of all ranks.
+        drop_invalid: Whether to drop invalid Gaussians; see `read_scene`.
+        growth: Factor by which refinement may increase the number of Gaussians. It scales the memory requirement, and
+            lowers the size up to which spherical harmonics are loaded into memory.
 
     Returns:
-        The scene, and whether this rank has read it itself: on every machine one does.
+        The scene, and whether this rank read it itself. One rank of each machine does.
 
     Raises:
-        SceneError: see `read_scene`; the same on every rank.
-        SceneTooLargeError: the memory of a rank's machine or GPU cannot hold it.
+        SceneError: If the scene cannot be read; see `read_scene`. Every rank raises the same error.
+        SceneTooLargeError: If the scene does not fit into the memory of a rank's machine or GPU.
     """
     homes = collectives.all_gather(home())
     reader = homes.index(home())
@@ -91,9 +95,9 @@ def read_shared_scene(
             assert offer is not None
             try:
                 own = _mapped(offer, f"/proc/{offer.process}/fd/{offer.descriptor}")
-            except OSError:  # systems that hide even a user's own processes
+            except OSError:  # some systems hide even the user's own processes in /proc
                 own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth))
-        collectives.all_gather(None)  # the reader may close its memory file when everybody has opened it
+        collectives.all_gather(None)  # barrier: the reader closes its memory file after all ranks have opened it
     finally:
         if shared is not None:
             os.close(shared.descriptor)
@@ -101,12 +105,12 @@ def read_shared_scene(
 
 
 def _held_bytes(growth: float) -> int | None:
-    """Spherical harmonics that are held of a scene that may grow; None for as many as of others."""
+    """Return the maximum bytes of spherical harmonics in memory for a scene that may grow; None for the default."""
     return None if growth == 1 else int(HELD_BYTES / growth)
 
 
 def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
-    """Lay a scene into a memory file; returns the scene as it lies there, and where that is."""
+    """Copy a scene to a memory file; return the scene mapped from there, and its location."""
     stored = file.scene.sh_rest if isinstance(file.scene.sh_rest, StoredHarmonics) else None
     tensors = {name.name: getattr(file.scene, name.name) for name in fields(Scene)}
     arrays: dict[str, NDArray[Any]] = {name: value.numpy() for name, value in tensors.items() if value is not stored}
@@ -130,7 +134,7 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
 
 
 def _mapped(shared: _Shared, path: str) -> SceneFile:
-    """The scene in a memory file, mapped."""
+    """Map the scene of a memory file."""
     with Path(path).open("rb") as file:
         memory = mmap.mmap(file.fileno(), shared.size, access=mmap.ACCESS_COPY)
     arrays = {}
@@ -145,11 +149,13 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
 
 
 def _check_room(path: Path, collectives: Collectives, sharing: int, growth: float) -> None:
-    """Compare what the scene needs, by its header, with what each rank's machine and GPU have.
+    """Compare the memory that the scene needs, by its header, with the free memory of each rank's machine and GPU.
 
     Args:
-        sharing: ranks on this machine.
-        growth: see `read_shared_scene`.
+        path: Scene file.
+        collectives: Collectives of all ranks.
+        sharing: Number of ranks on this machine.
+        growth: Factor of growth; see `read_shared_scene`.
     """
     problem: SgsstError | None = None
     try:
@@ -162,9 +168,9 @@ def _check_room(path: Path, collectives: Collectives, sharing: int, growth: floa
 
 
 def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
-    """Gaussians that a file declares, and their bytes in memory and on a GPU; zeros for what `read_scene` will refuse.
+    """Return the number of Gaussians that a file declares, and their bytes in memory and on a GPU.
 
-    Memory does not hold what stays in the file.
+    Memory excludes spherical harmonics that stay in the file. All values are 0 for a file that `read_scene` refuses.
     """
     declared = read_scene_header(path)
     if declared.form != "ply":
@@ -173,7 +179,7 @@ def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
     header = declared.ply
     if header is None or "vertex" not in header.names:
         return 0, 0, 0
-    # A header may declare anything: no more than what the file can hold is believed.
+    # A header may declare any count, so it is limited by the size of the file.
     count = min(header.vertex.count, path.stat().st_size // max(header.vertex.least_row_bytes(header.text), 1))
     rest = sum(prop.name.startswith("f_rest_") for prop in header.vertex.properties)
     held = 0 if stays_in_file(header, _held_bytes(growth)) else rest
@@ -181,9 +187,9 @@ def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
 
 
 def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: int) -> SceneTooLargeError | None:
-    """What is missing on this rank; None where there is room."""
+    """Return the error if this rank lacks memory; None if the scene fits."""
     own = count * (OPTIMIZER_BYTES + VIEW_BYTES)
-    each = scene_bytes + own  # every rank has what the views show once for itself
+    each = scene_bytes + own  # every rank has its own copy of the Gaussians that its views show
     where = f"Rank {rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
     advice = "Give a machine with more memory, fewer --workers on each, or a smaller scene."
     needed, free = scene_bytes + sharing * each, available_memory()
@@ -204,7 +210,7 @@ def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: i
 
 
 def available_memory() -> int:
-    """Bytes of memory that this process may still take: of the machine, or of its control group where that has less."""
+    """Return the bytes of memory still available to this process: those of the machine or, if less, of its cgroup."""
     free = psutil.virtual_memory().available
     group = Path("/sys/fs/cgroup")
     try:
@@ -213,6 +219,6 @@ def available_memory() -> int:
             used = int((group / "memory.current").read_text())
             cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
             free = min(free, int(limit) - used + int(cached.get("inactive_file", 0)))
-    except OSError:  # no control groups of version 2, or none around this process
+    except OSError:  # no cgroup v2, or none for this process
         pass
     return int(free)

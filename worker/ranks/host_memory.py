@@ -1,29 +1,29 @@
-"""Memory of its machine that a job on GPUs takes beside these: an estimate, before anybody has read its scene."""
+"""Estimate of the host memory that a job on GPUs needs, before its scene is read."""
 
 from __future__ import annotations
 
-#: Bytes of a Gaussian as it is read: 62 float32, of SH degree 3.
+#: Bytes of a Gaussian of SH degree 3 in memory: 62 float32 values.
 GAUSSIAN_BYTES = 248
-#: The same in the other forms of scene files by their names' ending, the longest first: chunks of 16 bytes and SH in
-#: bytes; a .splat's 32; SPZ is zipped besides.
+#: Bytes of a Gaussian in the other file formats, by the ending of the file name: compressed PLY has 16 bytes and one
+#: byte per SH coefficient, .splat has 32 bytes, and SPZ is additionally compressed.
 _PACKED_BYTES = ((".compressed.ply", 61), (".splat", 32), (".spz", 25))
-#: What a rank takes beside the scene (CUDA's and PyTorch's libraries, pinned buffers), and how often the bytes of the
-#: scene: as it was read, and as it is laid out for all ranks of a machine.
+#: Bytes that a rank needs beside the scene: libraries of CUDA and PyTorch, and pinned buffers.
 _RANK_BYTES = 3_000_000_000
+#: Copies of the scene on a machine: the arrays that were read, and those that its ranks share.
 _SCENE_COPIES = 2
 
 
 def scene_bytes(name: str, size: int) -> int:
-    """Bytes of a scene once it is read, by its file.
+    """Estimate the bytes of a scene in memory from its file.
 
     Args:
-        name: of the file; its ending tells the form.
-        size: of the file, bytes.
+        name: Name of the file; its ending determines the format.
+        size: Size of the file in bytes.
     """
     packed = next((each for suffix, each in _PACKED_BYTES if name.lower().endswith(suffix)), None)
     return size if packed is None else size * GAUSSIAN_BYTES // packed
 
 
 def memory_beside_gpus(ranks: int, scene: int) -> int:
-    """Bytes that so many ranks on one machine take of it, with one scene of so many bytes."""
+    """Estimate the host memory in bytes of `ranks` ranks on one machine with a scene of `scene` bytes."""
     return ranks * _RANK_BYTES + _SCENE_COPIES * scene

@@ -1,4 +1,4 @@
-"""Who is told what happens to a job on ranks, and what rank 0 tells of it."""
+"""Callbacks of a job on ranks, and the relay that calls them with the news from rank 0."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Listener:
-    """Who is told what happens; everything is called on the thread of `stylize_on_ranks`.
+    """Callbacks of a distributed job. All are called on the thread of `stylize_on_ranks`.
 
     Attributes:
-        prepared: once, when the inputs have been read and planned with.
-        progress: after steps, the last of them, a few times a second.
-        happened: what became of ranks and attempts, in a sentence.
-        warn: what is worth knowing although the job goes on.
-        stop: asked a few times a second; True ends the job as "interrupted".
-        preview: path of each picture of the running job.
-        left_out: GPUs that the job has let go of, because the plan does without them, by their names on their machines.
-        stored: what a workplace told of each file that it has stored, in their order.
-        planning: how far the survey of the views has come, a few times a second; again where an attempt that was lost
-            had not saved its plan.
+        prepared: Called once, after the job has been prepared.
+        progress: Called with the progress of the latest step, a few times per second.
+        happened: Called with a sentence about each lost or resumed attempt.
+        warn: Called with each warning.
+        stop: Called a few times per second; returns True to interrupt the job.
+        preview: Called with the path of each preview.
+        left_out: Called with the GPUs that the job released because the plan does not use them, by their names in
+            CUDA_VISIBLE_DEVICES on their machine.
+        stored: Called with the workplace's description of each stored file, in order.
+        planning: Called with the progress of the survey of the views, a few times per second. A later attempt repeats
+            the survey if a lost one had not saved its plan.
     """
 
     prepared: Callable[[Prepared], None] = lambda prepared: None
@@ -45,20 +46,20 @@ class Listener:
 
 
 class Relay:
-    """Passes on to a listener what rank 0 tells, each thing once, and knows by it how far the job has come.
+    """Relay from rank 0 to a listener, which passes on each event once and tracks the progress of the job.
 
     Args:
-        listener: who is told.
-        resumed: called when the first step of an attempt has been made, before the listener is told.
+        listener: Callbacks of the job.
+        resumed: Callback after the first step of an attempt, before the listener is notified.
 
     Attributes:
-        step: the farthest of all attempts.
-        total: of all steps; 0 until an attempt was prepared.
-        saved: step of the last checkpoint; None where there is none.
-        first_step: at which the present attempt began; None until it was prepared.
-        last_step: that the present attempt has made, or went on from.
-        stored: what was told of all files that were stored, by any attempt.
-        safe_at: when nothing was last lost: the beginning, then each checkpoint; monotonic seconds.
+        step: Highest step of all attempts.
+        total: Number of all steps; 0 until an attempt is prepared.
+        saved: Step of the last checkpoint; None if there is none.
+        first_step: Step at which the current attempt started; None until it is prepared.
+        last_step: Last step of the current attempt, or the step that it resumed from.
+        stored: Descriptions of all stored files of all attempts.
+        safe_at: Time of the last checkpoint, or of the start of the job, in monotonic seconds.
     """
 
     def __init__(self, listener: Listener, resumed: Callable[[], None]) -> None:
@@ -68,23 +69,23 @@ class Relay:
         self.first_step: int | None = None
         self.safe_at = time.monotonic()
         self._prepared = False
-        self._planned = -1  # views that were last told of
+        self._planned = -1  # surveyed views at the last notification
         self._warned = self._previewed = self._told_stored = 0
         self.stored: list[Any] = []
 
     @property
     def farthest(self) -> tuple[int, int | None]:
-        """Step and checkpoint: what grows with progress."""
+        """Return the highest step and the step of the last checkpoint, which change with progress."""
         return self.step, self.saved
 
     def begin_attempt(self) -> None:
-        """Another set of ranks starts to tell."""
+        """Reset the state of the current attempt for a new set of ranks."""
         self.first_step, self.last_step = None, self.saved or 0
         self._warned = self._previewed = self._told_stored = 0
         self._planned = -1
 
     def pass_on(self, status: RankStatus) -> None:
-        """Tell what is new in rank 0's last answer."""
+        """Notify the listener of everything that is new in the last answer of rank 0."""
         for line in status.warnings[self._warned :]:
             self._listener.warn(line)
         self._warned = len(status.warnings)

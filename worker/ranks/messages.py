@@ -30,7 +30,7 @@ def encode(value: Any) -> Tensor:
     """Return a message as a tensor [n] uint8.
 
     Raises:
-        TypeError: The value holds something that a message cannot hold.
+        TypeError: If the value holds an object of an unsupported type.
     """
     tensors: dict[str, Tensor] = {}
     text = json.dumps(_to_json(value, tensors)).encode()
@@ -42,24 +42,24 @@ def decode(message: Tensor) -> Any:
     """Return the value of a message [n] uint8.
 
     Raises:
-        ValueError: The bytes are not a message.
+        ValueError: If the bytes are not a valid message.
     """
     try:
         tensors = load(message.numpy().tobytes())
         return _from_json(json.loads(tensors[_JSON].numpy().tobytes()), tensors)
-    except Exception as error:  # safetensors has an error of its own; a wrong type can fail anywhere
+    except Exception as error:  # safetensors raises its own type, and a value of a wrong type can fail anywhere
         raise ValueError(f"Another rank sent something that is not a message of this program: {error}") from error
 
 
 def _to_json(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """Return JSON; values other than plain ones and lists become objects with one member, named after their kind."""
+    """Convert a value to JSON. Scalars and lists stay as they are; others become objects with one key, their kind."""
 
     def each(values: Any) -> list[Any]:
         return [_to_json(item, tensors) for item in values]
 
     def add(tensor: Tensor) -> str:
         name = str(len(tensors))
-        tensors[name] = tensor.detach().cpu().clone(memory_format=torch.contiguous_format)  # shares no memory
+        tensors[name] = tensor.detach().cpu().clone(memory_format=torch.contiguous_format)  # must not share memory
         return name
 
     match value:
@@ -90,7 +90,7 @@ def _to_json(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def _from_json(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """Return the value of `_to_json`."""
+    """Convert JSON from `_to_json` back to a value."""
 
     def each(values: Any) -> list[Any]:
         return [_from_json(item, tensors) for item in values]
@@ -124,13 +124,13 @@ def _from_json(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def _object(name: str, members: dict[str, Any]) -> Any:
-    """Return an instance of a dataclass with these members, without a call of its constructor."""
+    """Return an instance of a dataclass with these members, without calling its constructor."""
     found = _class(name)
     if not is_dataclass(found) or members.keys() != {field.name for field in fields(found)}:
         raise ValueError(f"{name} is not a dataclass with the members {', '.join(members)}")
     made = object.__new__(found)
     for member, value in members.items():
-        object.__setattr__(made, member, value)  # frozen ones, too
+        object.__setattr__(made, member, value)  # works for frozen dataclasses, too
     return made
 
 

@@ -1,4 +1,4 @@
-"""Where ranks run: a place for each of them, reserved together, with its share of the machine."""
+"""Reservation of cores, GPUs and memory for the ranks of a job, as Ray placement groups."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import Any
 
 from worker.ranks.host_memory import memory_beside_gpus
 
-#: What Ray calls a machine by, in labels.
+#: Label of a Ray node that holds its ID.
 NODE_LABEL = "ray.io/node-id"
-#: Seconds to wait for places that are taken; what lost ranks held is free again after a moment.
+#: Seconds to wait for resources in use. Those of lost ranks are soon free again.
 PLACE_SECONDS = 5.0
 
 
 class NoRoomError(Exception):
-    """There is not a single place."""
+    """Error if the cluster has no free resources even for one rank."""
 
 
 @dataclass(frozen=True)
 class Reservation:
-    """Places for ranks, each of which can be given back alone.
+    """Resources for ranks; those of each rank can be released individually.
 
     Attributes:
-        groups: Ray's placement group of each rank.
-        threads: processor cores for each.
-        gpus: for each, 0 or 1.
+        groups: Ray placement group of each rank.
+        threads: Processor cores per rank.
+        gpus: GPUs per rank, 0 or 1.
     """
 
     groups: tuple[Any, ...]
@@ -33,7 +33,7 @@ class Reservation:
     gpus: int
 
     def actor_options(self) -> list[dict[str, Any]]:
-        """Options of each rank's actor: dies once, and for good."""
+        """Return the options of each rank's actor. Ray must not restart an actor that died."""
         from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
         return [
@@ -49,30 +49,30 @@ class Reservation:
         ]
 
     def release(self) -> None:
-        """Give all places back."""
+        """Release all resources."""
         for group in self.groups:
             give_back(group)
 
 
 def give_back(group: Any) -> None:
-    """Give one place back; one that was given back before is no error."""
+    """Release a placement group. Releasing it twice is not an error."""
     from ray.util import remove_placement_group
 
     remove_placement_group(group)
 
 
 def reserve(workers: int, scene: int = 0) -> Reservation:
-    """Places for as many of the ranks as there is room for now.
+    """Reserve resources for as many ranks as the cluster can run now.
 
-    GPUs, where the cluster has any, are given out one for each rank, on as few machines as possible, with the memory of
-    the machine that the rank takes; otherwise ranks are spread over the machines, and share the cores.
+    If the cluster has GPUs, every rank gets one, together with the host memory that it needs, on as few machines as
+    possible. Otherwise ranks are spread over the machines and share their cores.
 
     Args:
-        workers: ranks at most.
-        scene: bytes of the job's scene once it is read.
+        workers: Maximum number of ranks.
+        scene: Bytes of the job's scene in memory.
 
     Raises:
-        NoRoomError: for none.
+        NoRoomError: If there are no free resources even for one rank.
     """
     nodes = _nodes()
     gpus = sum(int(node.get("GPU", 0)) for node in nodes)
@@ -85,7 +85,7 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
         groups = _places(wanted, _bundle(nodes, wanted, threads, scene), deadline)
         if groups:
             return Reservation(groups, threads, 1 if gpus else 0)
-        if threads > 1 and not gpus:  # other work may hold a part of the cores
+        if threads > 1 and not gpus:  # other work may use some of the cores
             threads = 1
         else:
             wanted -= 1
@@ -93,7 +93,7 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
 
 
 def _told(bundle: dict[str, int]) -> str:
-    """What a place has, in words."""
+    """Describe the resources of a rank in words."""
     parts = [f"{bundle['CPU']} cores" if bundle["CPU"] > 1 else "a core"]
     parts += ["a GPU"] if "GPU" in bundle else []
     parts += [f"{bundle['memory'] / 1e9:.1f} GB of memory"] if "memory" in bundle else []
@@ -101,14 +101,14 @@ def _told(bundle: dict[str, int]) -> str:
 
 
 def _nodes() -> list[dict[str, float]]:
-    """The resources of every machine that is there."""
+    """Return the resources of every machine of the cluster."""
     import ray
 
     return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
 def _threads(cores: list[int], ranks: int) -> int:
-    """The most cores that each of so many ranks can have on these machines; at least one."""
+    """Return the largest number of cores that each of `ranks` ranks can have on these machines; at least one."""
     return max(
         (each for each in range(1, max(cores, default=1) + 1) if sum(count // each for count in cores) >= ranks),
         default=1,
@@ -116,23 +116,23 @@ def _threads(cores: list[int], ranks: int) -> int:
 
 
 def _bundle(nodes: list[dict[str, float]], ranks: int, threads: int, scene: int) -> dict[str, int]:
-    """What each of so many ranks asks Ray for."""
+    """Return the Ray resources of each of `ranks` ranks."""
     with_gpus = [node for node in nodes if node.get("GPU")]
     if not with_gpus:
         return {"CPU": threads}
-    sharing = min(ranks, max(int(node["GPU"]) for node in with_gpus))  # on few machines: they share the scene there
-    # A job for which no machine has enough may try on one that nobody else is on.
+    sharing = min(ranks, max(int(node["GPU"]) for node in with_gpus))  # ranks of a machine share the scene
+    # If a job needs more than any machine has, it gets all memory of the largest one and may still succeed there.
     most = max(int(node.get("memory", 0)) for node in with_gpus)
     memory = min(memory_beside_gpus(sharing, scene), most) // sharing
     return {"CPU": threads, "GPU": 1, **({"memory": memory} if memory else {})}
 
 
 def _places(ranks: int, bundle: dict[str, int], deadline: float) -> tuple[Any, ...]:
-    """A placement group for each rank, once all are there; empty where that takes too long.
+    """Return a placement group for each rank; empty if the resources are not free before the deadline.
 
-    Ray gives the bundles of a group back together only. So it is asked for all of them at once, which it puts where
-    they belong together, and then for each alone on the machine that was found. Fewer are there where others were
-    faster in between.
+    Ray can only release all bundles of a placement group together. Therefore one group for all ranks is created first,
+    to choose the machines, and is then replaced by one group per rank on the same machines. Other jobs may take
+    resources in between, so there may be fewer groups than ranks.
     """
     from ray.util import placement_group, placement_group_table
 

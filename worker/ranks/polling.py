@@ -1,4 +1,4 @@
-"""Watching the ranks of an attempt: ask each how it is, and find out which one is lost, and why."""
+"""Monitor of the ranks of an attempt: poll each rank, and find out which one is lost and why."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from worker.ranks.rank_group import AttemptFailedError, RankGroup, RankHandle
 
 #: Seconds between two polls of a rank.
 POLL_SECONDS = 0.25
-#: Seconds for an answer that Ray says is there.
+#: Seconds to wait for an answer that Ray reports as ready.
 _FETCH_SECONDS = 60.0
-#: Seconds for the reason to show, after a rank has lost its connection to another one.
+#: Seconds to wait for the cause to show after a rank has lost its connection to another rank.
 _GRACE = 3.0
 
 
 def poll_ranks(group: RankGroup) -> None:
-    """Ask every rank how it is, and take in what has been answered.
+    """Poll every rank, and store the answers that have arrived.
 
     Raises:
-        AttemptFailedError: a rank's process is gone.
+        AttemptFailedError: If the process of a rank has ended.
     """
     import ray
 
@@ -48,7 +48,7 @@ def _take_answer(group: RankGroup, rank: RankHandle, poll: Any) -> None:
         rank.answered_at = time.monotonic()
         if rank.left_out:
             group.on_left_out(rank)
-    except ray.exceptions.ActorUnavailableError:  # perhaps only for now: the time-out decides
+    except ray.exceptions.ActorUnavailableError:  # may be temporary: the timeout decides
         return
     except ray.exceptions.ActorDiedError as error:
         raise _lost(f"{group.name_of(rank)} was lost: {_reason_of_death(error)}") from error
@@ -57,13 +57,15 @@ def _take_answer(group: RankGroup, rank: RankHandle, poll: Any) -> None:
 
 
 def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> None:
-    """Raise what ended a rank: the error of the job itself, or the loss behind it.
+    """Raise an error if a rank has failed or was lost, with the original cause.
 
     Args:
-        rank_timeout: seconds without an answer after which a rank counts as lost.
+        group: Ranks of the attempt.
+        cluster: Ray cluster that runs them.
+        rank_timeout: Seconds without an answer after which a rank counts as lost.
 
     Raises:
-        AttemptFailedError: a rank has failed, is silent, or Ray is gone.
+        AttemptFailedError: If a rank has failed, does not answer, or Ray has ended.
     """
     _look_for_reasons(group, cluster)
     silent = max(group.handles, key=lambda rank: rank.silence)
@@ -75,7 +77,10 @@ def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> 
 
 
 def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle) -> None:
-    """Raise what broke a rank's connection: it breaks when another rank ends, and it takes a while to show which."""
+    """Wait for the cause of a rank's broken connection and raise it.
+
+    A connection breaks when another rank ends, but it takes a moment until the driver knows which one.
+    """
     started = time.monotonic()
     while time.monotonic() - started < _GRACE:
         poll_ranks(group)
@@ -90,7 +95,7 @@ def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle)
 
 
 def _look_for_reasons(group: RankGroup, cluster: Cluster) -> None:
-    """Raise what cannot be the echo of another rank's end: Ray's own, and an error that a rank made itself."""
+    """Raise an error that is not a consequence of another rank's end: the loss of Ray, or an error of a rank's own."""
     if not cluster.alive():
         raise _lost("Ray's own processes on this machine were lost")
     for rank in group.handles:
@@ -113,7 +118,7 @@ def _lost(reason: str, error: Exception | None = None) -> AttemptFailedError:
 
 
 def _reason_of_death(error: Exception) -> str:
-    """What Ray knows about the end of a rank's process, in a few words."""
+    """Return a short description of Ray's reason for the end of a rank's process."""
     text = " ".join(str(error).split())
     if "memory" in text.lower() and "low on memory" in text.lower():
         return "killed, because its machine had run out of memory"

@@ -1,10 +1,10 @@
-"""The exchanges of `sgsst_core.parallel.collectives` over torch.distributed: NCCL between GPUs, gloo between CPUs.
+"""Collectives over torch.distributed: NCCL between GPUs, gloo between CPUs.
 
 torch.distributed does not authenticate its peers. Ranks therefore listen on one interface only, which is loopback for a
 job of one machine, and never unpickle what they receive (see `messages`).
 
-Sums are made in an order that depends on the number of ranks and on the size of what is summed alone, so that a run can
-be repeated bit for bit, and every rank receives the same bits.
+The order of a sum depends only on the number of ranks and the size of the tensors. All ranks therefore receive the
+same bits, and repeated runs are bit-identical.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from worker.ranks.messages import decode, encode
 
 T = TypeVar("T")
 
-#: After which a rank that waits for another one gives up, at the earliest.
+#: Minimum timeout of a rank that waits for another one.
 DEFAULT_TIMEOUT = timedelta(seconds=120)
-#: The same while a job is prepared: one rank may read or plan for long, with nothing for the others to do.
+#: Timeout during preparation, when one rank may read or plan for a long time while the others wait.
 PREPARING = timedelta(minutes=30)
-#: The same, in iterations, where one takes long: ranks are never so uneven.
+#: Timeout in iterations, if these are slow. Ranks never differ by that many iterations.
 ITERATIONS = 5
 
 
@@ -53,12 +53,12 @@ def process_group(
     """Join the process group of a job, and leave it at the end of the block.
 
     Args:
-        rank: of this process, 0 to size - 1.
-        size: ranks in all; with 1 there is no group.
-        address: "host:port" at which rank 0 listens.
-        device: that this rank computes on; tensors of all exchanges lie there.
-        timeout: of each exchange, once `Collectives.set_timeout_for` was called.
-        listener: Socket that rank 0 listens on; None to open one at the address.
+        rank: Rank of this process, 0 to size - 1.
+        size: Number of ranks; with 1 there is no group.
+        address: Address "host:port" at which rank 0 listens.
+        device: Device of this rank, which holds the tensors of all exchanges.
+        timeout: Timeout of each exchange after `Collectives.set_timeout_for` was called.
+        listener: Socket that rank 0 listens on; None opens one at the address.
     """
     if size == 1:
         yield ALONE
@@ -71,8 +71,8 @@ def process_group(
     dist.init_process_group(
         _backend(device), store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device)
     )
-    # Or else subgroups would be split off this group's connections, for which every rank is needed: even those that
-    # the job has left out by then.
+    # With a bound device, subgroups would be split off this group's connections. That needs all ranks, including those
+    # that the job has left out by then.
     world: Any = dist.group.WORLD
     world.bound_device_id = None
     collectives = ProcessGroupCollectives(world, device, timeout)
@@ -103,13 +103,13 @@ def _meet(
     timeout: timedelta,
     listener: socket.socket | None = None,
 ) -> tuple[torch.device, Any]:
-    """Return the device that this rank's tensors lie on, and the ranks' store.
+    """Return the device of this rank's tensors, and the ranks' store.
 
     The device is a GPU if every rank has one, else the CPU. Ranks exchange this before they form a group, because all
     of them must form it for the same back ends.
     """
     host, port = split_address(address)
-    # Without a socket of ours, the store listens on every interface.
+    # Without an explicit socket, the store listens on all interfaces.
     descriptor = (listener or listen(host, port)).detach() if rank == 0 else None
     store: Any = dist.TCPStore(  # type: ignore[attr-defined]  # public, but not listed
         host, port, size, rank == 0, timeout, master_listen_fd=descriptor
@@ -120,7 +120,7 @@ def _meet(
 
 
 def _backend(device: torch.device) -> str:
-    """Of torch.distributed. Values that are not tensors (plans, decisions) travel between CPUs in any case.
+    """Return the back ends of torch.distributed. Values that are not tensors are always exchanged between CPUs.
 
     Without NCCL, gloo copies tensors of GPUs to the host and back.
     """
@@ -128,15 +128,15 @@ def _backend(device: torch.device) -> str:
 
 
 def _named(device: torch.device) -> torch.device | None:
-    """The device that a group is made for: NCCL then connects it at once, not within the first exchange.
+    """Return the device to bind a group to, so that NCCL connects at once rather than in the first exchange.
 
-    Gloo does not take one.
+    Return None for gloo, which does not accept a device.
     """
     return device if "nccl" in _backend(device) else None
 
 
 def with_index(device: torch.device | str) -> torch.device:
-    """The device; a GPU with its number, without which it can neither be made the current one nor given to NCCL."""
+    """Return the device, a GPU with its index. Both `torch.cuda.set_device` and NCCL require the index."""
     found = torch.device(device)
     if found.type == "cuda" and found.index is None:
         return torch.device("cuda", torch.cuda.current_device())
@@ -147,10 +147,10 @@ class ProcessGroupCollectives:
     """`Collectives` of a torch.distributed group.
 
     Args:
-        group: whose exchanges these are.
-        device: of the tensors.
-        timeout: see `process_group`.
-        sent: counter to go on with; None for one of its own.
+        group: Group of torch.distributed.
+        device: Device of the tensors.
+        timeout: Timeout of each exchange; see `process_group`.
+        sent: Counters of sent bytes to continue; None for new ones.
     """
 
     def __init__(
@@ -165,14 +165,14 @@ class ProcessGroupCollectives:
         self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
         self._subgroups: list[ProcessGroupCollectives] = []
         self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
-        # Where statistics travel while the next scale is computed: a stream of a GPU, which waits for others while the
-        # host goes on; one thread of a CPU. One, because exchanges meet by their order, the same on every rank.
+        # Statistics are exchanged while the next scale is computed: on a separate stream of a GPU, or in one thread on
+        # a CPU. More threads would be wrong, because ranks match exchanges by their order.
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._background = ThreadPoolExecutor(1, thread_name_prefix="collectives")
         self.local_size = self.all_gather(_machine()).count(_machine())
 
     def close(self) -> None:
-        """Let exchanges under way come to their end, and start no more."""
+        """Finish pending exchanges, and start no more."""
         for subgroup in self._subgroups:
             subgroup.close()
         self._background.shutdown(cancel_futures=True)
@@ -180,7 +180,7 @@ class ProcessGroupCollectives:
     def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
         """See `Collectives`."""
         largest = max(stop - start for start, stop in bands)
-        # All ranks send equally many rows: that is all that the back ends can do.
+        # The back ends require the same number of rows from all ranks.
         padded = band.new_zeros((largest, *band.shape[1:]))
         padded[: len(band)] = band
         gathered = [torch.empty_like(padded) for _ in bands]
@@ -218,7 +218,7 @@ class ProcessGroupCollectives:
         return self._merge_on(self._stream, list(parts), numbers)
 
     def _merge_on(self, stream: torch.cuda.Stream, parts: list[LayerStatistics], numbers: Tensor) -> Merged:
-        """Merge on a stream of the GPU, beside what the caller's stream is given meanwhile; the host does not wait."""
+        """Merge on a stream of the GPU, concurrently with the caller's stream and without blocking the host."""
         stream.wait_stream(torch.cuda.current_stream(self._device))
         _keep_for(stream, parts, numbers)
         with torch.cuda.stream(stream):
@@ -234,10 +234,11 @@ class ProcessGroupCollectives:
         return wait
 
     def _merge(self, parts: list[LayerStatistics], numbers: Tensor) -> tuple[list[LayerStatistics], Tensor]:
-        """Mean first, then second moments about it: sums of squares only, in which nothing can cancel.
+        """Merge the statistics of all ranks: first the means, then the second moments about the common mean.
 
-        C of all positions is the sum over ranks of C_r + n_r (mean_r - mean)(mean_r - mean)^T, the pairwise update of
-        Chan et al. (1979) for many parts at once.
+        C of all positions is the sum over ranks of C_r + n_r (mean_r - mean)(mean_r - mean)^T. This is the pairwise
+        update of Chan et al. (1979) for many parts at once. It adds positive semidefinite terms only, so no digits
+        cancel.
         """
         if not parts:
             return [], self.all_reduce(numbers.clone(), "statistics")
@@ -249,7 +250,7 @@ class ProcessGroupCollectives:
         for part, mean in zip(parts, means, strict=True):
             away = part.mean - mean
             moment = part.centered + torch.outer(away, away) * part.count
-            moments.append(moment[self._half(moment)])  # symmetric: one half travels
+            moments.append(moment[self._half(moment)])  # symmetric: one half is enough
         halves = self.all_reduce(torch.cat(moments), "statistics").split([len(moment) for moment in moments])
         merged = [
             LayerStatistics(total[0], mean, self._symmetric(half, len(mean)))
@@ -258,7 +259,7 @@ class ProcessGroupCollectives:
         return merged, added
 
     def _half(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows [n] and columns [n] of one half of a symmetric matrix with its diagonal, made once."""
+        """Return the rows [n] and columns [n] of a symmetric matrix's upper half with its diagonal, cached."""
         key = len(matrix), matrix.device
         if key not in self._halves:
             rows, columns = torch.triu_indices(len(matrix), len(matrix), device=matrix.device).unbind()
@@ -266,7 +267,7 @@ class ProcessGroupCollectives:
         return self._halves[key]
 
     def _symmetric(self, half: Tensor, channels: int) -> Tensor:
-        """The matrix [channels, channels] of one half."""
+        """Return the symmetric matrix [channels, channels] that has this upper half."""
         matrix = half.new_empty((channels, channels))
         rows, columns = self._half(matrix)
         matrix[rows, columns] = half
@@ -321,7 +322,7 @@ class ProcessGroupCollectives:
         return own
 
     def _own_group(self, all_ranks: list[list[int]]) -> Collectives | None:
-        """The one of these groups of ranks that this rank is in; every rank makes all of them, as the library asks."""
+        """Create all of these groups, as torch.distributed requires of every rank, and return the one of this rank."""
         own: Collectives | None = None
         for ranks in all_ranks:
             members = [dist.get_global_rank(self._group, rank) for rank in ranks]
@@ -337,11 +338,11 @@ class ProcessGroupCollectives:
 
 
 def _machine() -> tuple[str, str]:
-    """What tells machines apart: containers on one machine have names of their own, and memory limits too."""
+    """Return an identifier of the machine, by which containers count as machines: each has its own memory limit."""
     return socket.gethostname(), os.environ.get("HOSTNAME", "")
 
 
 def _keep_for(stream: torch.cuda.Stream, parts: Sequence[LayerStatistics], numbers: Tensor) -> None:
-    """Memory of tensors of another stream is not given to others before this one has done with it."""
+    """Keep the memory of these tensors, which belong to another stream, until this stream has finished with it."""
     for tensor in (numbers, *(tensor for part in parts for tensor in (part.count, part.mean, part.centered))):
         tensor.record_stream(stream)

@@ -1,6 +1,6 @@
-"""One rank: the process that Ray starts, its job in a thread of its own, and what it tells the driver meanwhile.
+"""Process of one rank: a Ray actor that runs the job in a thread and reports its status to the driver.
 
-PyTorch is imported in that thread, after the process knows its threads and its GPU.
+PyTorch is imported in that thread, after the numbers of threads and the GPU are set in the environment.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ if TYPE_CHECKING:
     from worker.request import Resume, StylizeRequest
     from worker.workplace import OpenWorkplace, Workplace
 
-#: Seconds by which an exchange waits longer than the driver: so the driver, which knows which rank gives no answer, is
-#: the first to notice.
+#: Seconds that an exchange between ranks waits longer than the driver. The driver should time out first, because it
+#: knows which rank does not answer.
 _PATIENCE = 15.0
 
 
 @dataclass(frozen=True)
 class RankPlace:
-    """Where a rank's process is.
+    """Location of a rank's process.
 
     Attributes:
-        node: Ray's name of the node.
-        address: of the node, as others reach it.
-        host: the machine's name.
-        process: to end it.
-        gpus: that it was given, as CUDA_VISIBLE_DEVICES names them.
+        node: Ray node ID.
+        address: Address under which other nodes reach the node.
+        host: Host name of the machine.
+        process: Identifier of the process, to end it.
+        gpus: Assigned GPUs, as CUDA_VISIBLE_DEVICES names them.
     """
 
     node: str
@@ -55,22 +55,23 @@ class RankPlace:
 
 @dataclass(frozen=True)
 class RankTask:
-    """What a rank has to do.
+    """Task of a rank.
 
     Attributes:
-        request: the job.
-        rank, size: in the group.
-        address: "host:port" at which rank 0 listens.
-        threads: for computing.
-        timeout: seconds after which a rank that gives no answer counts as lost.
-        folder: from which relative paths are meant, on every machine; without a workplace.
-        workplace: where the files are on machines that share no folder; None where they do.
-        resume: whether to go on from a checkpoint.
-        run_id: identifies the run of the program.
-        checkpoint_seconds: between checkpoints.
-        preview_folder, preview_seconds: see `attempts.WorkerOptions`.
-        workers: for the report: what has happened so far.
-        seconds_lost, seconds_since_loss: of the last attempt (see `attempts.LostAttempt`), until this task was made.
+        request: Job to run.
+        rank, size: Number of this rank, and number of ranks.
+        address: Address "host:port" at which rank 0 listens.
+        threads: Number of threads for computation.
+        timeout: Seconds without an answer after which a rank counts as lost.
+        folder: Base folder of relative paths on every machine; unused with a workplace.
+        resume: Choice of the checkpoint to resume from.
+        run_id: Identifier of this run of the program.
+        checkpoint_seconds: Seconds between checkpoints.
+        preview_folder, preview_seconds: Options of previews; see `attempts.WorkerOptions`.
+        workers: Requested ranks and lost attempts, for the report.
+        seconds_lost, seconds_since_loss: Costs of the last lost attempt until this task was created; see
+            `attempts.LostAttempt`.
+        workplace: Workplace for machines without a shared folder; None if they share one.
     """
 
     request: StylizeRequest
@@ -93,14 +94,14 @@ class RankTask:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a rank ended.
+    """Outcome of a rank.
 
     Attributes:
-        kind: "done", "left-out" (the plan does without this rank) or "failed".
-        result: where it is done.
-        error: where it failed.
-        trace: the traceback's text.
-        echo: the error came out of an exchange, as it does when another rank is lost.
+        kind: "done", "left-out" (the plan does not use this rank) or "failed".
+        result: Result of the job if the rank is done.
+        error: Error if the rank failed.
+        trace: Text of the error's traceback.
+        echo: Whether the error occurred in an exchange between ranks, as it does when another rank is lost.
     """
 
     kind: Literal["done", "left-out", "failed"]
@@ -112,17 +113,17 @@ class Outcome:
 
 @dataclass(frozen=True)
 class RankStatus:
-    """What a rank answers when it is asked.
+    """Status of a rank, which it returns when it is polled.
 
     Attributes:
-        planning: how far the survey of the views has come; None where there was none.
-        prepared: once the inputs have been read; rank 0 alone.
-        progress: of the last step; rank 0 alone.
-        saved: step of the last checkpoint that this rank has written, or stored where others find it.
-        warnings: all so far.
-        previews: paths of all pictures so far.
-        stored: what a workplace told of all files that it has stored so far.
-        outcome: once it has ended.
+        planning: Progress of the survey of the views; None if there was none yet.
+        prepared: Summary of the prepared job; set on rank 0 only.
+        progress: Progress of the last step; set on rank 0 only.
+        saved: Step of the last checkpoint. With a workplace, a checkpoint counts once it is stored.
+        warnings: All warnings so far.
+        previews: Paths of all previews so far.
+        stored: Descriptions of all files that a workplace has stored so far.
+        outcome: Outcome; None while the rank runs.
     """
 
     planning: PlanningProgress | None = None
@@ -136,17 +137,17 @@ class RankStatus:
 
 
 class RankProcess:
-    """The Ray actor of a rank. Every method returns at once."""
+    """Ray actor of a rank. All methods return immediately."""
 
     def __init__(self) -> None:
         self._status = RankStatus()
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._listener: socket.socket | None = None
-        die_with_parent()  # of Ray's daemon: a stopped process would not notice that it is gone
+        die_with_parent()  # the parent is Ray's daemon; a suspended process would not notice that it has ended
 
     def place(self) -> RankPlace:
-        """Where this is."""
+        """Return the location of this process."""
         import ray
 
         node = ray.get_runtime_context().get_node_id()
@@ -163,16 +164,16 @@ class RankProcess:
         return int(self._listener.getsockname()[1])
 
     def start(self, task: RankTask) -> None:
-        """Begin."""
+        """Start the job in a thread."""
         threading.Thread(target=self._run, args=(task,), daemon=True, name="job").start()
 
     def poll(self) -> RankStatus:
-        """The present state: the answer itself is the sign of life."""
+        """Return the current status. The driver takes the answer as a sign of life."""
         with self._lock:
             return self._status
 
     def stop(self) -> None:
-        """Ask the job to end after the step in hand; on rank 0."""
+        """Ask the job to end after the current step. Only rank 0 is asked."""
         self._stop.set()
 
     def _update(self, **changes: Any) -> None:
@@ -190,7 +191,7 @@ class RankProcess:
                 os.chdir(place.folder)
             self._work(task, place)
         except BaseException as error:
-            if self._status.outcome is None:  # who is done may leave the others as it likes
+            if self._status.outcome is None:  # an error after the job is done does not matter
                 self._update(outcome=_failure(error))
         finally:
             if place is not None:
@@ -213,7 +214,7 @@ class RankProcess:
         with process_group(
             task.rank, task.size, task.address, device=device, timeout=timeout, listener=self._listener
         ) as collectives:
-            # The outcome is told inside the block: leaving the group may have to wait for ranks that are lost.
+            # The outcome is set inside the block, because leaving the group may wait for lost ranks.
             try:
                 result = self._job(task, collectives)
                 if place is not None:
@@ -277,19 +278,19 @@ class RankProcess:
 
 
 def _set_environment(task: RankTask) -> None:
-    """Set threads and GPU before anything is imported that reads them."""
+    """Set the variables for threads and GPU before libraries are imported that read them."""
     set_thread_variables(task.threads)
     import ray
 
-    # A process that was given no GPU would see all of them.
+    # Without the variable, a process without an assigned GPU would see all of them.
     os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(str(number) for number in ray.get_gpu_ids())
 
 
 def _enter_folder(task: RankTask) -> None:
-    """Make the folder from which relative paths are meant the working folder.
+    """Change to the base folder of relative paths.
 
     Raises:
-        InfrastructureError: it is not on this machine, and the job has relative paths.
+        InfrastructureError: If the folder does not exist on this machine, and the job has relative paths.
     """
     if task.folder.is_dir():
         os.chdir(task.folder)
@@ -301,7 +302,7 @@ def _enter_folder(task: RankTask) -> None:
 
 
 def _paths(request: StylizeRequest) -> list[Path]:
-    """All paths of a job that are given."""
+    """Return all paths of a request that are not None."""
     styles = [*request.styles, *(style for region in request.regions for style in region.styles)]
     masks = [region.selection.path for region in request.regions if region.selection]
     found = [request.source.scene, request.source.cameras, *(style.path for style in styles), *masks]
@@ -309,10 +310,10 @@ def _paths(request: StylizeRequest) -> list[Path]:
 
 
 def set_thread_variables(threads: int) -> None:
-    """Tell libraries that have not been imported yet how many threads to use.
+    """Set the number of threads for libraries that have not been imported yet.
 
-    Numba reads its variable again whenever it compiles, and refuses another value than that of its import: where it has
-    been imported, `compiled.kernel_threads` alone says how many of its threads run.
+    Numba reads its variable again whenever it compiles, and raises an error if the value differs from that at its
+    import. Once Numba is imported, only `compiled.kernel_threads` sets its number of threads.
     """
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = str(threads)
@@ -325,13 +326,13 @@ def _failure(error: BaseException) -> Outcome:
     told = error if isinstance(error, Exception) else RuntimeError(repr(error))
     try:
         pickle.loads(pickle.dumps(told))
-    except Exception:  # whatever it holds, its text can travel
+    except Exception:  # the error cannot be pickled, so only its text is sent
         told = RuntimeError(f"{type(error).__name__}: {error}")
     return Outcome("failed", error=told, trace=trace, echo=_raised_in_exchange(error))
 
 
 def _raised_in_exchange(error: BaseException) -> bool:
-    """Whether an error was raised inside torch.distributed, or by its store of ranks."""
+    """Return whether an error was raised inside torch.distributed, including its store."""
     if type(error).__module__.startswith("torch.distributed"):
         return True
     step = error.__traceback__

@@ -1,4 +1,4 @@
-"""The ranks of one attempt as the driver knows them: their actors, where they are, what each has last answered."""
+"""State of an attempt's ranks in the driver: their actors, locations and last answers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from worker.ranks.rank import Outcome, RankPlace, RankStatus
 
 
 class AttemptFailedError(Exception):
-    """An attempt has ended before its job."""
+    """Error if an attempt ends before its job is done."""
 
     def __init__(self, failure: Failure) -> None:
         super().__init__(failure.reason)
@@ -22,15 +22,15 @@ class AttemptFailedError(Exception):
 
 @dataclass
 class RankHandle:
-    """One rank.
+    """Handle of one rank.
 
     Attributes:
-        actor: its Ray actor.
-        group: Ray's placement group that it runs in.
-        place: where it is; None until it has told.
-        pending_poll: Ray's reference to the answer that is waited for; None where nothing is.
-        polled_at, answered_at: when it was last asked, and answered; monotonic seconds.
-        status: its last answer.
+        actor: Ray actor of the rank.
+        group: Ray placement group that it runs in.
+        place: Location of its process; None until the rank has reported it.
+        pending_poll: Ray reference to a pending answer; None if no poll is pending.
+        polled_at, answered_at: Times of the last poll and the last answer, in monotonic seconds.
+        status: Last answer.
     """
 
     actor: Any
@@ -43,28 +43,28 @@ class RankHandle:
 
     @property
     def outcome(self) -> Outcome | None:
-        """How it ended; None while it has not."""
+        """Return the outcome of the rank; None while it runs."""
         return self.status.outcome
 
     @property
     def left_out(self) -> bool:
-        """Whether the job goes on without it, whatever becomes of it."""
+        """Return whether the job continues without this rank."""
         return self.outcome is not None and self.outcome.kind == "left-out"
 
     @property
     def silence(self) -> float:
-        """Seconds since its last answer."""
+        """Return the seconds since the last answer; 0 for a rank that was left out."""
         return 0.0 if self.left_out else time.monotonic() - self.answered_at
 
 
 @dataclass
 class RankGroup:
-    """The ranks of one attempt, in the order of their numbers.
+    """Ranks of one attempt, ordered by number.
 
     Attributes:
-        on_left_out: called with a rank that the plan does without.
-        handles: empty until they have been started.
-        reservation: of their places; None before, and where these have been given back.
+        on_left_out: Callback for each rank that the plan does not use.
+        handles: Handles of the ranks; empty until they are started.
+        reservation: Reserved resources; None before the reservation and after its release.
     """
 
     on_left_out: Callable[[RankHandle], None]
@@ -72,6 +72,6 @@ class RankGroup:
     reservation: Reservation | None = None
 
     def name_of(self, rank: RankHandle) -> str:
-        """For sentences."""
+        """Return the name of a rank for messages."""
         where = f" on {rank.place.host}" if rank.place else ""
         return f"Worker {self.handles.index(rank)}{where}"

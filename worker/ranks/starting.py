@@ -1,4 +1,4 @@
-"""Starting the ranks of an attempt: reserve places, start an actor in each, number them, give each its task."""
+"""Startup of an attempt's ranks: reserve resources, start an actor per rank, number the ranks and send their tasks."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from worker.ranks.placement import NoRoomError, reserve
 from worker.ranks.rank import RankPlace, RankProcess, RankTask
 from worker.ranks.rank_group import AttemptFailedError, RankGroup, RankHandle
 
-#: Seconds that a process of a rank may take to start.
+#: Seconds that the process of a rank may take to start.
 START_SECONDS = 60.0
 
-#: Makes the task of the rank of a number, in a started group, at rank 0's "host:port".
+#: Function that creates the task of a rank from its number and the "host:port" of rank 0, once all ranks are started.
 MakeTask = Callable[[int, str], RankTask]
 
 
 def start_ranks(group: RankGroup, workers: int, scene: int, actor: type[RankProcess], make_task: MakeTask) -> None:
-    """Start as many ranks as there is room for, and begin their work.
+    """Start as many ranks as the cluster has resources for, and send each its task.
 
     Args:
-        group: an empty one; it holds what has been started even where an error is raised.
-        workers: ranks at most.
-        scene: bytes of the job's scene, for which GPUs' machines need room.
-        actor: what runs a rank.
+        group: Empty group to fill. If an error is raised, it holds the ranks that were started.
+        workers: Maximum number of ranks.
+        scene: Bytes of the job's scene, which machines with GPUs need as host memory.
+        actor: Class of the Ray actor that runs a rank.
+        make_task: Function that creates the task of a rank.
 
     Raises:
-        AttemptFailedError: there is no room.
-        RayError: a process did not start in time.
+        AttemptFailedError: If there are no free resources.
+        RayError: If a process does not start in time.
     """
     import ray
 
@@ -52,7 +53,7 @@ def start_ranks(group: RankGroup, workers: int, scene: int, actor: type[RankProc
 
 
 def _from_all(group: RankGroup, method: str, arguments: list[tuple[Any, ...]] | None = None) -> list[Any]:
-    """What a method of each rank returns, called on all at once."""
+    """Call a method of all ranks concurrently, and return the results."""
     import ray
 
     given = arguments or [()] * len(group.handles)
@@ -61,7 +62,10 @@ def _from_all(group: RankGroup, method: str, arguments: list[tuple[Any, ...]] | 
 
 
 def _numbered(handles: list[RankHandle], here: str) -> list[RankHandle]:
-    """Ranks by number: rank 0 writes the files, so it belongs where the driver is; neighbors share a machine."""
+    """Order the ranks by number. Rank 0 writes the files, so it runs on the driver's machine if one does.
+
+    Ranks of one machine get consecutive numbers.
+    """
 
     def order(rank: RankHandle) -> tuple[bool, str]:
         place = _place(rank)
@@ -80,5 +84,5 @@ def _address(handles: list[RankHandle]) -> str:
 
 
 def _place(rank: RankHandle) -> RankPlace:
-    assert rank.place is not None  # every rank has told it before it is numbered
+    assert rank.place is not None  # all ranks report their location before they are numbered
     return rank.place

@@ -1,8 +1,7 @@
-"""Leaves nothing of a killed process behind: of a local Ray, or of a rank.
+"""Watchdog process that cleans up after a killed process: the folder of a local Ray instance or of a rank.
 
-Runs as a process of its own beside the owner of a folder, with a pipe as standard input, so that it outlives it: when
-the pipe closes without a word, the owner was killed. Uses the standard library alone, so that it starts in no time and
-takes next to no memory.
+It runs beside the owner of the folder and reads from a pipe. If the pipe closes without a message, the owner was
+killed. It imports the standard library only, so that it starts quickly and needs little memory.
 """
 
 from __future__ import annotations
@@ -15,17 +14,18 @@ import sys
 import time
 from pathlib import Path
 
-#: What the owner says when it has cleaned up itself.
+#: Message of an owner that has deleted the folder itself.
 DONE = b"done"
-#: Seconds for processes to go by themselves, and in all.
+#: Seconds until remaining processes are killed, and until the sweeper stops waiting for them.
 _PATIENCE, _LIMIT = 1.0, 20.0
 
 
 def beside(folder: Path, *, users: bool = False) -> subprocess.Popen[bytes]:
-    """Start one that removes a folder when this process is killed; `dismiss` ends it.
+    """Start a sweeper that deletes a folder if this process is killed; `dismiss` ends it.
 
     Args:
-        users: processes that still use the folder are ended first.
+        folder: Folder to delete.
+        users: Whether to end the processes that still use the folder first.
     """
     return subprocess.Popen(
         [sys.executable, "-I", "-S", __file__, str(folder), *(["users"] if users else [])],
@@ -37,13 +37,16 @@ def beside(folder: Path, *, users: bool = False) -> subprocess.Popen[bytes]:
 
 
 def dismiss(process: subprocess.Popen[bytes]) -> None:
-    """The owner has removed the folder itself; once is enough."""
+    """End a sweeper after the owner has deleted the folder itself. Further calls have no effect."""
     if process.stdin and not process.stdin.closed:
         process.communicate(DONE)
 
 
 def sweep(folder: Path) -> None:
-    """Kill every other process that has a file of the folder open, or names it in its command; remove the folder."""
+    """Wait until no other process uses a folder, kill those that still do after a moment, and delete the folder.
+
+    A process uses the folder if it has a file in it open or names it in its command line.
+    """
     started = time.monotonic()
     while users := _users(folder):
         if time.monotonic() - started > _LIMIT:
@@ -52,14 +55,14 @@ def sweep(folder: Path) -> None:
             for process in users:
                 try:
                     os.kill(process, signal.SIGKILL)
-                except OSError:  # gone meanwhile
+                except OSError:  # the process has ended meanwhile
                     continue
         time.sleep(0.1)
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def _users(folder: Path) -> list[int]:
-    """Processes of this user, apart from this one, that use a folder."""
+    """Return the other processes of this user that use a folder."""
     processes = Path("/proc")
     if not processes.is_dir():  # not Linux
         return []
@@ -77,7 +80,7 @@ def _uses(process: Path, folder: str) -> bool:
         if folder.encode() in process.joinpath("cmdline").read_bytes():
             return "sweeper.py" not in process.joinpath("cmdline").read_text(errors="replace")
         return any(str(link.readlink()).startswith(folder + "/") for link in process.joinpath("fd").iterdir())
-    except OSError:  # gone meanwhile, or another user's
+    except OSError:  # the process has ended meanwhile, or belongs to another user
         return False
 
 

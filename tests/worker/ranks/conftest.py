@@ -1,4 +1,4 @@
-"""A Ray cluster for those tests that join one."""
+"""Fixture of a Ray cluster for tests that join one."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def joined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A Ray cluster of one node, which was there before and stays: told of two GPUs that are not there, and 10 GB."""
+    """Run a Ray cluster of one node that is configured with two GPUs, which do not exist, and 10 GB of memory."""
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
     monkeypatch.setenv("RAY_AUTH_TOKEN", cluster._SECRET)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")  # or Ray would not believe that there are any
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")  # without it, Ray finds no GPUs
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     folder = tempfile.mkdtemp(prefix="sgsst-head-", dir="/tmp")
     import ray
 
-    here, port = ray.util.get_node_ip_address(), free_port()  # Ray takes 127.0.0.1 for this address when it joins
+    here, port = ray.util.get_node_ip_address(), free_port()  # Ray replaces 127.0.0.1 by this one
     command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", f"--port={port}"]
     command += [f"--node-ip-address={here}", "--num-cpus=2", "--num-gpus=2", "--memory=10000000000"]
     command += [

@@ -1,4 +1,4 @@
-"""Faults at chosen places of a rank: real signals to real processes, at a moment that can be repeated."""
+"""Fault injection in ranks: real signals to real processes, at reproducible points of the program."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ Place = Literal[
 
 @dataclass(frozen=True)
 class Fault:
-    """What happens to a rank, once.
+    """Fault of a rank, which occurs once.
 
     Attributes:
-        rank: to which.
-        place: in which function.
-        call: at its so-manieth call.
-        what: signal that the rank gets; "full" for a disk that takes no more than a few bytes.
-        delay: seconds from the beginning of the call on.
+        rank: Rank at which the fault occurs.
+        place: Function during which it occurs.
+        call: Number of the call of that function, counted from 1.
+        what: Signal that is sent to the rank, or "full" for a full disk.
+        delay: Seconds from the start of the call to the signal.
     """
 
     rank: int
@@ -55,12 +55,12 @@ class Fault:
     delay: float = 0.0
 
     def write(self, request: StylizeRequest) -> None:
-        """Leave it where `FaultyRank` looks for it."""
+        """Write the fault to the file that `FaultyRank` reads."""
         _file(request).parent.mkdir(parents=True, exist_ok=True)
         _file(request).write_text(json.dumps(asdict(self)))
 
     def arm(self, request: StylizeRequest) -> None:
-        """Make it happen in this process."""
+        """Install the fault in this process."""
         owner, name = _places()[self.place]
         original: Callable[..., Any] = getattr(owner, name)
         calls = 0
@@ -70,8 +70,8 @@ class Fault:
             calls += 1
             if calls != self.call:
                 return original(*arguments, **options)
-            _file(request).rename(_fired(request))  # the next attempt is left alone
-            os.utime(_fired(request))  # now: a file keeps its time under another name
+            _file(request).rename(_fired(request))  # the fault must not occur in the next attempt
+            os.utime(_fired(request))  # record the current time, which a renamed file does not have
             if self.what == "full":
                 with _full_disk():
                     return original(*arguments, **options)
@@ -87,7 +87,7 @@ class Fault:
 
 
 class FaultyRank(RankProcess):
-    """A rank to which the fault that lies beside its output happens."""
+    """Rank with the fault that is stored beside the job's output."""
 
     def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
         if _file(task.request).exists():
@@ -98,18 +98,18 @@ class FaultyRank(RankProcess):
 
 
 def fired(request: StylizeRequest) -> float | None:
-    """When the fault happened, seconds since the epoch; None where it has not."""
+    """Return the time of the fault in seconds since the epoch; None if it has not occurred."""
     path = _fired(request)
     return path.stat().st_mtime if path.exists() else None
 
 
 def forget(request: StylizeRequest) -> None:
-    """As if nothing had happened yet."""
+    """Delete the record that the fault occurred."""
     _fired(request).unlink(missing_ok=True)
 
 
 def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
-    """A job of tiny views in which every rank takes part."""
+    """Return a request with tiny views that uses all ranks, and write its inputs."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True, exist_ok=True)
     ply, cameras, style = write_files(inputs, wall())
@@ -121,7 +121,7 @@ def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
 
 
 def shared_memory(processes: Iterable[psutil.Process]) -> set[Path]:
-    """Files of shared memory that processes have mapped."""
+    """Return the shared memory files that these processes have mapped."""
     found = set()
     for process in processes:
         with contextlib.suppress(psutil.Error):
@@ -130,7 +130,7 @@ def shared_memory(processes: Iterable[psutil.Process]) -> set[Path]:
 
 
 def folders(processes: Iterable[psutil.Process]) -> set[Path]:
-    """Ray's folders that processes name in their commands."""
+    """Return Ray's folders in the command lines of these processes."""
     words = []
     for process in processes:
         with contextlib.suppress(psutil.Error):
@@ -164,7 +164,7 @@ def _places() -> dict[str, tuple[Any, str]]:
 
 
 class _full_disk:  # noqa: N801 (reads as the state that it makes)
-    """Files of this process can have no more than a few bytes: the system says so as it does where a disk is full."""
+    """Simulation of a full disk: within the block, this process can write files of a few kilobytes only."""
 
     def __enter__(self) -> None:
         self._before = resource.getrlimit(resource.RLIMIT_FSIZE)

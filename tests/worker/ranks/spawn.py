@@ -1,4 +1,4 @@
-"""Runs functions on several gloo ranks: real processes of one thread each, kept from test to test."""
+"""Runner of functions on several gloo ranks: real processes of one thread each, which tests reuse."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def on_ranks(
     device: str = "cpu",
     host: str = "127.0.0.1",
 ) -> list[Any]:
-    """What function(collectives, *arguments) returns on each rank; its first error is raised here.
+    """Run function(collectives, *arguments) on `size` ranks, and return the result of each. The first error is raised.
 
-    The function and its arguments must be picklable. Ranks give each other up after `timeout` seconds. On the device
-    "cuda" each rank has a pretend GPU. They meet at `host`.
+    The function and its arguments must be picklable. Exchanges time out after `timeout` seconds. With the device "cuda"
+    each rank has a simulated GPU. Rank 0 listens on the address `host`.
     """
     address = f"{host}:{free_port()}"
     futures = [_pool().submit(_run, rank, size, address, timeout, device, function, arguments) for rank in range(size)]
@@ -40,8 +40,8 @@ def on_ranks(
 
 @functools.cache
 def _pool() -> ProcessPoolExecutor:
-    # A rank waits for the others inside its task, so that no process takes two of them.
-    context = multiprocessing.get_context("forkserver")  # which imports once what every rank would
+    # A task waits for all other ranks, so each process runs exactly one of them.
+    context = multiprocessing.get_context("forkserver")  # imports the modules once for all ranks
     context.set_forkserver_preload(["sgsst_core.stylizing.stylizer", "worker.ranks.process_group"])
     pool = ProcessPoolExecutor(MOST_RANKS, mp_context=context)
     atexit.register(pool.shutdown, cancel_futures=True)
@@ -70,7 +70,7 @@ def _result(future: Future[Any]) -> Any:
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens at."""
+    """Return an unused port of this machine."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port: int = listener.getsockname()[1]

@@ -1,4 +1,4 @@
-"""Jobs on real ranks that are killed, stopped, cut off and canceled: the result is that of an undisturbed run."""
+"""Tests of jobs whose ranks are killed, suspended, disconnected or canceled: results equal an undisturbed run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ pytestmark = [
 
 ROOT = Path(__file__).resolve().parents[3]
 STEPS = 24
-#: Largest relative difference of a loss to an undisturbed run's.
+#: Maximum relative difference of the loss from that of an undisturbed run.
 TOLERANCE = 1e-3
 
 
@@ -55,7 +55,7 @@ def cluster() -> Iterator[Cluster]:
 
 @dataclass
 class Heard:
-    """What a job told, and when it is asked to stop."""
+    """Recorder of a job's events, which stops the job at step `stop_at`."""
 
     stop_at: int | None = None
     planned: list[float] = field(default_factory=list)
@@ -86,7 +86,7 @@ class Heard:
 def run(
     request: StylizeRequest, cluster: Cluster, heard: Heard | None = None, fault: Fault | None = None, workers: int = 2
 ) -> RanksResult:
-    """A job on ranks to which something may happen; checkpoints after nearly every step."""
+    """Run a job on ranks, optionally with a fault. A checkpoint is written after almost every step."""
     if fault is not None:
         fault.write(request)
     options = WorkerOptions(
@@ -100,14 +100,14 @@ def run(
 
 
 def loss_of(ended: RanksResult) -> float:
-    """On the evaluation views, at the end."""
+    """Return the final loss on the evaluation views."""
     assert ended.result is not None
     return mean_loss(ended.result.after)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> tuple[float, bytes]:
-    """Loss and file of a run on two ranks to which nothing happens."""
+    """Return the loss and the file of a run on two ranks without a fault."""
     request = small_request(tmp_path_factory.mktemp("undisturbed"), STEPS)
     heard = Heard()
     ended = run(request, cluster, heard)
@@ -152,7 +152,7 @@ def test_a_lost_rank_costs_no_more_than_a_checkpoint_interval(
     assert 0 < lost.saved_step <= lost.last_step
     assert len(heard.prepared) == 1
     assert "Going on from step" in heard.happened[-1]
-    # Two ranks again: the same sums in the same order, and so the same file.
+    # Two ranks again add in the same order, so the file is the same.
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
     assert request.out.read_bytes() == undisturbed[1]
     report = json.loads(request.out.with_name("s.report.json").read_text())
@@ -213,7 +213,7 @@ def test_a_bad_input_is_told_at_once_and_not_tried_again(cluster: Cluster, tmp_p
 
 
 def command(request: StylizeRequest, *options: str) -> list[str]:
-    """`sgsst stylize` of the same job."""
+    """Return the arguments of `sgsst stylize` for the same job."""
     source = request.source
     files = [str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
     settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop", "--compute-everything"]
@@ -221,7 +221,7 @@ def command(request: StylizeRequest, *options: str) -> list[str]:
 
 
 def start(arguments: list[str]) -> subprocess.Popen[str]:
-    """The command in a process of its own, which has printed what was decided."""
+    """Start the command in a process, and wait until it has printed its plan."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     environment.pop("RAY_ADDRESS", None)
     process = subprocess.Popen(
@@ -240,7 +240,7 @@ def start(arguments: list[str]) -> subprocess.Popen[str]:
 
 
 def left_of(process: psutil.Process) -> list[psutil.Process]:
-    """A process's children and theirs, with Ray's folder in their command or open files."""
+    """Return all running descendants of a process."""
     return [child for child in process.children(recursive=True) if child.is_running()]
 
 
@@ -270,7 +270,7 @@ def test_ctrl_c_saves_and_the_command_that_it_prints_goes_on(tmp_path: Path) -> 
     request = small_request(tmp_path, STEPS)
     arguments = command(request, "--max-seconds", "3")
     process = start(arguments)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it: to Ray's processes too
+    os.killpg(process.pid, signal.SIGINT)  # like a terminal, also to Ray's processes
     _, error = process.communicate(timeout=120)
     assert process.returncode == 130, error
     assert "Traceback" not in error

@@ -1,4 +1,4 @@
-"""What artists ask for gives the same result on several ranks as on one."""
+"""Tests that controls for artists give the same result on several ranks as on one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several ranks give the gradient, the loss and the run that one rank gives, whatever the division of the work."""
+"""Tests that gradient, loss and run of several ranks equal those of one rank for any division of the work."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.worker.ranks.spawn import on_ranks
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-#: Largest relative error of the color gradient against one rank's.
+#: Maximum relative error of the color gradient compared with that of one rank.
 BOUNDS = {torch.float32: 1e-5, torch.float64: 1e-9}
 
 
@@ -47,7 +47,10 @@ def gradient(
     style_loss: StyleLossName = "sos",
     regions: Regions | None = None,
 ) -> tuple[Tensor, float, list[bool]]:
-    """Color gradient [N, 3] and SOS loss of one view, two or three scales; which of this rank's tiles were kept."""
+    """Compute color gradient [N, 3] and SOS loss of one view at two or three scales.
+
+    Also return which of this rank's tiles have cached activations.
+    """
     weights = comparing_pixels(tiny_weights())
     network = FeatureNetwork(weights, layers_of(style_loss, weights, content=True), dtype)
     loss = SosLoss(
@@ -90,8 +93,8 @@ def gradient(
         (3, 128, 96, 64, wall()),
         (4, 101, 83, None, wall()),
         (2, 150, 70, 48, ball()),
-        (4, 48, 36, None, wall()),  # fewer rows of raster tiles, and hardly more cells, than ranks
-        (4, 17, 15, None, wall()),  # one piece of work
+        (4, 48, 36, None, wall()),  # fewer rows of raster tiles than ranks, and hardly more cells
+        (4, 17, 15, None, wall()),  # a single work unit
     ],
 )
 def test_gradient_is_that_of_one_rank(
@@ -116,7 +119,7 @@ def test_ranks_of_different_speed_get_different_shares_of_the_same_gradient() ->
 
 @pytest.mark.parametrize("style_loss", ["sos", "mixed"])
 def test_regions_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> None:
-    """On three ranks, of which some have no pixel of a region; one of the regions is kept."""
+    """Some of the three ranks have no pixel of a region, and one region is frozen."""
     scene, camera = wall(), cameras(1, 128, 96)[0]
     other = StyleMixture.of(picture(64, 80, seed=5, dtype=torch.float64))
     every = (Region("rest"), Region("a", style=other, weight=3.0), Region("b", freeze=True))
@@ -142,7 +145,7 @@ def test_ranks_that_keep_only_some_activations_give_the_same_gradient() -> None:
 
 @pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
 def test_matched_features_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> None:
-    """On three ranks, of which one has hardly anything to match."""
+    """One of the three ranks has almost no features to match."""
     scene, camera = ball(), cameras(1, 128, 96)[0]
     arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss
     expected, loss, _ = gradient(ALONE, *arguments)
@@ -152,7 +155,7 @@ def test_matched_features_give_the_gradient_of_one_rank(style_loss: StyleLossNam
 
 
 def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str, Any]) -> dict[str, Any]:
-    """A whole run."""
+    """Run a whole job."""
     settings = make_settings("standard", keep=("ranks",), coarsest_side=40, **values)
     stylizer = Stylizer.planned(
         scene, cameras(views), style(), settings, weights=tiny_weights(), collectives=collectives
@@ -174,7 +177,7 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
 )
 @pytest.mark.slow
 def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(scene: Scene) -> None:
-    """At a small rate: at that of `standard`, steps make a rounding 1e4 times larger within thirty of them."""
+    """The learning rate is small: at that of `standard`, thirty steps amplify rounding errors by 1e4."""
     values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False, "learning_rate": 0.01}
     alone = stylize(ALONE, scene, 3, values)
     first, second = on_ranks(2, stylize, scene, 3, values)
@@ -212,7 +215,7 @@ def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, v
 
 
 def test_ranks_draw_the_same_colors_behind_a_scan() -> None:
-    """One rank's, whatever the groups in which views are taken."""
+    """Background colors equal those of a run on one rank, however the ranks are grouped."""
     values = {
         "steps_coarse": 2,
         "steps_sos": 3,

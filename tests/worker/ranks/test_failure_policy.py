@@ -1,4 +1,4 @@
-"""What is done after a failure, without any process: errors of the job, losses, and how often they are tried again."""
+"""Tests of the failure policy without processes: errors of the job, losses, and the number of attempts."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_too_many_attempts_in_vain_are_given_up() -> None:
 
 
 def twice(error: Exception, second: Exception | None = None, steps: tuple[int, int] = (4, 4)) -> Decision:
-    """After two attempts without progress that a rank's errors ended."""
+    """Return the decision after two attempts that made no progress and ended with these errors."""
     return decide([failed(raised(error), steps[0]), failed(raised(second or error), steps[1])])
 
 

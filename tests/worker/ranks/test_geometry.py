@@ -1,4 +1,4 @@
-"""The scene is read once on a machine, shared without a trace, and refused where there is no room for it."""
+"""Tests that a scene is read once per machine, shared without leaks, and refused if memory is too small."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory 
 
 
 def digest(scene: Scene) -> str:
-    """Of all bits of a scene."""
+    """Return a hash of all tensors of a scene."""
     return hashlib.sha256(b"".join(getattr(scene, field.name).numpy().tobytes() for field in fields(Scene))).hexdigest()
 
 
 def shared(collectives: Collectives, path: Path, drop: bool) -> tuple[str, bool, int, int, int]:
-    """What a rank has of a scene: its digest, whether it read it, dropped rows, mappings; and what is left of it."""
+    """Return a rank's digest of the scene, whether it read it, dropped rows, mappings, and leaked memory files."""
     file, reader = read_shared_scene(path, collectives, drop_invalid=drop)
     maps = Path("/proc/self/maps").read_text().count("memfd:sgsst-scene")
-    file.scene.sh_dc[0] += 1.0  # a rank's own business
+    file.scene.sh_dc[0] += 1.0  # must not be visible to other ranks
     collectives.all_gather(None)
     again = read_scene(path, drop_invalid=drop).scene.sh_dc
     assert float((file.scene.sh_dc - again).abs().sum()) == pytest.approx(3.0)
@@ -80,7 +80,7 @@ def test_a_packed_scene_is_read_once_too(tmp_path: Path, form: PackedForm) -> No
 
 
 def test_the_room_that_a_packed_scene_needs_is_that_of_its_floats(tmp_path: Path) -> None:
-    """By its header, before it is unpacked."""
+    """The requirement follows from the header, before the scene is decompressed."""
     path = tmp_path / "scene"
     for form in PACKED_FORMS:
         write_packed(path, wall(sh_degree=3), form)
@@ -90,7 +90,7 @@ def test_the_room_that_a_packed_scene_needs_is_that_of_its_floats(tmp_path: Path
 
 
 def shared_colors(collectives: Collectives, path: Path, drop: bool) -> tuple[bool, Tensor, Tensor]:
-    """Of a scene whose harmonics stay in the file: whether they do on a rank, what they are, and a view's colors."""
+    """Return whether SH coefficients stay in the file on this rank, the coefficients, and the colors of a view."""
     with patch.object(ply, "HELD_BYTES", 0):
         scene = read_shared_scene(path, collectives, drop_invalid=drop)[0].scene
     stored = isinstance(scene.sh_rest, StoredHarmonics)
@@ -113,7 +113,7 @@ def test_harmonics_in_the_file_are_read_there_by_every_rank(tmp_path: Path, drop
 
 
 def refused(collectives: Collectives, path: Path) -> str:
-    """The error that a rank gets."""
+    """Return the error message of a rank."""
     with pytest.raises(SceneError) as caught:
         read_shared_scene(path, collectives)
     return str(caught.value)
@@ -129,7 +129,7 @@ def test_what_the_reader_refuses_is_refused_everywhere(tmp_path: Path) -> None:
 
 
 def test_a_scene_that_no_memory_holds_is_refused_with_figures(tmp_path: Path) -> None:
-    """A billion Gaussians, in a file of as many bytes as they take; none of them is ever stored."""
+    """The file is sparse, with the size of a billion Gaussians, none of which is stored."""
     path = tmp_path / "scene.ply"
     write_scene(path, wall(sh_degree=3))
     head, end, body = path.read_bytes().partition(b"end_header\n")

@@ -1,4 +1,4 @@
-"""Ranks that the plan does without end at once; what they had is there for others."""
+"""Tests that ranks end immediately and release their resources if the plan does not use them."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ STEPS = 16
 
 
 def ranks_that_run() -> int:
-    """Processes of ranks below this one."""
+    """Return the number of running ranks among the descendants of this process."""
     children = psutil.Process().children(recursive=True)
     return sum("FaultyRank" in " ".join(child.cmdline()) for child in children if child.is_running())
 
 
 @pytest.mark.slow
 def test_a_worker_that_the_plan_does_without_ends_before_the_work_begins(tmp_path: Path) -> None:
-    request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it
+    request = small_request(tmp_path, STEPS, keep=())  # views are too small to be divided between ranks
     ranks_alive: list[int] = []
     listener = Listener(progress=lambda now: ranks_alive.append(ranks_that_run()))
     ended = stylize_on_ranks(request, 2, listener, options=WorkerOptions(actor=FaultyRank))
@@ -46,8 +46,8 @@ def test_a_worker_that_the_plan_does_without_ends_before_the_work_begins(tmp_pat
 def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ray is told of two GPUs that are not there: it gives them out all the same, and ranks compute on the CPU."""
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # Ray looks when it is imported, which is earlier here than otherwise
+    """Ray is configured with two GPUs that do not exist. It assigns them, and ranks compute on the CPU."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # Ray reads it at import, which is earlier here than in a job
     monkeypatch.setenv("RAY_AUTH_TOKEN", cluster._SECRET)
     import ray
 
@@ -61,7 +61,7 @@ def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    request = small_request(tmp_path, STEPS, keep=())  # every part of so small a view is the whole of it
+    request = small_request(tmp_path, STEPS, keep=())  # views are too small to be divided between ranks
     Fault(0, "optimizer", 10, "SIGKILL").write(request)
     given_back: list[str] = []
     happened: list[str] = []

@@ -1,4 +1,4 @@
-"""What rank 0 tells is passed on once, whichever attempt it is in, and says how far the job has come."""
+"""Tests that the relay passes on each event of rank 0 once in any attempt, and tracks the progress of the job."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from worker.ranks.rank import RankStatus
 
 
 class Told:
-    """Everything that a listener was told, in its order."""
+    """Recorder of all events of a listener, in order."""
 
     def __init__(self) -> None:
         self.events: list[tuple[str, object]] = []
@@ -32,7 +32,7 @@ class Told:
         self.relay.begin_attempt()
 
     def after(self, *statuses: RankStatus) -> list[tuple[str, object]]:
-        """What these answers of rank 0 add."""
+        """Return the new events after these answers of rank 0."""
         known = len(self.events)
         for status in statuses:
             self.relay.pass_on(status)
@@ -88,7 +88,7 @@ def test_warnings_and_pictures_are_told_once(again: bool) -> None:
     told.after(first)
     status = replace(first, warnings=("a", "b"), previews=(Path("out/1.jpg"), Path("out/2.jpg")))
     if again:
-        told.relay.begin_attempt()  # of other ranks, which know nothing of what was told
+        told.relay.begin_attempt()  # its ranks report all events again
         assert len(told.after(status)) == 4
     else:
         assert told.after(status) == [("warning", "b"), ("preview", "2.jpg")]

@@ -1,4 +1,4 @@
-"""Messages between ranks: values are restored bit by bit, and hostile messages are refused."""
+"""Tests of messages between ranks: values are restored bit-identically, and hostile messages are refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VALUES = [
     True,
     -(2**70),
     "",
-    "line\n\udcff \u2028",  # a file name that is not UTF-8 has such characters
+    "line\n\udcff \u2028",  # file names that are not UTF-8 contain such characters
     0.1 + 0.2,
     5e-324,
     -0.0,
@@ -46,7 +46,7 @@ VALUES = [
 def test_values_come_out_as_they_went_in(value: Any) -> None:
     found = decode(encode(value))
     assert found == value
-    assert repr(found) == repr(value)  # tells -0.0 from 0.0, a tuple from a list, and True from 1
+    assert repr(found) == repr(value)  # distinguishes -0.0 from 0.0, tuples from lists, and True from 1
 
 
 def test_not_a_number_stays_one() -> None:
@@ -79,14 +79,16 @@ def test_errors_keep_their_type() -> None:
     assert found.args == ("scene.ply: is empty.",)
 
 
-@pytest.mark.parametrize("value", [object(), {1}, ValueError("no"), Path, len, np.float32(1)], ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize(
+    "value", [object(), {1}, ValueError("no"), Path, len, np.float32(1)], ids=lambda value: type(value).__name__
+)
 def test_what_no_message_can_hold_is_refused(value: Any) -> None:
     with pytest.raises(TypeError, match=r"A message between ranks cannot hold a|is not a class of"):
         encode(value)
 
 
 def message(value: Any) -> Tensor:
-    """Any JSON as a message."""
+    """Encode any JSON as a message."""
     text = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
     return torch.frombuffer(bytearray(save({"json": text})), dtype=torch.uint8)
 

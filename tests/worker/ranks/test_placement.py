@@ -1,4 +1,4 @@
-"""What ranks ask a Ray cluster for: GPUs with the memory of their machines, or cores alone."""
+"""Tests of the resources that ranks request from Ray: GPUs with host memory, or cores alone."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def test_a_scene_for_which_no_machine_has_enough_asks_for_all_of_one() -> None:
 
 
 def test_without_gpus_cores_alone_are_asked_for() -> None:
-    """On cores a plan keeps to its part of the machine's memory, and ranks take all cores of theirs."""
+    """Without GPUs, plans already limit their memory to a fraction of the machine's, so only cores are requested."""
     assert _bundle([{"CPU": 32.0, "memory": 100.0 * GB}], 2, 8, 5 * GB) == {"CPU": 8}
     assert _bundle([{"CPU": 32.0, "GPU": 4.0}], 2, 8, 5 * GB) == {"CPU": 8, "GPU": 1}, "Ray was told of none"
 
 
 @contextmanager
 def taken(memory: int) -> Iterator[None]:
-    """Memory of the cluster that another job holds."""
+    """Reserve memory of the cluster, as another job would."""
     from ray.util import placement_group, remove_placement_group
 
     group = placement_group([{"memory": memory}])
@@ -56,7 +56,7 @@ def taken(memory: int) -> Iterator[None]:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent")
 @pytest.mark.usefixtures("joined")
 def test_ray_gives_no_gpus_on_a_machine_whose_memory_is_taken() -> None:
-    """Two GPUs and 10 GB; a scene of 2 GB needs 10 GB with two ranks and 7 GB with one."""
+    """The cluster has two GPUs and 10 GB; a scene of 2 GB needs 10 GB with two ranks and 7 GB with one."""
     with Cluster(2):
         reserved = reserve(2, 2 * GB)
         assert len(reserved.groups) == 2

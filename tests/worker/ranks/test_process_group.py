@@ -1,4 +1,4 @@
-"""The exchanges over torch.distributed against what they are defined to give."""
+"""Tests of the collectives over torch.distributed against their definitions."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_rows_are_gathered_and_scattered(ranks: int, covered: tuple[int, int]) -
 
 
 def features(rank: int) -> Tensor:
-    """Layer features with a mean 1e4 times their spread, a channel that is constant, and one that is dead."""
+    """Return features with a mean of 1e4 standard deviations, a constant channel, and a channel of zeros."""
     values = torch.randn(11 + 3 * rank, 7, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(rank))
     values[..., 1] += 1e4
     values[..., 2] = 3.7
@@ -184,7 +184,7 @@ def leave_out(collectives: Collectives) -> str | int:
 
 
 def test_ranks_that_would_only_add_communication_are_left_out() -> None:
-    """A view of 32 x 24 pixels: every tile is all halo."""
+    """In a view of 32 x 24 pixels, all tiles consist of halo only."""
     results = on_ranks(4, leave_out)
     taking_part = [result for result in results if result != "left out"]
     assert len(taking_part) < 4
@@ -200,7 +200,7 @@ def test_one_rank_has_nobody_to_tell() -> None:
 
 
 def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
-    """Whether rank 1 waits for rank 0, which comes three seconds late, where one second is the time-out."""
+    """Return whether rank 1 waits for rank 0, which is three seconds late, with a timeout of one second."""
     collectives.all_gather(None)
     if expected is not None:
         collectives.set_timeout_for(expected)

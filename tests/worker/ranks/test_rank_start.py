@@ -1,4 +1,4 @@
-"""What a rank sets before it begins: threads, its GPU, the precision of products."""
+"""Tests of the state that a rank sets before it starts: threads, GPU, precision of matrix products."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from worker.ranks.rank import _failure
 
 ROOT = Path(__file__).resolve().parents[3]
 
-#: A kernel without machine code on disk, compiled after the threads of Numba have started and been told otherwise.
+#: Program that compiles an uncached kernel after Numba's threads have started and another number of threads was set.
 COLD_CACHE = """
 import os, sys
 import numba, numpy as np
@@ -47,7 +47,7 @@ def test_threads_can_be_told_after_kernels_have_run() -> None:
 
 
 def test_a_gpu_has_its_number_before_it_is_made_the_current_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PyTorch refuses a device without one, and does so before it looks for a GPU."""
+    """PyTorch refuses a device without an index, and does so before it looks for a GPU."""
     with pytest.raises(ValueError, match="index"):
         torch.cuda.set_device(torch.device("cuda"))
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 3)
@@ -57,7 +57,7 @@ def test_a_gpu_has_its_number_before_it_is_made_the_current_one(monkeypatch: pyt
 
 
 def test_an_error_of_the_store_is_one_of_an_exchange() -> None:
-    """A rank that is lost while the others form their group."""
+    """Such an error occurs if a rank is lost while the others form their group."""
     assert _failure(dist.DistStoreError("wait timeout")).echo
     assert not _failure(RuntimeError("wait timeout")).echo
 

@@ -1,4 +1,4 @@
-"""On GPUs: NCCL ranks against one rank, and one GPU against the CPU."""
+"""Tests on GPUs: NCCL ranks against one rank, and one GPU against the CPU."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("vgg16_weights")]
 
 
 def gradient(collectives: Collectives, name: str) -> Tensor:
-    """Color gradient [n, 3] of one view at two scales, as a step computes it on this machine's devices."""
+    """Compute the color gradient [N, 3] of one view at two scales, as a step does on this machine's devices."""
     scene = wall(sh_degree=1) if name == "wall" else ball()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=120, keep=("ranks",))
     stylizer = Stylizer.planned(
@@ -37,7 +37,7 @@ def gradient(collectives: Collectives, name: str) -> Tensor:
 
 @pytest.fixture
 def exact_convolutions() -> Any:
-    """TensorFloat-32 rounds to ten bits: no comparison at 1e-5."""
+    """Disable TensorFloat-32, which rounds to ten bits and would not allow comparisons at 1e-5."""
     before = torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
     torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     yield
@@ -66,7 +66,7 @@ def test_nccl_ranks_give_the_gradient_of_one(name: str, tmp_path: Path, exact_co
 
 
 def merge_beside_other_work(rank: int, size: int, address: str, folder: str) -> None:
-    """Statistics of three scales under way at once, while the caller's stream overwrites what it may."""
+    """Merge statistics of three scales at once, while the caller's stream reuses the memory that it may reuse."""
     with process_group(rank, size, address, device=f"cuda:{rank}", timeout=timedelta(seconds=60)) as collectives:
         waiting = []
         for turn in range(3):
@@ -109,7 +109,7 @@ def test_statistics_are_merged_beside_other_work(tmp_path: Path) -> None:
 def test_one_gpu_gives_the_gradient_of_the_cpu(
     name: str, exact_convolutions: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another device sums in another order, so that near-ties of max pooling may fall the other way."""
+    """Devices add in different orders, so near-ties of max pooling may be resolved differently."""
     on_gpu = gradient(ALONE, name)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     on_cpu = gradient(ALONE, name)

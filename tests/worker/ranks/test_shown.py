@@ -1,4 +1,4 @@
-"""The sum of a gradient over ranks, of which only what the view shows travels, and the count of what is sent."""
+"""Tests of the gradient sum over ranks, which exchange only values of Gaussians in the view, and of the sent bytes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WIDTH, HEIGHT = 128, 96
 
 
 def make_views(collectives: Collectives, scene: Scene, camera: Camera, memory: int = 1 << 30) -> Views:
-    """Views of which nothing is kept with a memory of 0."""
+    """Return views, which cache nothing if the memory is 0."""
     loss = SosLoss(FeatureNetwork(tiny_weights(), (*STYLE_LAYERS, CONTENT_LAYER)), collectives=collectives)
     rasterizer = make_rasterizer("cpu", scene)
     return Views(scene, [camera], rasterizer, loss, covered=[0], weighted=False, memory=memory, collectives=collectives)
@@ -43,7 +43,7 @@ def pixels(camera: Camera, seed: int) -> Tensor:
 
 
 def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[str, Any]:
-    """Color gradients [N, 3] of two visits, of which all values travel, or those of shown Gaussians alone."""
+    """Return color gradients [N, 3] of two visits, with all values exchanged and with those of shown Gaussians only."""
     found: dict[str, Any] = {}
     for name, memory in (("whole", 0), ("shown", 1 << 30)):
         views = make_views(collectives, scene, camera, memory)
@@ -61,13 +61,13 @@ def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[st
 
 
 def shown_of(scene: Scene, camera: Camera) -> Tensor:
-    """[N] bool."""
+    """Return whether the view shows each Gaussian, [N] bool."""
     ones = torch.ones(camera.height, camera.width, 3)
     return make_rasterizer("cpu", scene).color_gradient(ones, camera)[:, 0] > 0
 
 
 def upper(scene: Scene) -> Scene:
-    """What projects into the upper half of the views; y points down."""
+    """Return the Gaussians that project to the upper half of the views; y points down."""
     return scene.subset(scene.means[:, 1] < -0.5)
 
 
@@ -94,7 +94,7 @@ def test_what_the_view_shows_gives_the_bits_of_the_whole_gradient(scene: Scene, 
 
 
 def test_a_band_that_shows_nothing_is_one() -> None:
-    """What the second of the cases above stands for."""
+    """Check the assumption of the second case above."""
     scene, camera = upper(wall()), cameras(1, WIDTH, HEIGHT)[0]
     first, second = divide_rows(HEIGHT, 2)
     rasterizer = make_rasterizer("cpu", scene)
@@ -103,7 +103,7 @@ def test_a_band_that_shows_nothing_is_one() -> None:
 
 
 def test_rings_of_more_ranks_add_in_other_orders() -> None:
-    """A value's place decides at which rank the ring begins to add: rounding, and no more."""
+    """The index of a value determines the rank at which the ring starts to add, so only the rounding differs."""
     scene, camera = wall(), cameras(1, WIDTH, HEIGHT)[0]
     results = on_ranks(4, both_ways, scene, camera)
     for found in results:
@@ -161,7 +161,7 @@ def run_two_steps(collectives: Collectives) -> dict[str, Any]:
 
 
 def test_a_step_says_what_it_sent() -> None:
-    """Two ranks send half of what they add up, twice, and their half of the image, twice."""
+    """Each of two ranks sends twice half of what they add, and twice its half of the image."""
     layer = CHANNELS + 1 + CHANNELS * (CHANNELS + 1) // 2
     statistics = 8 * (len(STYLE_LAYERS) * layer + len(TERMS))
     for found in on_ranks(2, run_two_steps):

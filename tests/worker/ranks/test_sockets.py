@@ -1,4 +1,4 @@
-"""Sockets of a job on several ranks: on one machine, other machines can reach none of them."""
+"""Tests of the sockets of a job on several ranks: other machines cannot reach those of a job on one machine."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = [
 
 
 def listening(process: psutil.Process) -> list[str]:
-    """Addresses on which a process accepts connections or datagrams."""
+    """Return the addresses on which a process accepts connections or datagrams."""
     found = []
     for socket in process.net_connections("inet"):
         if socket.status == psutil.CONN_LISTEN or (socket.type.name == "SOCK_DGRAM" and not socket.raddr):
@@ -59,21 +59,21 @@ def _is_loopback(address: str) -> bool:
 
 
 def own_sockets(collectives: Collectives) -> list[str]:
-    """Addresses that a rank listens on while it is in its group."""
+    """Return the addresses that a rank listens on while it is in its group."""
     collectives.all_gather(None)
     return listening(psutil.Process())
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2"])
 def test_ranks_listen_on_the_address_of_their_job_alone(host: str) -> None:
-    """127.0.0.2 is that of a cluster's interface here."""
+    """Here 127.0.0.2 stands for the address of a cluster's interface."""
     first, second = on_ranks(2, own_sockets, host=host)
     assert host in first, "the ranks' store"
     assert {"127.0.0.1", host} >= {*first, *second}
 
 
 class Evil:
-    """Makes a folder when it is unpickled."""
+    """Object that creates a folder when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -83,7 +83,7 @@ class Evil:
 
 
 def send_raw(data: bytes, *, broadcast: bool) -> None:
-    """Send bytes in the place of a message: their number, then they themselves, as long as the longest message is."""
+    """Send bytes in place of a message: their number, then the bytes, padded to the longest message."""
     size, message = torch.tensor([len(data)]), torch.frombuffer(bytearray(data), dtype=torch.uint8)
     if broadcast:
         dist.broadcast(size, 0)
@@ -97,7 +97,7 @@ def send_raw(data: bytes, *, broadcast: bool) -> None:
 
 
 def receive(collectives: Collectives, path: Path, broadcast: bool) -> str:
-    """Error of the rank that receives a pickle from the other one."""
+    """Return the error message of the rank that receives a pickle from the other one."""
     if collectives.rank == (0 if broadcast else 1):
         send_raw(pickle.dumps(Evil(path)), broadcast=broadcast)
         return ""

@@ -1,4 +1,4 @@
-"""Who takes part, whether ranks agree, and how fast each is: without a scene."""
+"""Tests of the team of ranks without a scene: participation, agreement and speeds."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def plan(ranks: int) -> Plan:
 
 
 def drift(collectives: Collectives) -> list[str]:
-    """What is said after a step of the same colors, and after two of others."""
+    """Check equal colors, then different colors twice, and return the error message."""
     team = Team(plan(2), make_settings(), collectives)
     colors, other = torch.zeros(3, 3), torch.full((3, 3), 1e-6 * collectives.rank)
     team.check_drift(DRIFT_STEPS, colors)
-    team.check_drift(DRIFT_STEPS + 1, other)  # nobody looks
+    team.check_drift(DRIFT_STEPS + 1, other)  # not checked at this step
     with pytest.raises(RanksDriftedError) as raised:
         team.check_drift(2 * DRIFT_STEPS, other)
     return [str(raised.value)]
@@ -37,7 +37,7 @@ def test_drift_is_found_on_every_rank() -> None:
 
 
 def speeds(collectives: Collectives, slower: float, rebalance: bool) -> list[tuple[float, ...] | None]:
-    """What is told after each step; rank 1 takes `slower` times as long."""
+    """Return the reported speeds after each step. Rank 1 is slower by the factor `slower`."""
     team = Team(plan(2), make_settings(rebalance=rebalance), collectives)
     seconds = {"vgg_forward": 1.0, "vgg_backward": 1.0, "render": 9.0}
     if collectives.rank == 1:
