@@ -333,13 +333,13 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
         "statistics": Part(moments),
         "style gradient": Part(style),
         "content loss": Part(passes.content()),
-        "content features anew": Part(uncached, missing["content"], len(uncached)),
+        "content features recomputed": Part(uncached, missing["content"], len(uncached)),
         "pyramid": Part(passes.scaled() + passes.added_up()),
         "render": Part(render(job)),
         "raster gradient": Part(raster_gradient(job)),
-        "lists anew": Part(lists(job), missing["lists"], LIST_LAUNCHES),
+        "lists recomputed": Part(lists(job), missing["lists"], LIST_LAUNCHES),
         "colors and Adam": Part(colors(job)),
-        "frozen colors anew": Part(frozen, missing["colors"] * (1 + missing["content"]), len(frozen)),
+        "frozen colors recomputed": Part(frozen, missing["colors"] * (1 + missing["content"]), len(frozen)),
     }
 
 

@@ -99,7 +99,7 @@ class ServiceSettings(BaseSettings):
     upload_hours: float = Field(24, gt=0)
     retention_days: float = Field(30, gt=0)
 
-    lease_seconds: float = Field(30, gt=0)
+    lease_seconds: float = Field(30, gt=0, le=1800)  # far below the hour at which `store.queue` finds times implausible
     max_attempts: int = Field(3, gt=0)
     retry_seconds: float = Field(5, ge=0)
     parallel_jobs: int | None = Field(None, gt=0)

@@ -36,6 +36,8 @@ LEASE_SECONDS, CHECKPOINT_SECONDS, POLL_SECONDS = 30.0, 60.0, 0.5
 #: Seconds after which a host polls again if it has free GPUs but fits none of the waiting jobs (a real one uses
 #: `POLL_SECONDS`).
 _LOOK_AGAIN = 10.0
+#: Interval between renewals of a host's leases in seconds; real ones are renewed more often.
+_RENEWAL_SECONDS = 900.0
 #: Minimum and maximum seconds until a failed host is back.
 _REPAIR_SECONDS = (600.0, 3600.0)
 _EPOCH = 1_700_000_000.0
@@ -133,8 +135,8 @@ class Fleet:
         self._number = 0
         self._doing = ""
         self._waiting = 0
-        # Leases last as long as the simulation; `_run_out` ends those of failed hosts.
-        settings = ServiceSettings(data=folder, lease_seconds=1e9, log_format="text")
+        # Leases last long, so that few renewals are simulated; `_run_out` ends those of failed hosts.
+        settings = ServiceSettings(data=folder, lease_seconds=2 * _RENEWAL_SECONDS, log_format="text")
         self.store: Store = open_store(settings, lambda: _EPOCH + self.now)
         self._prepare_store()
         names = tuple(str(number) for number in range(gpus_each))
@@ -173,6 +175,7 @@ class Fleet:
             self._at(job.at, lambda job=job: self._arrive(job))  # type: ignore[misc]
         for host in self.hosts:
             self._fail_some_day(host)
+            self._at(_RENEWAL_SECONDS, lambda host=host: self._renew(host))  # type: ignore[misc]
         while self._events and self._events[0][0] <= seconds:
             if time.perf_counter() - started > patience:
                 seconds = self.now
@@ -289,6 +292,12 @@ class Fleet:
         attempt.record.ended = self.now
         del host.running[attempt.lease.job_id]
         self._at(self._soon(), lambda: self._look(host))
+
+    def _renew(self, host: Host) -> None:
+        if host.up and host.running:
+            self._do("renew")
+            self.store.leases.renew([attempt.lease for attempt in host.running.values()])
+        self._at(self.now + _RENEWAL_SECONDS, lambda: self._renew(host))
 
     # --- failures --------------------------------------------------------------------------------------------------
 

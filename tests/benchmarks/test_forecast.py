@@ -82,13 +82,13 @@ def test_device_and_host_work_at_the_same_time() -> None:
     assert step_seconds(parts, shares, "float32", 10**9)["total"] == pytest.approx(1e9 * shares.launch, rel=1e-6)
 
 
-def test_what_is_kept_is_not_made_anew() -> None:
+def test_cached_values_are_not_recomputed() -> None:
     everything = forecast.kept_shares(SMALL, make_loss("float32"), coarse=False)
     assert everything == {"content": 1.0, "lists": 1.0, "colors": 1.0}
     garden = forecast.kept_shares(JOBS["5187x3361"], make_loss("float32"), coarse=False)
     assert all(0 < share < 1 for share in garden.values())
     parts = forecast.step_parts(SMALL, "bfloat16")
-    assert [parts[name].visits for name in parts if name.endswith("uncached")] == [0.0] * 3
+    assert [parts[name].visits for name in parts if name.endswith("recomputed")] == [0.0] * 3
 
 
 def test_the_range_holds_the_likely_figure() -> None:

@@ -206,5 +206,5 @@ def test_lpips_is_left_out_where_its_weights_are_not_installed(vgg16_weights, tm
     assert installed is not None
     assert installed.network == "alex"
     (tmp_path / "lpips_alex.safetensors").write_bytes(b"no weights")
-    with pytest.raises(WeightsError, match="corrupt"):
+    with pytest.raises(WeightsError, match="damaged"):
         load_lpips_or_none(folder=tmp_path)

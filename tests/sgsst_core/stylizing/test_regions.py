@@ -107,7 +107,7 @@ def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> Non
     near = (scene.means[:, 0].abs() < 2.35) & (scene.means[:, 1].abs() < 1.8)
     regions = Regions((Region("rest"), Region("middle", freeze=True)), near.to(torch.uint8))
     assert bool((~near).any())
-    with pytest.raises(SettingsError, match="Every Gaussian that a view sees is kept"):
+    with pytest.raises(SettingsError, match="Every Gaussian that a view sees is frozen"):
         make(tiny_weights, scene, regions)
 
 
