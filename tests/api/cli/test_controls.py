@@ -74,7 +74,7 @@ def test_a_plan_tells_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["--scales", "0,0"], "no scale has a weight"),
         (["--scales", "1,-1"], "greater than or equal to 0"),
         (["--scales", "nan"], "finite"),
-        (["--scales", "fine"], "are no numbers with commas between them"),
+        (["--scales", "fine"], "is not a list of weights"),
         (["--scales", "0,1"], "the views have one scale, 0"),
         (["--sh-attenuation", "1.5"], "less than or equal to 1"),
         (["--preserve-colors", "hue"], "hue"),
