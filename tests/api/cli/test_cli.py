@@ -101,8 +101,8 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     told += ["--region", "left:half-space=-1,0,0,0.5", "--region-freeze", "left", "--region", "far:sphere=0,0,99,1"]
     assert main(files.stylize("--steps-sos", "2", "--warm-start", "--clamp-aware-gradient", *told)) == 0
     said = capsys.readouterr().out
-    assert "take other.png, with weight 2" in said
-    assert "region far:           warning: left out, because it has no Gaussians" in said
+    assert "use other.png, with weight 2" in said
+    assert "region far:           warning: ignored, because it has no Gaussians" in said
     before, after = second_reader(files.ply), second_reader(files.out)
     kept = before["x"] <= -0.5
     for name, values in before.items():
@@ -293,7 +293,7 @@ def test_a_plan_shows_the_views_of_an_orbit_before_the_start(files: Files, capsy
         assert views.width > 4 * 30
     decisions = {each["item"]: each for each in json.loads(out.read_text())["decisions"]}
     assert decisions["up"]["decision"] == "z"
-    assert decisions["cameras"]["decision"] == "4 views in a ring at 30 degrees, 5 from the middle"
+    assert decisions["cameras"]["decision"] == "4 views in a ring at 30 degrees, 5 from the center"
     assert main([*command, "--sheet", str(out)]) == 2
     assert "views.jpg" in capsys.readouterr().err
 
@@ -536,7 +536,7 @@ def test_an_old_checkpoint_is_mentioned_when_a_job_starts_anew(
     main(files.stylize("--steps-sos", "3", "--max-seconds", "0.000001"))
     capsys.readouterr()
     assert main(files.stylize("--steps-sos", "2")) == 0
-    assert "of an earlier run is there" in capsys.readouterr().out
+    assert "exists from an earlier run" in capsys.readouterr().out
     assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
 
 

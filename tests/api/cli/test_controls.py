@@ -40,7 +40,7 @@ def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.
     shown = capsys.readouterr().out
     for line in (
         "luminance alone is compared and optimized",
-        "0.75 times as large",
+        "multiplied by 0.75",
         "scale 0 1, scale 2 0.5; 1 of 3 scales are not computed",
         "2 of 3 scales",
     ):

@@ -136,7 +136,7 @@ def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
         run(stylizer)
     assert torch.equal(found.stylized(), wanted.stylized())
     (line,) = [each for each in found.plan.decisions if each.item == "region empty"]
-    assert line.decision == "warning: left out, because it has no Gaussians"
+    assert line.decision == "warning: ignored, because it has no Gaussians"
 
 
 def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights) -> None:
