@@ -119,7 +119,7 @@ def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_pat
     assert refined["lowest_psnr"] >= 40
     if form != "ply":
         assert len(read_scene(resumed.out).scene) == refined["gaussians"]
-    assert "cutting large Gaussians" in resumed.out.with_name("s.report.html").read_text()
+    assert "splitting large Gaussians" in resumed.out.with_name("s.report.html").read_text()
 
 
 def test_planning_is_shown(request_: StylizeRequest) -> None:

@@ -278,7 +278,7 @@ def test_orbit_needs_no_camera_file(files: Files) -> None:
     assert [decision["item"] for decision in report["plan"]["decisions"][:3]] == ["up", "cameras", "frames"]
     with Image.open(files.out.with_name("stylized.views.jpg")) as views:
         assert views.format == "JPEG"
-    assert "The orbit's views" in files.out.with_name("stylized.report.html").read_text()
+    assert "Views of the orbit" in files.out.with_name("stylized.report.html").read_text()
     assert report["position_weights"]["used"] is True
 
 
@@ -325,7 +325,7 @@ def test_a_target_ends_the_run_and_the_report_says_what_the_time_bought(
 ) -> None:
     assert main(files.stylize("--steps-sos", "60", "--target-loss", "0.8", "--learning-rate", "0.1")) == 0
     shown = capsys.readouterr().out
-    assert "come down to --target-loss" in shown
+    assert "reached --target-loss" in shown
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     assert report["stopped"] == "target-loss"
     assert 3 <= len(report["history"]) < 60

@@ -107,7 +107,7 @@ def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> Non
     near = (scene.means[:, 0].abs() < 2.35) & (scene.means[:, 1].abs() < 1.8)
     regions = Regions((Region("rest"), Region("middle", freeze=True)), near.to(torch.uint8))
     assert bool((~near).any())
-    with pytest.raises(SettingsError, match="Every Gaussian that a view sees is kept"):
+    with pytest.raises(SettingsError, match="Every Gaussian that a view sees is frozen"):
         make(tiny_weights, scene, regions)
 
 
@@ -237,8 +237,8 @@ def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
     plan, _ = make_plan(scene, cameras(), settings, weights=tiny_weights, regions=halves(scene))
     lines = {line.item: line for line in plan.decisions}
     assert "2 renders at a view's first visit, 0.1 MB for all views" in lines["regions"].decision
-    assert "% of what the views show, take the style" in lines["region rest"].decision
-    assert "take picture 1" in lines["region right"].decision
+    assert "% of what the views show, use the style" in lines["region rest"].decision
+    assert "use picture 1" in lines["region right"].decision
 
 
 def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: BackboneWeights) -> None:
