@@ -302,7 +302,7 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
         SettingsError: If the preset is unknown, or a value is out of range.
     """
     if preset not in _PRESETS:
-        raise SettingsError(f"There is no preset {preset!r}; choose one of {', '.join(_PRESETS)}.")
+        raise SettingsError(f"There is no preset {preset!r}. Choose one of {', '.join(_PRESETS)}.")
     chosen = {name: value for name, value in values.items() if value is not None}
     if "learning_rate" in chosen:  # an explicit learning rate is constant, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])

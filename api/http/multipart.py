@@ -336,7 +336,7 @@ def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSet
     count = declared.count
     if count > settings.max_gaussians:
         raise RefusedInputError(
-            f"The scene has {count:,} Gaussians; {settings.max_gaussians:,} may be.",
+            f"The scene has {count:,} Gaussians. At most {settings.max_gaussians:,} are allowed.",
             "too-many-gaussians",
             input=role,
             limit=settings.max_gaussians,

@@ -46,7 +46,7 @@ class Receipts:
                 try:
                     await asyncio.to_thread(self.inputs.renew_receipts, list(self.active))
                 except DatabaseUnavailableError:  # they last for several renewals
-                    _log.warning("receipts could not be renewed; this is tried again")
+                    _log.warning("receipts could not be renewed; retrying")
 
 
 class Receipt:

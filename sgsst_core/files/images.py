@@ -183,7 +183,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except Exception as error:  # Pillow's decoders raise whatever their format's parser runs into
         if isinstance(error, OSError) and error.strerror:
             raise ImageError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
-        raise ImageError(f"{path}: is truncated or corrupt ({error}). Give another copy.") from error
+        raise ImageError(f"{path}: is truncated or corrupt ({error}). Use an intact copy.") from error
 
 
 def _check_scans(path: Path) -> None:
@@ -204,7 +204,7 @@ def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:
     if image.mode.startswith(("I", "F")):  # more than 8 bits, always gray: Pillow would cut them off at 255
         values: NDArray[np.float32] = np.asarray(image, dtype=np.float32)
         if not np.isfinite(values).all():
-            raise ImageError(f"{path}: holds NaN or infinite pixels. Give another image.")
+            raise ImageError(f"{path}: holds NaN or infinite pixels. Use another image.")
         gray = np.clip(values / np.float32(_full_scale(image.mode, float(values.max()))), 0, 1)
         key = image.info.get("transparency")
         if isinstance(key, int):

@@ -198,7 +198,7 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
     warnings: list[str] = []
     assert go_on(prepare(request_), checkpoint_seconds=0, warnings=warnings).stopped == "finished"
     assert len(warnings) == 1
-    assert "No checkpoint could be written" in warnings[0]
+    assert "The checkpoint could not be written" in warnings[0]
     assert len(read_scene(request_.out).scene) == 616
     left = {path.suffix for path in request_.out.parent.iterdir()}
     assert ".safetensors" not in left
