@@ -324,7 +324,8 @@ def _check_queue(session: Session, owner: str, limit: int) -> None:
     """Raise QueueFullError if an owner has `limit` unfinished jobs."""
     if session.execute(_UNFINISHED_OF, {"owner": owner}).scalar_one() >= limit:
         raise QueueFullError(
-            f"There are {limit} unfinished jobs of this key. Wait for one to finish, or cancel one.", limit=limit
+            f"There are already {limit} unfinished jobs of this key. Wait for one to finish, or cancel one.",
+            limit=limit,
         )
 
 

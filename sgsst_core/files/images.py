@@ -256,7 +256,7 @@ def _check_aspect(path: Path, size: tuple[int, int], camera: Camera) -> None:
     if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > allowed:
         raise ImageError(
             f"{path}: is {size[0]} x {size[1]}, but its camera {camera.name!r} {camera.width} x {camera.height}, "
-            "another aspect. Give the photos that the cameras were computed from, neither cropped nor turned."
+            "another aspect. Give the photos that the cameras were computed from, neither cropped nor rotated."
         )
 
 

@@ -493,9 +493,9 @@ def _valid_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool)
         ]
     summary = f"{path}: {bad} of {len(kept)} Gaussians {', or '.join(flawed)}"
     if bad == len(kept):
-        raise SceneError(f"{summary}. None is left: train or export the scene again.")
+        raise SceneError(f"{summary}. No valid Gaussians remain. Train or export the scene again.")
     if not drop_invalid:
-        raise SceneError(f"{summary}. Give --drop-invalid to leave these Gaussians out.")
+        raise SceneError(f"{summary}. Use --drop-invalid to drop these Gaussians.")
     return kept
 
 

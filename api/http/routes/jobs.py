@@ -357,11 +357,11 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
         **problems(
             _NOT_THERE,
             ConflictError(
-                "The job has status running; only one that failed or was canceled can be tried again.",
+                "The job has status running; only failed or canceled jobs can be retried.",
                 job_status="running",
             ),
             QueueFullError(
-                "There are 100 unfinished jobs of this key already. Wait for one to end, or cancel one.", limit=100
+                "There are already 100 unfinished jobs of this key. Wait for one to finish, or cancel one.", limit=100
             ),
             QuotaError(
                 "This key may submit 1,000 jobs a day, and has done so. Try again tomorrow (UTC).",

@@ -391,7 +391,7 @@ ROW = 20 + 9
         (spz_bytes(3, 616, 1, bytes(616 * ROW - 1)), "ends before all Gaussians"),
         (spz_bytes(3, 616, 1, bytes(616 * ROW))[:-9], "ends before all Gaussians"),
         (spz_bytes(3, 4_000_000_000, 3, bytes(1000)), "declares 4000000000 Gaussians, which take 260000000016 bytes"),
-        (spz_bytes(3, 616, 1, bytes(616 * ROW + (64 << 20))), "goes on behind all Gaussians"),
+        (spz_bytes(3, 616, 1, bytes(616 * ROW + (64 << 20))), "continues after all Gaussians"),
         (spz_bytes(5, 616, 1, bytes(616 * ROW)), "version 5, which cannot be read.*splat-transform"),
         (spz_bytes(3, 616, 4, bytes(100)), "SH degree 4; 0 to 3 can be read.*splat-transform"),
         (spz_bytes(3, 0, 0), "holds no Gaussians"),
