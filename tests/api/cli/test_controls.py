@@ -39,7 +39,7 @@ def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.
     assert main(command("stylize", tmp_path, "--out", str(out), *steps, *CONTROLS)) == 0
     shown = capsys.readouterr().out
     for line in (
-        "luminance alone is compared and optimized",
+        "only luminance is compared and optimized",
         "multiplied by 0.75",
         "scale 0 1, scale 2 0.5; 1 of 3 scales are not computed",
         "2 of 3 scales",
