@@ -6,7 +6,7 @@ from typing import Self
 
 from sgsst_core.errors import InfrastructureError, SgsstError
 
-_AGAIN = "If you have sent it, send it again; a result has to be computed again."
+_AGAIN = "If you uploaded it, upload it again; if it is a result, run the job again."
 
 
 class ServiceError(SgsstError):
@@ -105,8 +105,8 @@ class DamagedWeightsError(ServiceError, InfrastructureError):
 
     def __init__(self) -> None:
         super().__init__(
-            "The service's feature networks are damaged. Try again when its operator has installed them again: the "
-            "log and `sgsst weights list` say which.",
+            "The service's feature networks are damaged. Retry after its operator has reinstalled them; the log and "
+            "`sgsst weights list` name them.",
             retry_after=60,
         )
 
@@ -139,7 +139,7 @@ class LockedError(ServiceError):
     code, status = "upload-locked", 423
 
     def __init__(
-        self, message: str = "Another request is writing to this upload. Ask for its offset, and go on from there."
+        self, message: str = "Another request is writing to this upload. Get its offset and resume from there."
     ) -> None:
         super().__init__(message)
 

@@ -25,8 +25,8 @@ class JobParameters(StylizeOptions):
         json_schema_extra={"examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}]},
     )
 
-    name: Annotated[str, Option(default="none; sgsst submit takes the scene's file name")] = Field(
-        "", max_length=200, pattern=_NO_CONTROLS, description="For people; not unique."
+    name: Annotated[str, Option(default="none; sgsst submit uses the scene's file name")] = Field(
+        "", max_length=200, pattern=_NO_CONTROLS, description="Display name; need not be unique."
     )
     style_weights: Annotated[
         list[Annotated[float, Field(gt=0, allow_inf_nan=False)]] | None, Option(instead="--style FILE:WEIGHT")
@@ -34,14 +34,14 @@ class JobParameters(StylizeOptions):
         None,
         min_length=1,
         max_length=MOST_PICTURES,
-        description="Weight of each style image that is no region's, in the order in which they are sent: they are "
-        "mixed in proportion. Without, they count alike.",
+        description="Weight of each style image that belongs to no region, in upload order: images are mixed in "
+        "proportion. Default: equal weights.",
     )
     regions: Annotated[list[RegionOptions] | None, Option(instead="--region NAME:SPEC")] = Field(
         None,
         max_length=MOST_REGIONS + 1,
-        description="Regions of the scene, each with a style of its own or kept. Where they overlap, the later one "
-        "counts. Masks are for `sgsst stylize` alone.",
+        description="Regions of the scene, each with its own style or frozen. Where regions overlap, the later one "
+        "wins. Only `sgsst stylize` accepts masks.",
     )
 
     @property
@@ -55,8 +55,8 @@ class JobParameters(StylizeOptions):
         for region in found:
             if region.selection is not None and region.selection.path is not None:
                 raise SettingsError(
-                    f"Region {region.name!r} is selected by {region.selection.kind}=, which the service does not take: "
-                    "masks are for the command line (sgsst stylize). Give a box, a sphere, a half-space or a property."
+                    f"Region {region.name!r} is selected by {region.selection.kind}=, which the service does not "
+                    "accept: only sgsst stylize accepts masks. Use a box, sphere, half-space or property."
                 )
         return found
 
@@ -71,7 +71,7 @@ def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
         return checked(JobParameters, _with_present_names(values))
     except SettingsError as error:
         raise SettingsError(
-            f"{error} The job was stored by a version of the service that took this. Submit it anew without."
+            f"{error} The job was stored by an earlier version that accepted this. Submit a new job without it."
         ) from error
 
 

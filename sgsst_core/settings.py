@@ -50,12 +50,12 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Near = Annotated[
     float,
     Option(unit="scene units"),
-    Field(gt=0, allow_inf_nan=False, description="Near plane, in the scene's units."),
+    Field(gt=0, allow_inf_nan=False, description="Distance of the near plane."),
 ]
 Resolution = Annotated[
     int | None,
     Option(unit="pixels", name="resolution", default="the cameras' own"),
-    Field(ge=1, le=MAX_RESOLUTION, description="Pixels of every view's longer side."),
+    Field(ge=1, le=MAX_RESOLUTION, description="Longer side of every view in pixels."),
 ]
 
 
@@ -95,18 +95,18 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    preset: PresetName = Field("standard", description="Where the settings below start from.")
+    preset: PresetName = Field("standard", description="Preset that sets the defaults of the options below.")
     steps_coarse: Annotated[int, Option(unit="steps", metavar="N")] = Field(
-        ge=0, le=_MAX_STEPS, description="Steps of phase 1, on the coarsest scale alone."
+        ge=0, le=_MAX_STEPS, description="Steps of phase 1, on the coarsest scale only."
     )
     steps_sos: Annotated[int, Option(unit="steps", metavar="N")] = Field(
         ge=0, le=_MAX_STEPS, description="Steps of phase 2, on all scales."
     )
-    learning_rate: Annotated[float, Option(unit="of a color, a step", metavar="R")] = Field(
-        gt=0, le=100, allow_inf_nan=False, description="Adam's learning rate; constant where it is given."
+    learning_rate: Annotated[float, Option(unit="color units per step", metavar="R")] = Field(
+        gt=0, le=100, allow_inf_nan=False, description="Learning rate of Adam; constant if given."
     )
     learning_rate_end: Annotated[float, Option(unit="as learning_rate", instead="learning_rate")] = Field(
-        gt=0, le=100, allow_inf_nan=False, description="Adam's learning rate at the end, reached exponentially."
+        gt=0, le=100, allow_inf_nan=False, description="Final learning rate of Adam, reached by exponential decay."
     )
     content_weight: Annotated[
         float,
@@ -117,133 +117,140 @@ class Settings(BaseModel):
         ge=0,
         le=_MAX_WEIGHT,
         allow_inf_nan=False,
-        description="Weight of the content term, or how strong the style is: light, balanced or strong; 0 leaves the "
-        "term out.",
+        description="Weight of the content term, or a style strength: light, balanced or strong; 0 disables the term.",
     )
     feature_scale: FeatureScale = Field(
         "even",
-        description="How much each layer of the network counts; paper: as in the paper's network; even: Gram "
-        "matrix, mean and deviation count about alike, the first layer more, and the pixels' own colors too.",
+        description="Weighting of the network's layers; paper: as published; even: Gram matrix, mean and standard "
+        "deviation count about equally, the first layer counts more, and pixel colors count too.",
     )
     style_loss: StyleLossName = Field(
         "sos",
-        description="How views are compared with the style; sos: by statistics of features, as in the paper; nnfm: "
-        "each feature with the nearest one of the style, as in ARF; mixed: both.",
+        description="Comparison of views with the style; sos: feature statistics, as in the paper; nnfm: each feature "
+        "with its nearest neighbor in the style, as in ARF; mixed: both.",
     )
     position_weights: PositionWeights = Field(
         "auto",
-        description="Weigh statistics by coverage, so that an empty surround does not count; auto does so where views "
-        "have uncovered pixels.",
+        description="Weight statistics by coverage, so that an empty background does not count; auto: if views have "
+        "uncovered pixels.",
     )
     precision: Precision = Field(
         "float32",
-        description="Number format of the feature network; tf32: of its convolutions alone, on NVIDIA GPUs.",
+        description="Precision of the feature network; tf32: for convolutions only, on NVIDIA GPUs.",
     )
     max_resolution: Resolution = None
     background: Annotated[tuple[Share, Share, Share], Option(unit="RGB, 0 to 1", default="black")] = Field(
-        (0.0, 0.0, 0.0), description="Color behind the Gaussians."
+        (0.0, 0.0, 0.0), description="Background color behind the Gaussians."
     )
     training_background: TrainingBackground = Field(
         "auto",
-        description="What is behind the Gaussians in a step: the background, a random color each time, or that of a "
-        "random pixel of the style; auto: by how much of the views is uncovered.",
+        description="Background during steps; background: the background color; random: a random color each time; "
+        "palette: the color of a random style pixel; auto: depends on how much of the views is uncovered.",
     )
     near: Near = NEAR
     style_scale: Annotated[float, Option(unit="factor", metavar="S")] = Field(
-        1.0, ge=0.25, le=4, description="Strokes S times as large as the style image has them in a view."
+        1.0,
+        ge=0.25,
+        le=4,
+        description="Draw strokes S times as large as they are in the style image, fitted to a view.",
     )
     style_rotation: Annotated[float, Option(unit="degrees", metavar="D")] = Field(
-        0.0, ge=-360, le=360, description="Turn the style image by D degrees, against the clock."
+        0.0, ge=-360, le=360, description="Rotate the style image counterclockwise by D degrees."
     )
     preserve_colors: PreservedColors = Field(
         "no",
-        description="match: the style image takes the scene's colors first, so that only its strokes are taken; "
-        "luminance: colors change in luminance alone.",
+        description="Preserve the scene's colors; match: recolor the style image like the scene first, so that only "
+        "its strokes are transferred; luminance: change only the luminance of colors.",
     )
-    sh_attenuation: Annotated[Share, Option(unit="share", metavar="S")] = Field(
+    sh_attenuation: Annotated[Share, Option(unit="fraction", metavar="S")] = Field(
         0.0,
-        description="Fade colors that depend on the direction of view by S, in the result too: 0 leaves spherical "
-        "harmonics as they are, 1 leaves none above degree 0.",
+        description="Attenuate view-dependent color by S, in the result too; 0 leaves spherical harmonics unchanged, "
+        "1 removes all above degree 0.",
     )
     scales: Annotated[
         tuple[ScaleWeight, ...],
-        Option(unit="weights of scales", metavar="W,W,...", default="all alike"),
+        Option(unit="scale weights", metavar="W,W,...", default="all equal"),
         AfterValidator(_some_weight),
     ] = Field(
         (),
         max_length=16,
-        description="Weight of each scale in the loss, from full size on, each scale half as large as the one before; "
-        "those that are not named, or have 0, are not computed.",
+        description="Weight of each scale in the loss, starting at full size, each scale half as large as the one "
+        "before; scales without a weight, or with weight 0, are not computed.",
     )
     refine: Annotated[float, Option(unit="factor", metavar="N")] = Field(
         1.0,
         ge=1,
         le=16,
-        description="Cut Gaussians that are large in the views into smaller ones, which carry finer strokes: at most N "
-        "times as many in all. 1 cuts none.",
+        description="Split Gaussians that are large on screen, for finer strokes: up to N times as many in total "
+        "(1 = off).",
     )
-    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the order of views and of what is drawn behind them.")
+    seed: int = Field(0, ge=0, lt=2**63, description="Seed for the order of views and for random training backgrounds.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
         None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."
     )
-    memory_limit: Annotated[int | None, Option(unit="bytes", default="40 % of all, at most")] = Field(
-        None, gt=0, le=2**50, description="Bytes of memory to plan with."
+    memory_limit: Annotated[int | None, Option(unit="bytes", default="40 % of memory, at most")] = Field(
+        None, gt=0, le=2**50, description="Memory budget of the plan."
     )
     unseen: Literal["neighbors", "freeze"] = Field(
-        "neighbors", description="Colors of Gaussians that no view sees: their neighbors' change, or kept."
+        "neighbors",
+        description="Colors of Gaussians that no view sees; neighbors: change like their neighbors' colors; freeze: "
+        "stay unchanged.",
     )
     coarsest_side: Annotated[int, Option(unit="pixels", metavar="N")] = Field(
         COARSEST_SHORTER_SIDE,
         ge=16,
         le=MAX_RESOLUTION,
-        description="Shorter side of the coarsest scale in pixels, at most; the method's is 511.",
+        description="Maximum shorter side of the coarsest scale in pixels; the paper's is 511.",
     )
     warm_start: Annotated[bool | None, Option(flags="--warm-start/--cold-start", default="on")] = Field(
-        None, description="Begin with colors that are distributed as the style's; by luminance alone, for scans only."
+        None,
+        description="Start with colors that are distributed like the style's. With preserve_colors luminance, the "
+        "default is on for scans only.",
     )
-    clamp_aware_gradient: bool = Field(
-        False, description="Let colors that fell below black come back, by gradients that would raise them."
-    )
+    clamp_aware_gradient: bool = Field(False, description="Apply gradients that would raise clamped (negative) colors.")
     bounded: bool = Field(
-        False, description="Keep colors within 0 to 1, which is what screens show, by bringing them back each step."
+        False, description="Keep colors within 0..1, the displayable range, by projecting them back after each step."
     )
-    early_stop: bool = Field(False, description="Stop when the smoothed loss of all scales has stopped falling.")
-    target_loss: Annotated[
-        float | None, Option(unit="share of the loss at the start", metavar="R", default="never")
-    ] = Field(
-        None, gt=0, lt=1, description="Stop when the loss has come down to this share of the start, such as 0.05."
+    early_stop: bool = Field(False, description="Stop when the smoothed loss of all scales no longer falls.")
+    target_loss: Annotated[float | None, Option(unit="fraction of the initial loss", metavar="R", default="never")] = (
+        Field(
+            None,
+            gt=0,
+            lt=1,
+            description="Stop when the loss has fallen to this fraction of the initial loss, such as 0.05.",
+        )
     )
     prune_weight: Annotated[float, Option(unit="pixels", metavar="W")] = Field(
         0.0,
         ge=0,
         allow_inf_nan=False,
-        description="Leave out Gaussians that all views together show in no more than W pixels; 0 takes out none that "
-        "any pixel shows.",
+        description="Exclude Gaussians whose blend weights sum to at most W pixels over all views; 0 excludes none "
+        "that any pixel shows.",
     )
-    similar_views: Annotated[float, Option(unit="share of the longer side", metavar="S")] = Field(
-        0.0, ge=0, lt=1, description="Leave out views that another, shifted by less than S of its side, shows."
+    similar_views: Annotated[float, Option(unit="fraction of the longer side", metavar="S")] = Field(
+        0.0, ge=0, lt=1, description="Drop views that show the same as another one, shifted by less than S of its side."
     )
     cached_weights: CachedWeights = Field(
-        "auto", description="How blend weights are kept between steps; auto: as memory allows."
+        "auto", description="Precision of blend weights that are cached between steps; auto: as memory allows."
     )
     views_per_step: Annotated[int, Option(unit="views", metavar="V")] = Field(
         1,
         ge=1,
         le=10_000,
-        description="Average the gradients of V views in each step; groups of workers take them side by side.",
+        description="Average the gradients of V views in each step; groups of workers evaluate them in parallel.",
     )
     rebalance: bool = Field(
         True,
-        description="Give slower workers less to do, once. Without it a run on as many workers repeats bit for bit "
-        "even where they differ in speed.",
+        description="Give slower workers less work, once. Without it, runs on the same number of workers are "
+        "bit-identical even if the workers differ in speed.",
     )
     keep: Annotated[tuple[Item, ...], Option(instead="compute_everything")] = Field(
-        (), description="Items that are not left out although the scene does not need them; the result is the same."
+        (), description="Items to compute although the scene does not need them; the result is the same."
     )
-    measure: Annotated[Share, Option(unit="share of the steps' seconds", metavar="S")] = Field(
+    measure: Annotated[Share, Option(unit="fraction of the steps' time", metavar="S")] = Field(
         0.1,
-        description="Measure views between the cameras for S of the steps' predicted time, or 30 s if that is more; 0 "
-        "measures none.",
+        description="Measure novel views, which lie between the cameras, for S of the steps' predicted time, or 30 s "
+        "if that is more; 0 measures none.",
     )
 
     def learning_rate_at(self, share: float) -> float:
@@ -295,7 +302,7 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
         SettingsError: If the preset is unknown, or a value is out of range.
     """
     if preset not in _PRESETS:
-        raise SettingsError(f"There is no preset {preset!r}; choose one of {', '.join(_PRESETS)}.")
+        raise SettingsError(f"There is no preset {preset!r}. Choose one of {', '.join(_PRESETS)}.")
     chosen = {name: value for name, value in values.items() if value is not None}
     if "learning_rate" in chosen:  # an explicit learning rate is constant, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])

@@ -37,14 +37,16 @@ def describe(job: Job) -> Prepared:
     if job.resumed:
         lines.append(("resuming", f"at step {job.resumed.state.step} of {stylizer.total}"))
     elif job.outputs.checkpoints.exist:
-        note = f"{job.outputs.checkpoint} of an earlier run is there. This run starts anew and will replace it; "
-        lines.append(("note", note + "--resume would go on from it."))
+        note = (
+            f"{job.outputs.checkpoint} exists from an earlier run. This run starts from the beginning and replaces it; "
+        )
+        lines.append(("note", note + "use --resume to continue from it."))
     return Prepared(lines, job.resumed.state.step if job.resumed else 0, stylizer.total)
 
 
 def _describe_scene(job: Job) -> str:
     scene = job.scene_file.scene
-    dropped = f", {job.scene_file.dropped:,} invalid ones left out" if job.scene_file.dropped else ""
+    dropped = f", {job.scene_file.dropped:,} invalid ones dropped" if job.scene_file.dropped else ""
     return f"{len(scene):,} Gaussians{dropped}, SH degree {scene.sh_degree}"
 
 
@@ -64,5 +66,5 @@ def _describe_views(job: Job) -> str:
 def _describe_network(job: Job) -> str:
     name = job.sources.backbone.name.upper()
     if job.request.backbone == "auto" and name == "VGG16":
-        return f"{name}, because VGG19 (the paper's) is not installed: `sgsst weights fetch vgg19` gets it"
+        return f"{name}, because VGG19 (the paper's) is not installed; install it with `sgsst weights fetch vgg19`"
     return name

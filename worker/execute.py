@@ -132,7 +132,7 @@ def _write_views(job: Job, warn: Warn) -> None:
     try:
         write_views(path, job.scene_file.scene, cameras, background=settings.background, near=settings.near)
     except OutputError as error:
-        warn(f"No pictures of the views could be written: {error}")
+        warn(f"The images of the views could not be written: {error}")
 
 
 class _CheckpointWriter:
@@ -157,7 +157,7 @@ class _CheckpointWriter:
             self._saved(stylizer.step)
         except OutputError as error:
             self.error = error
-            self._warn(f"No checkpoint could be written: {error}")
+            self._warn(f"The checkpoint could not be written: {error}")
 
 
 def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:

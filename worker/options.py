@@ -40,24 +40,22 @@ class ViewOptions(BaseModel):
 
     orbit: Annotated[Views | None, Option(unit="views", metavar="N", default="cameras from files")] = Field(
         None,
-        description="Instead of camera files: N views around the scene, or auto, as many as its surface needs; in "
-        "rings at as many elevations as it needs.",
+        description="Create N views around the scene instead of reading camera files; auto: as many as its surface "
+        "needs. They form rings at as many elevations as needed.",
     )
-    up: Up = Field("auto", description="Axis that points up in the scene, for an orbit; auto: as the scene shows it.")
-    elevation: Annotated[float | None, Option(unit="degrees", metavar="E", default="by need")] = Field(
-        None, gt=-90, lt=90, description="Put all cameras of an orbit into one ring, E degrees above the horizon."
+    up: Up = Field("auto", description="Up axis of the scene, for an orbit; auto: estimated from the scene.")
+    elevation: Annotated[float | None, Option(unit="degrees", metavar="E", default="automatic")] = Field(
+        None, gt=-90, lt=90, description="Put all cameras of an orbit in one ring, E degrees above the horizon."
     )
-    radius: Annotated[float | None, Option(unit="world units", metavar="R", default="by the scene's size")] = Field(
-        None, gt=0, allow_inf_nan=False, description="Distance of an orbit's cameras from the scene's middle."
+    radius: Annotated[float | None, Option(unit="scene units", metavar="R", default="from the scene's size")] = Field(
+        None, gt=0, allow_inf_nan=False, description="Distance of an orbit's cameras from the scene's center."
     )
     views: Annotated[int | None, Option(unit="views", metavar="N", default="all")] = Field(
-        None, ge=1, le=1_000_000, description="Take N of the cameras, spread evenly."
+        None, ge=1, le=1_000_000, description="Use N of the cameras, evenly spread."
     )
     resolution: Resolution = None
     near: Near = NEAR
-    drop_invalid: bool = Field(
-        False, description="Leave Gaussians with NaN or infinite values, or without a rotation, out."
-    )
+    drop_invalid: bool = Field(False, description="Drop Gaussians with NaN or infinite values, or without a rotation.")
 
 
 def _settings_to_choose() -> dict[str, Any]:
@@ -88,15 +86,18 @@ else:
 class StylizeOptions(_Chosen):
     """Options of `sgsst stylize` and of a job of the service. Options that are not given follow the preset."""
 
-    backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 where it is installed, else VGG16.")
-    compute_everything: bool = Field(False, description="Leave nothing out; slower, with the same result.")
+    backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 if it is installed, else VGG16.")
+    compute_everything: bool = Field(
+        False, description="Compute even what cannot change the result; slower, with the same result."
+    )
     workers: Annotated[
-        int | None, Option(unit="ranks", metavar="N", default="this process alone; the service decides itself")
+        int | None, Option(unit="ranks", metavar="N", default="this process only; in a service, chosen by the service")
     ] = Field(
         None,
         ge=1,
         le=1024,
-        description="Work on N GPUs, or parts of the processor: of this machine, or of RAY_ADDRESS's cluster.",
+        description="Run on N workers, each on a GPU or a fraction of the CPU: of this machine, or of the Ray cluster "
+        "at RAY_ADDRESS.",
     )
 
     def given_settings(self) -> dict[str, Any]:
@@ -120,10 +121,10 @@ class RunOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    resume: bool = Field(False, description="Go on from the checkpoint beside --out.")
+    resume: bool = Field(False, description="Resume from the checkpoint beside --out.")
     checkpoint_seconds: Annotated[float, Option(unit="seconds", metavar="S")] = Field(
-        60.0, ge=0, description="Seconds between checkpoints: what is lost at most when a worker is."
+        60.0, ge=0, description="Seconds between checkpoints: the most that is lost with a worker."
     )
     rank_timeout: Annotated[float, Option(unit="seconds", metavar="S")] = Field(
-        120.0, ge=1, description="Seconds without an answer after which a worker counts as lost."
+        120.0, ge=1, description="Seconds without a response after which a worker counts as lost."
     )

@@ -181,7 +181,7 @@ def _find_checkpoint(
     checkpoints = outputs.checkpoints
     if resume.required and not checkpoints.exist and outputs.ply.exists():
         raise CheckpointError(
-            f"{outputs.ply}: is there, and no checkpoint beside it, so this job is finished. To start again, leave "
+            f"{outputs.ply}: exists without a checkpoint beside it, so this job is finished. To start again, leave "
             "--resume out."
         )
     try:
@@ -193,7 +193,7 @@ def _find_checkpoint(
     if resume.required and settings.max_seconds and found.state.seconds >= settings.max_seconds:
         raise CheckpointError(
             f"{outputs.checkpoint}: the job has run for {found.state.seconds:.0f} s already, and --max-seconds counts "
-            f"these too. Give more than {found.state.seconds:.0f}, or leave --max-seconds out."
+            f"these too. Give more than {found.state.seconds:.0f}, or omit --max-seconds."
         )
     if found.written_by["torch"] != torch.__version__:
         warn(f"The checkpoint was written with PyTorch {found.written_by['torch']}: last digits may differ.")

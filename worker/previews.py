@@ -48,7 +48,7 @@ class Previews:
         try:
             path = self._write(stylizer)
         except Exception as error:
-            self._warn(f"no preview could be made: {error}")
+            self._warn(f"The preview could not be rendered: {error}")
         else:
             self._written(path)
         self._last = time.monotonic()

@@ -33,7 +33,7 @@ _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,31}"
 _COMPARISON = re.compile(r"(?P<name>[^<>=!]+)(?P<sign>>=|<=|!=|>|<|=)(?P<value>.+)", re.DOTALL)
 _COUNTS = {"box": 6, "sphere": 4, "half-space": 4}
 Kind = Literal["box", "sphere", "half-space", "property", "mask", "masks"]
-_HOW = "Give box=, sphere=, half-space=, property=, mask= or masks=: see `sgsst stylize --help`."
+_HOW = "Use box=, sphere=, half-space=, property=, mask= or masks=; see `sgsst stylize --help`."
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,11 @@ class RegionOptions(BaseModel):
     )
 
     name: Annotated[str, Field(pattern=f"^{_NAME}$")] = Field(
-        description="`rest` for the Gaussians that no region selects.", examples=["face"]
+        description="Name of the region; `rest` stands for the Gaussians that no region selects.", examples=["face"]
     )
     select: Annotated[str, Field(max_length=1000)] | None = Field(
         None,
-        description="Which Gaussians it has, but for the rest: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, "
+        description="Selection of its Gaussians; omitted for the rest: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, "
         "half-space=A,B,C,D (where A x + B y + C z >= D) or property=NAME>VALUE (also >=, <, <=, =, !=).",
         examples=["half-space=0,1,0,0.5"],
     )
@@ -101,12 +101,14 @@ class RegionOptions(BaseModel):
         | None
     ) = Field(
         None,
-        description="Name of the `style` file, of those that were sent, that it is drawn to, which then is no part of "
-        "the job's own style; NAME:WEIGHT in a list of several. Without, the job's own style.",
+        description="Name of the uploaded `style` file with the region's style, which is then not part of the job's "
+        "style; a list of NAME:WEIGHT mixes several. Default: the job's style.",
         examples=["wave.jpg"],
     )
-    weight: float = Field(1.0, gt=0, le=1e12, allow_inf_nan=False, description="Of its style in the loss.")
-    freeze: bool = Field(False, description="Leave the colors of its Gaussians unchanged, bit for bit.")
+    weight: float = Field(
+        1.0, gt=0, le=1e12, allow_inf_nan=False, description="Weight of the region's style in the loss."
+    )
+    freeze: bool = Field(False, description="Freeze the region: its colors stay bit-identical.")
 
     @property
     def style_texts(self) -> list[str]:
@@ -145,22 +147,24 @@ def parse_selection(text: str, where: str) -> Selection:
     if separator and kind == "property":
         match = _COMPARISON.fullmatch(value)
         if match is None:
-            raise SettingsError(f"{where}: {text!r} is no comparison such as property=opacity>0.5. Give one.")
+            raise SettingsError(f"{where}: {text!r} is not a comparison. Give one such as property=opacity>0.5.")
         return Selection(
             "property", text, (_number(match["value"], text, where),), match["name"].strip(), match["sign"]
         )
-    raise SettingsError(f"{where}: {text!r} selects nothing that is known. {_HOW}")
+    raise SettingsError(f"{where}: {text!r} is not a known selection. {_HOW}")
 
 
 def _numbers(kind: str, value: str, where: str) -> tuple[float, ...]:
     parts = value.split(",")
     if len(parts) != _COUNTS[kind]:
-        raise SettingsError(f"{where}: {kind}={value} has {len(parts)} numbers; it takes {_COUNTS[kind]}.")
+        raise SettingsError(
+            f"{where}: {kind}={value} has {len(parts)} numbers. Give {_COUNTS[kind]}, separated by commas."
+        )
     numbers = tuple(_number(part, value, where) for part in parts)
     if kind == "sphere" and numbers[3] <= 0:
-        raise SettingsError(f"{where}: the sphere's radius {numbers[3]:g} is not above 0. Give a larger one.")
+        raise SettingsError(f"{where}: the sphere's radius is {numbers[3]:g}. It must be greater than 0.")
     if kind == "half-space" and not any(numbers[:3]):
-        raise SettingsError(f"{where}: half-space={value} has no direction. Give one that is not 0,0,0.")
+        raise SettingsError(f"{where}: half-space={value} has no direction. A, B and C must not all be 0.")
     return numbers
 
 
@@ -170,7 +174,7 @@ def _number(text: str, whole: str, where: str) -> float:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise SettingsError(f"{where}: {text!r} in {whole!r} is no finite number.")
+        raise SettingsError(f"{where}: {text!r} in {whole!r} is not a finite number. Give one.")
     return number
 
 
@@ -192,30 +196,30 @@ def region_options(
     for text in regions:
         name, separator, spec = text.partition(":")
         if not separator or not re.fullmatch(_NAME, name):
-            raise SettingsError(f"--region {text}: is not NAME:SPEC, such as face:sphere=0,1.4,0,0.3. {_HOW}")
+            raise SettingsError(f"--region {text}: expected NAME:SPEC, such as face:sphere=0,1.4,0,0.3. {_HOW}")
         if name in found:
-            raise SettingsError(f"--region {text}: there is a region {name} already. Give each its own name.")
+            raise SettingsError(f"--region {text}: a region {name} already exists. Give each region a unique name.")
         found[name] = checked(RegionOptions, {"name": name, "select": spec})
     given = set(found)
 
     def known(name: str, option: str) -> RegionOptions:
         if name != REST and name not in given:
             names = ", ".join([*found, REST]) if REST not in found else ", ".join(found)
-            raise SettingsError(f"{option}: there is no region {name!r}. There are {names}.")
+            raise SettingsError(f"{option}: there is no region {name!r}. Use one of {names}, or add it with --region.")
         return found.get(name, RegionOptions(name=REST))
 
     for text in styles:
         name, _, file = text.partition("=")
         region = known(name, f"--region-style {text}")
         if not file:
-            raise SettingsError(f"--region-style {text}: is not NAME=FILE. Name a picture.")
+            raise SettingsError(f"--region-style {text}: expected NAME=FILE. Give the path of a style image.")
         found[name] = region.model_copy(update={"style": [*region.style_texts, file]})
     for text in weights:
         name, _, value = text.partition("=")
         region = known(name, f"--region-weight {text}")
         weight = _number(value, text, "--region-weight")
         if not 0 < weight <= 1e12:
-            raise SettingsError(f"--region-weight {text}: the weight is not above 0, or too large. Give another.")
+            raise SettingsError(f"--region-weight {text}: the weight must be greater than 0 and at most 1e12.")
         found[name] = region.model_copy(update={"weight": weight})
     for name in frozen:
         found[name] = known(name, f"--region-freeze {name}").model_copy(update={"freeze": True})
@@ -235,16 +239,18 @@ def region_requests(
     for region in found:
         if len(region.styles) > MOST_PICTURES:
             raise SettingsError(
-                f"Region {region.name!r} has {len(region.styles)} style pictures; {MOST_PICTURES} may be."
+                f"Region {region.name!r} has {len(region.styles)} style images. At most {MOST_PICTURES} are allowed."
             )
         if names.count(region.name) > 1:
-            raise SettingsError(f"There are two regions {region.name!r}. Give each its own name.")
+            raise SettingsError(f"There are two regions {region.name!r}. Give each region a unique name.")
         if (region.name == REST) != (region.selection is None):
-            why = "needs a SPEC" if region.name != REST else "is what no other region has, and takes no SPEC"
+            why = "needs a SPEC" if region.name != REST else "is what no other region selects, and takes no SPEC"
             raise SettingsError(f"Region {region.name!r} {why}. {_HOW}")
         if region.freeze and (region.styles or region.weight != 1):
-            raise SettingsError(f"Region {region.name!r} is frozen and takes no style or weight. Leave one out.")
+            raise SettingsError(
+                f"Region {region.name!r} is frozen, so it cannot have a style or weight. Remove one or the other."
+            )
     if len([name for name in names if name != REST]) > MOST_REGIONS:
-        raise SettingsError(f"There are {len(found)} regions; {MOST_REGIONS} may be.")
+        raise SettingsError(f"There are {len(found)} regions. At most {MOST_REGIONS} are allowed.")
     rest = next((region for region in found if region.name == REST), None)
     return (*([rest] if rest else []), *(region for region in found if region.name != REST))

@@ -174,12 +174,12 @@ def check_choice(source: SceneRequest, images: Path | None = None) -> None:
             "There are no cameras. Give a camera file with --cameras, or --orbit N for N views around the scene."
         )
     if source.cameras is not None and source.orbit is not None:
-        raise CameraError("Both --cameras and --orbit are given. Give one of them.")
+        raise CameraError("Both --cameras and --orbit are given. Use only one of them.")
     if source.orbit is None and (source.elevation is not None or source.radius is not None):
-        raise CameraError("--elevation and --radius are those of an --orbit. Give one, or leave them out.")
+        raise CameraError("--elevation and --radius require --orbit. Add it, or omit them.")
     if images is not None and source.orbit is not None:
         raise CameraError(
-            "--images are photos of known cameras, which an --orbit has not. Give --cameras, or no --images."
+            "--images requires --cameras, and cannot be combined with --orbit. Use --cameras, or omit --images."
         )
 
 
@@ -203,12 +203,14 @@ def check_request(request: StylizeRequest) -> Outputs:
     check_choice(request.source, request.images)
     out = request.out
     if out.is_dir():
-        raise OutputError(f"{out}: is a folder. Name the PLY file to write, such as {out / 'stylized.ply'}.")
+        raise OutputError(f"{out}: is a folder. Give the PLY file to write, such as {out / 'stylized.ply'}.")
     outputs = Outputs.of(out)
     for path in (outputs.ply, outputs.packed):
         if path and path.exists() and request.source.scene.exists() and path.samefile(request.source.scene):
             beside = "" if path == out else f" (the PLY beside {out.name})"
-            raise OutputError(f"{path}{beside}: is the scene itself, which would be lost. Name another file.")
+            raise OutputError(
+                f"{path}{beside}: is the scene itself, which would be overwritten. Give another file name."
+            )
     check_folder(out.parent)
     return outputs
 

@@ -100,10 +100,10 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
     except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # the last one for an unclosed bracket
         raise SceneError(f"{path}: cannot be read as .npy: {error}. Write it with numpy.save.") from error
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "biuf":
-        raise SceneError(f"{path}: holds no array of flags or numbers. Write it with numpy.save.")
+        raise SceneError(f"{path}: does not hold an array of flags or numbers. Write it with numpy.save.")
     if found.shape != (rows,):
         raise SceneError(
-            f"{path}: has the shape {found.shape}; {file.path} has {rows:,} Gaussians, so that it has to be ({rows},)."
+            f"{path}: has the shape {found.shape}, but {file.path} has {rows:,} Gaussians. It must be ({rows},)."
         )
     flags = found == 1
     if not bool((flags | (found == 0)).all()):

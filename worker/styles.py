@@ -45,7 +45,9 @@ def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> Styl
         return StyleFile(Path(text))
     weight = float(match["weight"])
     if not (math.isfinite(weight) and weight > 0):
-        raise SettingsError(f"--style {text}: the weight {match['weight']} is no finite number above 0. Give one.")
+        raise SettingsError(
+            f"--style {text}: the weight {match['weight']} is not a finite number greater than 0. Give one."
+        )
     return StyleFile(Path(match["path"]), weight)
 
 
@@ -56,5 +58,5 @@ def parse_styles(texts: Sequence[str]) -> tuple[StyleFile, ...]:
         SettingsError: If a weight is invalid, or there are no images or too many.
     """
     if not 1 <= len(texts) <= MOST_PICTURES:
-        raise SettingsError(f"There are {len(texts)} style pictures; a style has 1 to {MOST_PICTURES}.")
+        raise SettingsError(f"There are {len(texts)} style images. Give between 1 and {MOST_PICTURES}.")
     return tuple(parse_style(text) for text in texts)

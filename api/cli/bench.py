@@ -141,11 +141,11 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 def quality_table(quality: Quality) -> Table:
     """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
     figures = ("style", "color_distance", "content", "features", "background_sensitivity", "saturated")
-    columns = (*figures, "short RMSE", "long RMSE", "loss left", "steps")
+    columns = (*figures, "short RMSE", "long RMSE", "remaining loss", "steps")
     table = Table(
         Column("", no_wrap=True),
         *columns,
-        title="after the same seconds: distances, less is better; * on the front of style and content",
+        title="distances after the same time, lower is better; * = on the Pareto front of style and content",
     )
     front = quality.front()
     for outcome in quality.outcomes:
@@ -177,7 +177,7 @@ def error_time_table(curves: Sequence[Curve]) -> Table:
         *moments,
         *(f"scale {scale}" for scale in scales),
         "steps",
-        title="loss that is left",
+        title="remaining loss, relative to the start",
     )
     for curve in curves:
         if not curve.points:
@@ -190,7 +190,7 @@ def error_time_table(curves: Sequence[Curve]) -> Table:
 
 def point_line(variant: Variant, point: Point) -> str:
     """Return one evaluation as a line for a log."""
-    return f"{variant.name}: {point.relative:.2%} of the loss left after {point.seconds:.1f} s, {point.step} steps"
+    return f"{variant.name}: {point.relative:.2%} of the loss remains after {point.seconds:.1f} s, {point.step} steps"
 
 
 def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> list[tuple[Case, Measurement]]:
@@ -202,10 +202,12 @@ def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> li
     """
     chosen = [case for case in all_cases() if only in case.name or only == case.group]
     if not chosen:
-        raise SettingsError(f"No case or group holds {only!r} in its name.")
+        raise SettingsError(
+            f"No case or group is called {only!r}, or contains it in its name. Omit --only to run all cases."
+        )
     if out is not None:
         if out.is_dir() or out.suffix.lower() != ".json":
-            raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as stability.json.")
+            raise OutputError(f"{out}: not the name of a JSON file. Give one, such as stability.json.")
         check_folder(out.parent)
     found = []
     for case in chosen:

@@ -38,11 +38,11 @@ error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=Tr
 _JOB_FAILED = 1
 
 UrlOption = Annotated[
-    str | None, typer.Option("--url", help="Address of the service. [SGSST_URL, else http://127.0.0.1:8000]")
+    str | None, typer.Option("--url", help="URL of the service. [default: SGSST_URL, else http://127.0.0.1:8000]")
 ]
-KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [SGSST_KEY]")]
+KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [default: SGSST_KEY]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.", show_default=False)]
+JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="ID of a job.", show_default=False)]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -60,28 +60,40 @@ def submit(
     style: Annotated[
         list[str],
         typer.Option(
-            metavar="FILE[:WEIGHT]", help="Style image. Several are mixed, as for stylize.", show_default=False
+            metavar="FILE[:WEIGHT]",
+            help="Style image; may be repeated. Several are mixed in proportion to their weights.",
+            show_default=False,
         ),
     ],
-    cameras: Annotated[Path | None, typer.Option(help="As for stylize.")] = None,
-    images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            help="cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender)."
+        ),
+    ] = None,
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
+    ] = None,
     region: RegionOption = None,
     region_style: RegionStyleOption = None,
     region_weight: RegionWeightOption = None,
     region_freeze: RegionKeepOption = None,
     *,
     options: JobParameters,
-    parameters: Annotated[str, typer.Option(metavar="JSON", help="Further parameters, as in the API.")] = "{}",
-    webhook: Annotated[str | None, typer.Option(help="URL that is told when the job has ended.")] = None,
+    parameters: Annotated[str, typer.Option(metavar="JSON", help="Additional parameters, as in the REST API.")] = "{}",
+    webhook: Annotated[str | None, typer.Option(help="URL to notify when the job ends.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Wait for the end, and write the scene here: .ply, .compressed.ply or .spz.")
+        Path | None,
+        typer.Option(help="Wait for the job, and write the scene to this file: .ply, .compressed.ply or .spz."),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check and plan, but queue nothing.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check the inputs and plan the job without queueing it.")
+    ] = False,
     as_json: JsonOption = False,
     url: UrlOption = None,
     key: KeyOption = None,
 ) -> None:
-    """Submit a job to a service. Options are those of stylize; with --out, wait for the result."""
+    """Submit a job to a service, with the options of stylize. With --out, wait for the result."""
     told = options.model_dump(mode="json", exclude_unset=True)
     styles = parse_styles(style)
     if len(styles) > 1:
@@ -107,7 +119,7 @@ def submit(
         if out is None:
             out_console.print(json.dumps(job.data) if as_json else job.id)
             if not as_json:
-                error_console.print(f"Watch it: sgsst watch {job.id}    Result: sgsst download {job.id}")
+                error_console.print(f"Progress: sgsst watch {job.id}    Result: sgsst download {job.id}")
             return
         if not as_json:
             error_console.print(job.id)
@@ -136,7 +148,7 @@ def status(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None,
 
 
 def watch(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Show a job's progress until it has ended; exit with 1 if it has not succeeded."""
+    """Show the progress of a job until it ends; exit with 1 if it does not succeed."""
     with _client(url, key) as client:
         found = _follow(client, job, as_json)
     if not as_json:
@@ -147,18 +159,19 @@ def watch(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, 
 
 def download(
     job: JobArgument,
-    name: Annotated[str, typer.Argument(metavar="[NAME]", help="File to download; 'all' for all of them.")] = (
+    name: Annotated[str, typer.Argument(metavar="[NAME]", help="File to download; 'all' downloads every file.")] = (
         "stylized.ply"
     ),
-    out: Annotated[Path | None, typer.Option(help="File to write, or folder for all. [the file's own name]")] = None,
+    out: Annotated[Path | None, typer.Option(help="File to write, or folder for 'all'. [default: NAME]")] = None,
     form: Annotated[
-        PackedForm | None, typer.Option("--format", help="Of stylized.ply: another form. [that of --out's ending]")
+        PackedForm | None,
+        typer.Option("--format", help="Compressed format of stylized.ply. [default: from the ending of --out]"),
     ] = None,
     as_json: JsonOption = False,
     url: UrlOption = None,
     key: KeyOption = None,
 ) -> None:
-    """Download a job's result, or another of its files. An interrupted download resumes where it stopped."""
+    """Download a job's result or other files; an interrupted download resumes."""
     with _client(url, key) as client:
         names = [entry["name"] for entry in client.artifacts(job)] if name == "all" else [name]
         written = []
@@ -190,14 +203,14 @@ def retry(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, 
 
 
 def delete(job: JobArgument, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Delete a job that has ended, with its results."""
+    """Delete a finished job and its results."""
     with _client(url, key) as client:
         client.delete(job)
 
 
 def jobs(
-    status: Annotated[list[str] | None, typer.Option(help="Only these; may be given several times.")] = None,
-    limit: Annotated[int, typer.Option(min=1, help="At most so many.")] = 20,
+    status: Annotated[list[str] | None, typer.Option(help="Show only jobs with this status; may be repeated.")] = None,
+    limit: Annotated[int, typer.Option(min=1, help="Maximum number of jobs.")] = 20,
     as_json: JsonOption = False,
     url: UrlOption = None,
     key: KeyOption = None,
@@ -229,16 +242,18 @@ def _client(url: str | None, key: str | None) -> Client:
 
 def _tell_of_retry(details: RetryDetails) -> None:
     what = str(details.caused_by) or type(details.caused_by).__name__
-    error_console.print(f"{what}: trying again in {details.wait_for:.0f} s")
+    error_console.print(f"{what}: retrying in {details.wait_for:.0f} s")
 
 
 def _parse_parameters(text: str) -> dict[str, Any]:
     try:
         values = json.loads(text)
     except ValueError as error:
-        raise typer.BadParameter(f"--parameters is not JSON: {error}") from error
+        raise typer.BadParameter(
+            f'--parameters is not valid JSON: {error}. Give an object such as {{"steps_sos": 100}}.'
+        ) from error
     if not isinstance(values, dict):
-        raise typer.BadParameter("--parameters is not a JSON object.")
+        raise typer.BadParameter('--parameters is not a JSON object. Give one such as {"steps_sos": 100}.')
     return values
 
 
@@ -308,7 +323,7 @@ def _tell_loss(client: Client, job_id: str, form: PackedForm | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         name = f"{packed_name('stylized.ply', form)}.json"
         found = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
-    psnr = "the same pictures as" if found["psnr_db"] is None else f"{found['psnr_db']:.1f} dB PSNR against"
+    psnr = "renders identical to" if found["psnr_db"] is None else f"{found['psnr_db']:.1f} dB PSNR against"
     error_console.print(f"{form}, {found['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
 
 
@@ -332,7 +347,7 @@ def _step_text(progress: Any) -> str:
 
 def _progress_text(job: Job) -> str:
     if job.status == "queued" and job.data.get("queue_position"):
-        return f"number {job.data['queue_position']} in the queue"
+        return f"position {job.data['queue_position']} in the queue"
     return _step_text(job.progress) if job.progress and not job.finished else ""
 
 
@@ -353,5 +368,5 @@ def _plan_text(plan: Any) -> str:
     lines = [f"{plan['gaussians']:,} Gaussians, {plan['views']} views, {plan['pixels']:,} pixels"]
     lines += [f"{item['item']}: {item['decision']}: {item['reason']}" for item in plan["plan"]["decisions"]]
     if plan["estimated_seconds"]:
-        lines.append(f"expected: {clock(plan['estimated_seconds'])} for all steps")
+        lines.append(f"predicted: {clock(plan['estimated_seconds'])} for all steps")
     return "\n".join(lines)

@@ -51,7 +51,7 @@ app = typer.Typer(
 )
 weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_help=True)
 app.add_typer(weights_app, name="weights")
-bench_app = typer.Typer(help="Measurements to repeat on your own scene and machine.", no_args_is_help=True)
+bench_app = typer.Typer(help="Benchmarks for your own scene and machine.", no_args_is_help=True)
 app.add_typer(bench_app, name="bench")
 operator_commands.add_to(app)
 client_commands.add_to(app)
@@ -65,7 +65,7 @@ SceneArgument = Annotated[
 CamerasOption = Annotated[
     Path | None,
     typer.Option(
-        help="cameras.json (INRIA), a COLMAP sparse model's folder, or transforms.json (nerfstudio, Blender)."
+        help="cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender)."
     ),
 ]
 StyleOption = Annotated[Path, typer.Option(help="Style image.", show_default=False)]
@@ -73,7 +73,7 @@ StylesOption = Annotated[
     list[str],
     typer.Option(
         metavar="FILE[:WEIGHT]",
-        help="Style image. Several are mixed, in proportion to their weights.",
+        help="Style image; may be repeated. Several are mixed in proportion to their weights.",
         show_default=False,
     ),
 ]
@@ -99,12 +99,14 @@ def stylize(
     out: Annotated[
         Path,
         typer.Option(
-            help="Stylized PLY to write; report and pictures go beside it. A .compressed.ply or .spz is written beside "
-            "a PLY of the same name."
+            help="Stylized PLY to write; report and images go beside it. A .compressed.ply or .spz is written in "
+            "addition to a PLY of the same name."
         ),
     ],
     cameras: CamerasOption = None,
-    images: Annotated[Path | None, typer.Option(help="Photos for the content term. [unstylized renders]")] = None,
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
+    ] = None,
     region: RegionOption = None,
     region_style: RegionStyleOption = None,
     region_weight: RegionWeightOption = None,
@@ -199,7 +201,7 @@ def _stylize_on_ranks(
 
 
 def _announce_stop() -> None:
-    error_console.print("Stopping after this step; Ctrl-C again aborts at once.")
+    error_console.print("Stopping after this step. Press Ctrl-C again to abort immediately.")
 
 
 def _announce(prepared: Prepared) -> None:
@@ -209,19 +211,19 @@ def _announce(prepared: Prepared) -> None:
 
 def _tell_interrupted(outputs: Outputs, step: int, total: int, saved: int | None, command: str) -> None:
     if saved is None:
-        error_console.print(f"Stopped at step {step}; nothing has been saved.")
+        error_console.print(f"Stopped at step {step}. Nothing was saved.")
         return
     there = "saved" if saved == step else f"step {saved} is saved"
     error_console.print(
-        f"Stopped at step {step} of {total}; {there} in {outputs.checkpoint}.\nTo go on, run:\n{command}"
+        f"Stopped at step {step} of {total}; {there} in {outputs.checkpoint}.\nTo continue, run:\n{command}"
     )
 
 
 def _tell_losses(ended: RanksResult) -> None:
     for attempt in ended.attempts:
         out_console.print(
-            f"{'lost:':<22}{attempt.reason}, at step {attempt.last_step}; on from step {attempt.saved_step} "
-            f"{attempt.seconds_to_resume:.1f} s later"
+            f"{'restarted:':<22}{attempt.reason}, at step {attempt.last_step}; resumed from step {attempt.saved_step} "
+            f"after {attempt.seconds_to_resume:.1f} s"
         )
 
 
@@ -229,32 +231,34 @@ def _conclude(outputs: Outputs, result: Result, command: str) -> None:
     before, after = result.losses
     out_console.print(f"{'loss:':<22}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
     for line in _time_bought(result):
-        out_console.print(f"{'time bought:':<22}{line}")
+        out_console.print(f"{'loss over time:':<22}{line}")
     paths = [("stylized scene", outputs.ply)]
     if outputs.packed is not None and result.packed is not None:
-        out_console.print(f"{'packed:':<22}{result.packed.text}")
-        paths.append(("packed scene", outputs.packed))
+        out_console.print(f"{'compressed:':<22}{result.packed.text}")
+        paths.append(("compressed scene", outputs.packed))
     paths += [("views", outputs.views)] if outputs.views.exists() else []
     if result.report_error is None:
         paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
-        paths += [("the same as JSON", outputs.report)]
+        paths += [("report as JSON", outputs.report)]
     for heading, path in paths:
         out_console.print(f"{heading + ':':<22}{path}")
     if result.stopped in _ENDED:
         out_console.print(f"Stopped at step {result.step} of {result.total}: {_ENDED[result.stopped]}.")
     if result.stopped == "max-seconds":
         out_console.print(
-            f"The time was up at step {result.step} of {result.total}. The checkpoint stays: to go on, "
-            f"give more time (--max-seconds counts from the beginning):\n{command}"
+            f"Reached --max-seconds at step {result.step} of {result.total}. The checkpoint is kept. To continue, "
+            f"raise --max-seconds, which counts from the first step:\n{command}"
         )
     if result.report_error is not None:
-        error_console.print(f"The stylized scene is whole, but its report could not be written: {result.report_error}")
+        error_console.print(
+            f"The stylized scene is complete, but its report could not be written: {result.report_error}"
+        )
         raise typer.Exit(FAILURE)
 
 
 _ENDED = {
-    "target-loss": "the loss has come down to --target-loss",
-    "converged": "the loss has stopped falling (--no-early-stop makes all steps)",
+    "target-loss": "the loss has reached --target-loss",
+    "converged": "the loss no longer falls (use --no-early-stop to run all steps)",
 }
 
 
@@ -263,12 +267,12 @@ def _time_bought(result: Result) -> list[str]:
     if found is None:
         return []
     lines = [
-        f"{entry['relative']:.0%} of the loss on all scales was left after {clock(entry['seconds'])}"
+        f"down to {entry['relative']:.0%} of the initial loss on all scales after {clock(entry['seconds'])}"
         for entry in found["reached"]
     ]
     last = found["last_tenth"]
     if last:
-        lines.append(f"the last tenth of the time changed {last['from']:.2%} to {last['to']:.2%}")
+        lines.append(f"from {last['from']:.2%} to {last['to']:.2%} in the last tenth of the time")
     return lines
 
 
@@ -277,9 +281,9 @@ def _time_bought(result: Result) -> list[str]:
 def plan(
     scene: SceneArgument,
     style: StylesOption,
-    out: Annotated[Path, typer.Option(help="Plan to write, JSON.")] = Path("plan.json"),
+    out: Annotated[Path, typer.Option(help="JSON file to write the plan to.")] = Path("plan.json"),
     cameras: CamerasOption = None,
-    sheet: Annotated[Path | None, typer.Option(help="Pictures of the views to write, JPEG.")] = None,
+    sheet: Annotated[Path | None, typer.Option(help="JPEG file to write with images of the views.")] = None,
     region: RegionOption = None,
     region_style: RegionStyleOption = None,
     region_weight: RegionWeightOption = None,
@@ -287,7 +291,7 @@ def plan(
     *,
     options: StylizeOptions,
 ) -> None:
-    """Show what stylizing a scene would skip, why, and what an iteration would cost."""
+    """Show what a stylization would skip and why, and what a step would cost."""
     from api.cli.scene_tools import make_plan
     from worker.request import SceneRequest, StylizeRequest
 
@@ -299,9 +303,9 @@ def plan(
     request = StylizeRequest(source, parse_styles(style), None, out, options.backbone, False, settings, regions)
     with job_bar(error_console) as bar:
         made = make_plan(request, bar.show_planning, sheet)
-    table = Table(Column("item", no_wrap=True), "what is done, and why", Column("saves", no_wrap=True), show_lines=True)
+    table = Table(Column("item", no_wrap=True), "decision and reason", Column("saves", no_wrap=True), show_lines=True)
     for item in made.decisions:
-        saved = [f"{item.seconds:.2g} s a step"] if item.seconds is not None else []
+        saved = [f"{item.seconds:.2g} s per step"] if item.seconds is not None else []
         saved += [f"{item.bytes / 1e6:.1f} MB"] if item.bytes is not None else []
         error = "" if item.error == "none" else f" Costs: {item.error}."
         table.add_row(item.item, f"{item.decision}: {item.reason}.{error}", "\n".join(saved))
@@ -310,9 +314,9 @@ def plan(
         seconds, peak = made.prediction.seconds, made.prediction.peak_bytes / 1e9
         coarse = f" ({made.prediction.seconds_coarse:.2g} s in phase 1)" if made.steps_coarse else ""
         on_device = made.prediction.device_bytes
-        gpu = f", of the GPU's {on_device / 1e9:.1f} GB" if on_device is not None else ""
-        expected = f"{seconds:.2g} s an iteration on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
-        out_console.print(f"Expected: {expected}")
+        gpu = f" (GPU: {on_device / 1e9:.1f} GB)" if on_device is not None else ""
+        expected = f"{seconds:.2g} s per step on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
+        out_console.print(f"Predicted: {expected}")
     if sheet is not None:
         out_console.print(f"{'views:':<22}{sheet}")
     out_console.print(f"{'plan:':<22}{out}")
@@ -327,17 +331,17 @@ def check(
     *,
     options: ViewOptions,
 ) -> None:
-    """Report extreme values in a scene, its views and its style, and how they are handled."""
+    """Report extreme values in a scene, its views and its style, and their consequences."""
     from api.cli.scene_tools import look_for_extremes
     from worker.request import SceneRequest
 
     source = SceneRequest.of(scene, cameras, options)
-    with _status("Looking at the scene and every view"):
+    with _status("Checking the scene and every view"):
         found = look_for_extremes(source, style)
     if not found:
-        out_console.print("Nothing extreme was found.")
+        out_console.print("No extreme values were found.")
         return
-    table = Table("what", Column("how many", justify="right"), "the worst", "what is done", show_lines=True)
+    table = Table("finding", Column("count", justify="right"), "worst", "consequence", show_lines=True)
     for item in found:
         table.add_row(f"{item.subject}: {item.what}", f"{item.count:,} of {item.total:,}", item.worst, item.done)
     out_console.print(table)
@@ -348,13 +352,13 @@ def check(
 @with_options(StylizeOptions, "chosen", only=("background",))
 def render(
     scene: SceneArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the pictures, PNG.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for the PNG images.", show_default=False)],
     cameras: CamerasOption = None,
     *,
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> None:
-    """Render the views of a scene."""
+    """Render all views of a scene."""
     from api.cli.scene_tools import render_views
     from worker.request import SceneRequest
 
@@ -397,7 +401,7 @@ def demo(
 
 #: Options of a job that `bench` applies to all variants.
 _OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")
-BenchSeconds = Annotated[float, typer.Option(min=1, help="Of optimization, for each variant.")]
+BenchSeconds = Annotated[float, typer.Option(min=1, help="Seconds of optimization per variant.")]
 
 
 @bench_app.command("error-time")
@@ -408,13 +412,13 @@ def bench_error_time(
     style: StyleOption,
     out: Annotated[Path, typer.Option(help="Folder for table, plot, JSON and scenes.")] = Path("error_time"),
     cameras: CamerasOption = None,
-    variants: Annotated[str, typer.Option(help="Names with commas between. [all]")] = "",
+    variants: Annotated[str, typer.Option(help="Names of variants, separated by commas. [default: all]")] = "",
     seconds: BenchSeconds = 300.0,
     *,
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> None:
-    """Run variants of a job for the same time each, and plot the remaining error over time."""
+    """Run variants of a job for the same time each, and plot the remaining error against time."""
     from api.cli.bench import error_time_table, point_line, run_error_time
 
     request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)
@@ -429,15 +433,17 @@ def bench_error_time(
 def bench_quality(
     scene: SceneArgument,
     style: StyleOption,
-    out: Annotated[Path, typer.Option(help="Folder for JSON, plot, pictures and scenes.")] = Path("quality"),
+    out: Annotated[Path, typer.Option(help="Folder for JSON, plots, images and scenes.")] = Path("quality"),
     cameras: CamerasOption = None,
-    variants: Annotated[str, typer.Option(help="Names with commas between.")] = "standard,one-scale,cold-start",
+    variants: Annotated[
+        str, typer.Option(help="Names of variants, separated by commas.")
+    ] = "standard,one-scale,cold-start",
     seconds: BenchSeconds = 300.0,
     *,
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> None:
-    """Run variants of a job for the same time each, and judge them by a network that none of them optimizes."""
+    """Run variants of a job for the same time each, and judge results with a network that none of them optimizes."""
     from api.cli.bench import point_line, quality_table, run_quality
 
     request = _variants_request(scene, style, out, cameras, variants, seconds, options, chosen)
@@ -450,7 +456,7 @@ def _tell_what_was_left_out(curves: Sequence[Curve], out: Path) -> None:
     """Print which variants were left out, and where the results are."""
     for curve in curves:
         if curve.left_out:
-            out_console.print(f"{curve.variant.name} was left out: {curve.left_out}")
+            out_console.print(f"{curve.variant.name} was skipped: {curve.left_out}")
     out_console.print(f"{'results:':<22}{out}")
 
 
@@ -476,11 +482,13 @@ def _variants_request(
 
 @bench_app.command("stability")
 def bench_stability(
-    only: Annotated[str, typer.Option(metavar="TEXT", help="Cases whose name holds this, or one group.")] = "",
-    quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes: minutes less.")] = False,
+    only: Annotated[
+        str, typer.Option(metavar="TEXT", help="Run only cases whose name contains TEXT, or the group TEXT.")
+    ] = "",
+    quick: Annotated[bool, typer.Option("--quick", help="Use smaller sizes; minutes faster.")] = False,
     out: Annotated[Path | None, typer.Option(help="JSON file to write.")] = None,
 ) -> None:
-    """Measure hard cases against float64 references; exit with 1 if one exceeds its bound."""
+    """Compare hard cases with float64 references; exit with 1 if one exceeds its bound."""
     from api.cli.bench import run_stability, stability_table
 
     found = run_stability(only, quick, out, lambda case: error_console.print(f"{case.group}: {case.name}"))
@@ -491,7 +499,7 @@ def bench_stability(
 
 @weights_app.command("list")
 def list_() -> None:
-    """List the weights that are installed, and the sources of the others; exit with 1 if some are damaged."""
+    """Show installed weights, and the source of the others; exit with 1 if some are damaged."""
     from sgsst_core.features.network_weights import list_network_weights
     from sgsst_core.features.weight_files import damage_of
 
@@ -513,7 +521,8 @@ def list_() -> None:
 def fetch(
     name: Annotated[Literal["vgg19", "vgg16"], typer.Argument(help="Network to install.")],
     from_: Annotated[
-        Path | None, typer.Option("--from", help="Convert this file (.pth of torchvision or of Gatys et al.) instead.")
+        Path | None,
+        typer.Option("--from", help="Convert this file (.pth of torchvision or Gatys et al.) instead of downloading."),
     ] = None,
 ) -> None:
     """Download and convert weights into the cache folder; do nothing if they are installed."""
@@ -530,7 +539,7 @@ def fetch(
 
 @weights_app.command()
 def path() -> None:
-    """Print the folder of the cached weights; SGSST_CACHE sets another one."""
+    """Print the cache folder for weights; set SGSST_CACHE to change it."""
     from sgsst_core.features.network_weights import cache_folder
 
     out_console.print(str(cache_folder()))
@@ -567,7 +576,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (MemoryError, RuntimeError) as error:
         if not _out_of_memory(error):
             raise
-        error_console.print("error: out of memory. Give a smaller --resolution or fewer --views, or --memory-limit.")
+        error_console.print("error: out of memory. Use a smaller --resolution, fewer --views or a --memory-limit.")
         return FAILURE
     return 0
 

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 _FSCK_CODES = {"missing": 4, "damaged": 8, "orphaned": 16}
 _FSCK_ROLLED_BACK = 32
 
-DataOption = Annotated[Path | None, typer.Option(help="Folder of the service. [SGSST_DATA, else ./sgsst-data]")]
+DataOption = Annotated[
+    Path | None, typer.Option(help="Data folder of the service. [default: SGSST_DATA, else ./sgsst-data]")
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -37,11 +39,13 @@ def add_to(app: typer.Typer) -> None:
 
 
 def serve(
-    host: Annotated[str | None, typer.Option(help="Address to listen on. [127.0.0.1: this machine only]")] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="[8000]")] = None,
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1, this machine only]")
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port to listen on. [default: 8000]")] = None,
     data: DataOption = None,
 ) -> None:
-    """Run the service on this machine: HTTP API and dispatcher. Settings are environment variables, SGSST_..."""
+    """Run the service on this machine: HTTP API and dispatcher. Environment variables SGSST_... configure it."""
     chosen = {"SGSST_HOST": host, "SGSST_PORT": port, "SGSST_DATA": data.absolute() if data else None}
     os.environ.update({name: str(value) for name, value in chosen.items() if value is not None})
     from api.cli.supervisor import serve as run
@@ -54,17 +58,17 @@ def fsck(
         bool,
         typer.Option(
             "--mend",
-            help="Move damaged files to the folder 'quarantine', delete rows of files that are gone, and delete files "
-            "that no row has referred to for an hour (six in an object store).",
+            help="Move damaged files to the folder 'quarantine', delete rows whose files are missing, and delete files "
+            "that no row has referred to for an hour (six hours in an object store).",
         ),
     ] = False,
     data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare all files of the service with its database; the service may be running.
+    """Check all files of the service against its database; the service may be running.
 
-    Exit code: 0 without findings, else the sum of 4 (files are missing), 8 (damaged), 16 (orphaned) and 32 (the
-    database has gone back in time).
+    Exit code: 0 if nothing was found, else the sum of 4 (missing files), 8 (damaged), 16 (orphaned) and 32 (the
+    database was rolled back).
     """
     store = _open_store(data)
     from service.fsck import FileCheck
@@ -80,25 +84,33 @@ def fsck(
         out_console.print(json.dumps([asdict(finding) for finding in found]))
     kinds: list[str] = [finding.kind for finding in found]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in _FSCK_CODES)
-    error_console.print(f"{check.checked} files of the database were read: {counts}")
+    error_console.print(f"Checked {check.checked} files of the database: {counts}")
     if store.database.rolled_back:
-        error_console.print("The database has gone back in time: orphaned files are kept. Its folder has a note on it.")
+        error_console.print("The database was rolled back, so orphaned files are kept. See the note in its folder.")
     code = sum(_FSCK_CODES[kind] for kind in set(kinds)) + (_FSCK_ROLLED_BACK if store.database.rolled_back else 0)
     store.close()
     raise typer.Exit(code)
 
 
 def create_key(
-    name: Annotated[str, typer.Argument(help="Whose it is, for people.", show_default=False)],
-    priority: Annotated[int, typer.Option(help="Jobs of a higher one go first.")] = 0,
-    jobs_a_day: Annotated[int | None, typer.Option(min=0, help="Quota. [the service's]")] = None,
-    gpu_seconds_a_day: Annotated[float | None, typer.Option(min=0, help="Quota. [the service's]")] = None,
-    stored_bytes: Annotated[int | None, typer.Option(min=0, help="Quota. [the service's]")] = None,
-    requests_a_second: Annotated[float | None, typer.Option(min=0.001, help="Quota. [the service's]")] = None,
+    name: Annotated[str, typer.Argument(help="Name of its owner, for display.", show_default=False)],
+    priority: Annotated[int, typer.Option(help="Priority; jobs with higher values run first.")] = 0,
+    jobs_a_day: Annotated[
+        int | None, typer.Option(min=0, help="Quota of jobs per day. [default: the service's]")
+    ] = None,
+    gpu_seconds_a_day: Annotated[
+        float | None, typer.Option(min=0, help="Quota of GPU seconds per day. [default: the service's]")
+    ] = None,
+    stored_bytes: Annotated[
+        int | None, typer.Option(min=0, help="Quota of stored bytes. [default: the service's]")
+    ] = None,
+    requests_a_second: Annotated[
+        float | None, typer.Option(min=0.001, help="Quota of requests per second. [default: the service's]")
+    ] = None,
     data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Create an API key and print it. Only its digest is stored, so it cannot be shown again."""
+    """Create an API key and print it. Only a digest is stored, so the key cannot be shown again."""
     from service.store.quotas import Quotas
 
     quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
@@ -106,7 +118,7 @@ def create_key(
     if as_json:
         out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
         return
-    error_console.print(f"Key {row.id} of {row.name!r}. It is shown only now:")
+    error_console.print(f"Key {row.id} of {row.name!r}. Save it now; it cannot be shown again:")
     out_console.print(text)
 
 
@@ -126,12 +138,14 @@ def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
 
 
 def revoke_key(
-    key_id: Annotated[str, typer.Argument(metavar="ID", help="As shown by keys list.", show_default=False)],
+    key_id: Annotated[
+        str, typer.Argument(metavar="ID", help="ID of the key, as listed by `sgsst keys list`.", show_default=False)
+    ],
     data: DataOption = None,
 ) -> None:
     """Revoke an API key."""
     row = _open_store(data).keys.revoke(key_id)
-    error_console.print(f"Key {row.id} of {row.name!r} is revoked.")
+    error_console.print(f"Revoked key {row.id} of {row.name!r}.")
 
 
 def _service_settings() -> ServiceSettings:

@@ -36,8 +36,8 @@ class JobBar:
     def show_planning(self, planning: PlanningProgress) -> None:
         """Show how many views have been surveyed."""
         left = "" if planning.seconds_left is None else f"{clock(planning.seconds_left)} left"
-        self._show("Looking at the views", planning.done, planning.total, left)
-        self._print_now_and_then(f"Looking at the views: {planning.done} of {planning.total}", left)
+        self._show("Surveying the views", planning.done, planning.total, left)
+        self._print_now_and_then(f"Surveying the views: {planning.done} of {planning.total}", left)
 
     def start(self, prepared: Prepared) -> None:
         """Show the first step."""

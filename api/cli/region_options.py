@@ -10,19 +10,23 @@ RegionOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME:SPEC",
-        help="A region of the scene: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, half-space=A,B,C,D (Ax+By+Cz>=D), "
-        "property=NAME>VALUE, mask=FILE.npy (a flag for each Gaussian) or masks=FOLDER (pictures of views, white is "
-        "in). May be given several times; where regions overlap, the later one counts.",
+        help="Region of the scene: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, half-space=A,B,C,D (Ax+By+Cz>=D), "
+        "property=NAME>VALUE, mask=FILE.npy (a flag for each Gaussian) or masks=FOLDER (images of views, white inside "
+        "the region). May be repeated; where regions overlap, the later one wins.",
     ),
 ]
 RegionStyleOption = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME=FILE[:WEIGHT]", help="Style of a region. Several are mixed. [the job's own]"),
+    typer.Option(
+        metavar="NAME=FILE[:WEIGHT]", help="Style image of a region. Several are mixed. [default: the job's style]"
+    ),
 ]
 RegionWeightOption = Annotated[
-    list[str] | None, typer.Option(metavar="NAME=WEIGHT", help="How much a region's style counts in the loss. [1]")
+    list[str] | None, typer.Option(metavar="NAME=WEIGHT", help="Weight of a region's style in the loss. [default: 1]")
 ]
 RegionKeepOption = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="Leave a region as it is, to the last bit; rest is what no region has."),
+    typer.Option(
+        metavar="NAME", help="Freeze a region: its colors stay bit-identical. rest: all Gaussians without a region."
+    ),
 ]

@@ -46,13 +46,13 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     source, settings, out = request.source, request.settings, request.out
     check_choice(source)
     if out.is_dir() or out.suffix.lower() != ".json":  # a typing mistake must not replace a scene or its cameras
-        raise OutputError(f"{out}: is not the name of a JSON file. Name one to write, such as plan.json.")
+        raise OutputError(f"{out}: not the name of a JSON file. Give one, such as plan.json.")
     if source.cameras and out.exists() and source.cameras.exists() and out.samefile(source.cameras):
-        raise OutputError(f"{out}: is the camera file, which would be lost. Name another file.")
+        raise OutputError(f"{out}: is the camera file, which would be overwritten. Give another file name.")
     check_folder(out.parent)
     if sheet is not None:
         if sheet.is_dir() or sheet.suffix.lower() not in (".jpg", ".jpeg"):
-            raise OutputError(f"{sheet}: is not the name of a JPEG file. Name one to write, such as views.jpg.")
+            raise OutputError(f"{sheet}: not the name of a JPEG file. Give one, such as views.jpg.")
         check_folder(sheet.parent)
     file, cameras, orbit = read_scene_and_cameras(source)
     check_sh_attenuation(file.path, file.header, settings.sh_attenuation)

@@ -62,7 +62,7 @@ class _Child:
             lived = now - self.started
             self.wait = 0.0 if lived > _SHORT_LIFE else min(_LONGEST_WAIT, max(0.5, 2 * self.wait))
             self.not_before = now + self.wait
-            announce(f"The {self.name} ended with code {self.process.returncode}; it is started again.")
+            announce(f"The {self.name} exited with code {self.process.returncode}. Restarting it.")
             self.process = None
         if self.process is None and now >= self.not_before:
             self.start()
@@ -81,8 +81,8 @@ def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
     store = open_store(settings)
     if settings.keys_required and not any(key.revoked_at is None for key in store.keys.all()):
         raise ServeError(
-            f"{settings.host} can be reached from other machines, and there is no API key yet. Make one first: "
-            "`sgsst keys create NAME`. Or serve this machine alone: --host 127.0.0.1."
+            f"{settings.host} can be reached from other machines, but there is no API key. Create one with "
+            "`sgsst keys create NAME`, or serve only this machine with --host 127.0.0.1."
         )
     store.close()
     with _listen(settings) as listener:
@@ -91,7 +91,9 @@ def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
         )
         dispatcher = _Child("dispatcher", [sys.executable, "-m", "service.scheduling.dispatcher"])
         if subprocess.run([sys.executable, "-m", "service.ensure_network_weights"], check=False).returncode:
-            raise ServeError("Without a feature network no job can run. `sgsst weights list` shows where to get one.")
+            raise ServeError(
+                "No feature network is installed, so no job can run. `sgsst weights list` shows where to get one."
+            )
         _run([api, dispatcher], settings, announce, _address(settings, listener))
 
 
@@ -105,7 +107,7 @@ def _listen(settings: ServiceSettings) -> socket.socket:
     except OSError as error:
         listener.close()
         raise ServeError(
-            f"{settings.host}:{settings.port} cannot be used: {error.strerror}. --port names another one."
+            f"Cannot listen on {settings.host}:{settings.port}: {error.strerror}. Choose another port with --port."
         ) from error
     return listener
 
@@ -125,12 +127,14 @@ def _run(children: list[_Child], settings: ServiceSettings, announce: Callable[[
         signal.signal(number, handle)
     for child in children:
         child.start()
-    announce(f"The page: {address}/ (the API's documentation: {address}/docs). Data: {settings.folder}. Ctrl-C stops.")
+    announce(
+        f"Serving at {address}/ (API documentation: {address}/docs). Data: {settings.folder}. Press Ctrl-C to stop."
+    )
     while not signals:
         for child in children:
             child.restart_if_dead(announce)
         time.sleep(_LOOK_SECONDS)
-    announce("Stopping; running jobs save their state. Ctrl-C again ends at once.")
+    announce("Stopping; running jobs save their state. Press Ctrl-C again to stop immediately.")
     processes = [child.process for child in children if child.process is not None]
     for process in processes:
         process.send_signal(signal.SIGTERM)

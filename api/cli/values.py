@@ -40,7 +40,9 @@ def parse_color(text: str) -> tuple[float, float, float]:
     except ValueError:
         red = math.nan
     if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
-        raise typer.BadParameter(f"{text!r} is neither black, white nor three numbers from 0 to 255 such as 40,40,48.")
+        raise typer.BadParameter(
+            f"{text!r} is not a color. Give black, white or three numbers from 0 to 255, such as 40,40,48."
+        )
     return red, green, blue
 
 
@@ -48,7 +50,7 @@ def parse_bytes(text: str) -> int:
     """Return bytes from "8GB", "512 MB", "6GiB" or a plain number."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?I?)B?", text.strip().upper())
     if not match or match[2] not in _UNITS or not (size := int(float(match[1]) * _UNITS[match[2]])):
-        raise typer.BadParameter(f"{text!r} is not an amount of memory such as 8GB or 512MB.")
+        raise typer.BadParameter(f"{text!r} is not an amount of memory. Give one such as 8GB or 512MB.")
     return size
 
 
@@ -60,7 +62,7 @@ def parse_strength(text: str) -> float:
         return float(text)
     except ValueError:
         words = ", ".join(STRENGTHS)
-        raise typer.BadParameter(f"{text!r} is neither a number nor one of {words}.") from None
+        raise typer.BadParameter(f"{text!r} is not a weight. Give a number or one of {words}.") from None
 
 
 def parse_weights(text: str) -> tuple[float, ...]:
@@ -68,13 +70,15 @@ def parse_weights(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"{text!r} are no numbers with commas between them such as 1,0.5,0,1.") from None
+        raise typer.BadParameter(
+            f"{text!r} is not a list of weights. Give numbers separated by commas, such as 1,0.5,0,1."
+        ) from None
 
 
 #: Units whose values are written differently than in JSON.
 FORMS = {
     "RGB, 0 to 1": Form(parse_color, "COLOR", ": black, white, or R,G,B from 0 to 255."),
     "factor or strength": Form(parse_strength, "W", f" {_STRENGTHS}"),
-    "weights of scales": Form(parse_weights, "W,W,...", ": 1,0,0.5 for the first and the third."),
+    "scale weights": Form(parse_weights, "W,W,...", ". 1,0,0.5 uses the first and the third."),
     "bytes": Form(parse_bytes, "SIZE", ", such as 8GB."),
 }

@@ -139,7 +139,7 @@ async def get_caller(
         return _caller(context, key)
     if context.settings.keys_required:
         if cookie:
-            raise NoKeyError("The session is over. Sign in again with an API key.")
+            raise NoKeyError("The session has ended. Sign in again with an API key.")
         raise NoKeyError("An API key is needed: send it as 'Authorization: Bearer KEY'.")
     _check_site(request, context.settings)
     return Caller(LOCAL_OWNER, 0)

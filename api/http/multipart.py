@@ -139,10 +139,10 @@ def declared_bytes(request: Request, limit: int, advice: str = "Use uploads.") -
         TooLargeError: If the body is too long.
     """
     if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
-        raise MediaTypeError("Bodies are taken as they are: send it without Content-Encoding.")
+        raise MediaTypeError("Encoded bodies are not accepted. Send the body without Content-Encoding.")
     total = int(request.headers.get("content-length", "0"))  # only digits: the HTTP parser refuses anything else
     if total > limit:
-        raise TooLargeError(f"The request has {total:,} bytes; at most {limit:,} are allowed. {advice}", limit=limit)
+        raise TooLargeError(f"The request has {total:,} bytes. At most {limit:,} are allowed. {advice}", limit=limit)
     return total
 
 
@@ -225,7 +225,7 @@ class _Form:
                 max_header_size=_MAX_HEADER,
             )
         except FormParserError as error:
-            raise BadRequestError(f"The multipart boundary cannot be used: {error}.") from error
+            raise BadRequestError(f"The multipart boundary is invalid: {error}.") from error
 
     def feed(self, block: bytes) -> None:
         """Charge a block of the body to the receipt, then parse it."""
@@ -233,7 +233,7 @@ class _Form:
         try:
             self._parser.write(block)
         except FormParserError as error:
-            raise BadRequestError(f"The multipart body makes no sense: {error}.") from error
+            raise BadRequestError(f"The multipart body is invalid: {error}.") from error
 
     def finish(self) -> None:
         """Check that the body was complete.
@@ -272,7 +272,7 @@ class _Form:
         self._text.clear()
         if self._role not in (*ROLES, *_TEXT_FIELDS):
             known = ", ".join((*ROLES, *_TEXT_FIELDS))
-            raise RefusedInputError(f"There is a field {self._role[:60]!r}; known are {known}.", "invalid-request")
+            raise RefusedInputError(f"Unknown field {self._role[:60]!r}. Use {known}.", "invalid-request")
         if filename is None or self._role in _TEXT_FIELDS:
             return
         count = len(self.received.files)
@@ -307,7 +307,7 @@ class _Form:
             place = len(self.received.files) + len(self.received.uploads)
             self.received.uploads.append((place, self._role, text.strip()))
         elif self._role in self.received.texts:
-            raise RefusedInputError(f"The field {self._role!r} is there twice.", "invalid-request")
+            raise RefusedInputError(f"The field {self._role!r} was sent twice. Send it once.", "invalid-request")
         else:
             self.received.texts[self._role] = text
 
@@ -341,7 +341,7 @@ def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSet
     count = declared.count
     if count > settings.max_gaussians:
         raise RefusedInputError(
-            f"The scene has {count:,} Gaussians; {settings.max_gaussians:,} may be.",
+            f"The scene has {count:,} Gaussians. At most {settings.max_gaussians:,} are allowed.",
             "too-many-gaussians",
             input=role,
             limit=settings.max_gaussians,

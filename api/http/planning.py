@@ -104,7 +104,7 @@ async def _events(
         except ServiceError as error:
             yield _event("problem", json.loads(bytes(from_service(error).body)))
         except Exception as error:
-            _log.exception("a dry run broke", exc_info=error)
+            _log.exception("a dry run failed unexpectedly", exc_info=error)
             yield _event("problem", json.loads(bytes(from_service(InternalError()).body)))
     finally:
         task.cancel()

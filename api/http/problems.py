@@ -159,5 +159,5 @@ async def _system_error(request: Request, error: Exception) -> JSONResponse:
 
 
 async def _unexpected(request: Request, error: Exception) -> JSONResponse:
-    _log.exception("%s %s broke", request.method, request.url.path, exc_info=error)
+    _log.exception("%s %s failed unexpectedly", request.method, request.url.path, exc_info=error)
     return from_service(InternalError())

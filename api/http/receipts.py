@@ -49,7 +49,7 @@ class Receipts:
                 try:
                     await asyncio.to_thread(self.inputs.renew_receipts, list(self.active))
                 except DatabaseUnavailableError:  # receipts last for several renewals
-                    _log.warning("receipts could not be renewed; this is tried again")
+                    _log.warning("receipts could not be renewed; retrying")
 
 
 class Receipt:

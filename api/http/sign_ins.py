@@ -36,7 +36,7 @@ class SignIns:
         if found is not None and len(found) == MOST_FAILURES:
             left = found[0] + WITHIN_SECONDS - self._clock()
             if left > 0:
-                message = "Too many keys that are no good came from this address. Try again later."
+                message = "Too many invalid keys came from this address. Try again later."
                 raise TooManyTriesError(message, retry_after=int(left) + 1)
 
     def failed(self, address: str) -> None:

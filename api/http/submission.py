@@ -54,7 +54,7 @@ class JobFromUploads(BaseModel):
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
     parameters: JobParameters = Field(default_factory=JobParameters)
-    webhook: str | None = Field(None, max_length=2000, description="URL that is told when the job has ended.")
+    webhook: str | None = Field(None, max_length=2000, description="URL to notify when the job ends.")
 
 
 _FILE = {"type": "string", "format": "binary"}
@@ -78,7 +78,7 @@ _FORM = {
         },
         "photos": {"type": "array", "items": _FILE, "description": "Named as the cameras say."},
         "parameters": {"type": "string", "description": "JSON: see JobParameters."},
-        "webhook": {"type": "string", "description": "URL that is told when the job has ended."},
+        "webhook": {"type": "string", "description": "URL to notify when the job ends."},
     },
     "examples": [
         {
@@ -103,7 +103,9 @@ REFUSALS: tuple[ServiceError, ...] = (
     BadRequestError("The multipart body ends before its last boundary: it was cut off."),
     NotFoundError("The bytes of upload upl_1a1fe701a104f943e9d4d8cce5b818c are gone. Begin a new one."),
     TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
-    TooLargeError("The request has 5,000,000,000 bytes; 4,000,000,000 may be. Use uploads.", limit=4_000_000_000),
+    TooLargeError(
+        "The request has 5,000,000,000 bytes. At most 4,000,000,000 are allowed. Use uploads.", limit=4_000_000_000
+    ),
     MediaTypeError("The body must be multipart/form-data or application/json."),
     invalid("resolution", "Input should be greater than or equal to 1"),
     RefusedInputError(
@@ -119,13 +121,18 @@ REFUSALS: tuple[ServiceError, ...] = (
     RefusedInputError("Both numbers of steps are 0, so that nothing would change. Give some.", "invalid-settings"),
     RefusedInputError("The service has no weights of vgg19: its operator has to fetch them.", "invalid-weights"),
     RefusedInputError(
-        "The scene has 30,000,000 Gaussians; 20,000,000 may be.", "too-many-gaussians", input="scene", limit=20_000_000
+        "The scene has 30,000,000 Gaussians. At most 20,000,000 are allowed.",
+        "too-many-gaussians",
+        input="scene",
+        limit=20_000_000,
     ),
-    RefusedInputError("There are 3,000 views; 2,000 may be.", "too-many-views", input="cameras"),
+    RefusedInputError("There are 3,000 views. At most 2,000 are allowed.", "too-many-views", input="cameras"),
     RefusedInputError(
-        "All views have 30,000,000,000 pixels; 20,000,000,000 may be.", "too-many-pixels", input="cameras"
+        "All views have 30,000,000,000 pixels. At most 20,000,000,000 are allowed.", "too-many-pixels", input="cameras"
     ),
-    RefusedInputError("style.jpg: has 20000 x 20000 pixels; 100,000,000 may be.", "image-too-large", input="style"),
+    RefusedInputError(
+        "style.jpg: has 20000 x 20000 pixels. At most 100,000,000 are allowed.", "image-too-large", input="style"
+    ),
     RefusedInputError("There are more than 2041 files.", "too-many-files"),
     RefusedInputError(
         "view 'view_0' (5187x3361): its 9,000,000 visible Gaussians touch raster tiles 3,000,000,000 times, more than "
@@ -136,8 +143,8 @@ REFUSALS: tuple[ServiceError, ...] = (
         "Reading the files takes more time or memory than allowed, or breaks their reader.", "inspection-limit"
     ),
     RefusedInputError(
-        "'upl_1a1fe701a104f943e9d4d8cce5b818c' is no id of an upload that can be used, and 'scene' came without a "
-        "file name.",
+        "'upl_1a1fe701a104f943e9d4d8cce5b818c' is not the ID of a usable upload, and 'scene' has no file name. Send an "
+        "upload's ID, or a file with its name.",
         "unknown-upload",
         input="scene",
     ),

@@ -126,7 +126,7 @@ class FileCache:
             raise LostFileError.of(sha256) from error
         finally:
             half.unlink(missing_ok=True)
-        _log.error("the file with SHA-256 %s is damaged in the store: what comes has %s", sha256, found)
+        _log.error("the file with SHA-256 %s is damaged in the store: the received file has %s", sha256, found)
         raise DamagedFileError.of(sha256)
 
     def _fetch(self, half: Path, fetch: Fetch) -> None:
@@ -168,7 +168,7 @@ class FileCache:
             return False
         if file_digest(target) == sha256:
             return True
-        _log.error("%s is damaged; it is fetched again", path)
+        _log.error("%s is damaged; fetching it again", path)
         target.unlink()
         path.unlink(missing_ok=True)
         return False

@@ -208,8 +208,11 @@ class ObjectStore:
         """Return the modification times of all objects in a folder by name, in seconds since 1970 (0 if unknown)."""
         with self._told(folder):
             self._files.invalidate_cache()
-            found = self._files.find(self._path(folder), detail=True)
-            return {path[len(self.root) + 1 :]: _changed(entry) for path, entry in found.items()}
+            inside = f"{self._path(folder).rstrip('/')}/"
+            found = self._files.find(inside, detail=True)  # may list an empty folder as an object of its name
+            return {
+                path[len(self.root) + 1 :]: _changed(entry) for path, entry in found.items() if path.startswith(inside)
+            }
 
     def can_join(self, sizes: list[int]) -> bool:
         """Return whether the store can concatenate objects of these sizes without uploading them again."""

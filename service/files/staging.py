@@ -96,8 +96,8 @@ def check_roles(
     own = _check_region_styles([entry["name"] for entry in found["style"]], of_regions)
     if weights is not None and len(weights) != own:
         raise RefusedInputError(
-            f"style_weights has {len(weights)} values for {own} files 'style' that are no region's. Give one for each, "
-            "in their order.",
+            f"style_weights has {len(weights)} values for {own} files 'style' that belong to no region. Give one per "
+            "file, in the same order.",
             "invalid-request",
             input="style_weights",
         )
@@ -109,11 +109,15 @@ def check_roles(
         )
     if found["cameras"] and orbit:
         raise RefusedInputError(
-            "There are 'cameras' and the parameter 'orbit'. Send one of them.", "invalid-cameras", input="cameras"
+            "Both 'cameras' and the parameter 'orbit' were sent. Send only one of them.",
+            "invalid-cameras",
+            input="cameras",
         )
     if found["photos"] and orbit:
         raise RefusedInputError(
-            "Photos are of known cameras, which an orbit has not. Send 'cameras'.", "invalid-cameras", input="photos"
+            "'photos' requires 'cameras', and cannot be combined with 'orbit'. Send 'cameras' instead.",
+            "invalid-cameras",
+            input="photos",
         )
     _check_camera_files([entry["name"] for entry in found["cameras"]])
     names = [(entry["role"], entry["name"].lower()) for entry in inputs]
@@ -121,7 +125,7 @@ def check_roles(
         next((name for name in names if names.count(name) > 1), None) if len(names) < 50 else _first_duplicate(names)
     )
     if twice:
-        raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}.", "invalid-request")
+        raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}. Rename one.", "invalid-request")
     _check_folders(found["photos"])
 
 
@@ -130,15 +134,17 @@ def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int
     missing = next((name for name in of_regions if name not in names), None)
     if missing is not None:
         raise RefusedInputError(
-            f"A region's style is {missing!r}, but there is no file 'style' of that name; there are "
-            f"{', '.join(names)}. Send it.",
+            f"A region's style is {missing!r}, but no file 'style' has that name; the names are "
+            f"{', '.join(names)}. Send it, or correct the name.",
             "invalid-request",
             input="style",
         )
     own = len([name for name in names if name not in of_regions])
     if not own:
         raise RefusedInputError(
-            "Every file 'style' is a region's. Send one more for what no region has.", "invalid-request", input="style"
+            "Every file 'style' belongs to a region. Send one more for the rest of the scene.",
+            "invalid-request",
+            input="style",
         )
     return own
 

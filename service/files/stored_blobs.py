@@ -82,7 +82,7 @@ class StoredBlobs(Blobs):
             try:
                 self.objects.remove(f"{BLOBS}/{location}")
             except StoreError as error:
-                _log.warning("an unused input stays until the store is looked through: %s", error.__cause__)
+                _log.warning("an unused input stays until the next sweep of the store: %s", error.__cause__)
 
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
         """Return links in `folder` to this host's cached copies, after fetching missing ones."""
@@ -177,7 +177,7 @@ class StoredBlobs(Blobs):
         try:
             self.objects.join([part.location for part in parts], f"{BLOBS}/{location}")
         except StoreError as error:
-            _log.warning("the store does not join parts, the whole is sent: %s", error.__cause__)
+            _log.warning("the store cannot join parts; sending the whole file: %s", error.__cause__)
             return None
         return location
 

@@ -114,7 +114,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         if declared > limits["gaussians"]:
             raise RefusedError(
                 "too-many-gaussians",
-                f"The scene has {declared:,} Gaussians{_once(settings)}; {limits['gaussians']:,} may be.",
+                f"The scene has {declared:,} Gaussians{_once(settings)}. At most {limits['gaussians']:,} are allowed.",
             )
         file = read_scene(source.scene, drop_invalid=source.drop_invalid)
         check_sh_attenuation(file.path, file.header, settings.sh_attenuation)
@@ -132,10 +132,14 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         unfitted, orbit = read_cameras_of(source, file.scene)
         cameras = fit_cameras(unfitted, settings)
         if len(cameras) > limits["views"]:
-            raise RefusedError("too-many-views", f"There are {len(cameras):,} views; {limits['views']:,} may be.")
+            raise RefusedError(
+                "too-many-views", f"There are {len(cameras):,} views. At most {limits['views']:,} are allowed."
+            )
         pixels = sum(camera.width * camera.height for camera in cameras)
         if pixels > limits["pixels"]:
-            raise RefusedError("too-many-pixels", f"All views have {pixels:,} pixels; {limits['pixels']:,} may be.")
+            raise RefusedError(
+                "too-many-pixels", f"All views have {pixels:,} pixels. At most {limits['pixels']:,} are allowed."
+            )
         check_scales(settings.scales, cameras, settings.coarsest_side)
         check_something_in_view(file.scene, cameras, source.near)
         found |= {"views": len(cameras), "pixels": pixels}
@@ -236,7 +240,8 @@ def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
     width, height = image_size(path)
     if width * height > limits["image_pixels"]:
         raise RefusedError(
-            "image-too-large", f"{path.name}: has {width} x {height} pixels; {limits['image_pixels']:,} may be."
+            "image-too-large",
+            f"{path.name}: has {width} x {height} pixels. At most {limits['image_pixels']:,} are allowed.",
         )
 
 

@@ -105,7 +105,7 @@ class Dispatcher:
         known = {row.name for row in self._store.operations.dispatchers()}
         for name in sorted(known.union(self._store.leases.holders())):
             if is_dead(name):
-                _log.info("dispatcher %s is gone; its jobs are taken over", name)
+                _log.info("dispatcher %s is gone; taking over its jobs", name)
                 self._store.leases.run_out(name)
                 self._store.operations.gone(name)
         if self._work.parent.is_dir():
@@ -222,7 +222,7 @@ class Dispatcher:
                     attempt.abandon()
 
     def _shut_down(self) -> None:
-        _log.info("shutting down: %d running jobs save their state", len(self._running))
+        _log.info("shutting down; %d running jobs are saving their state", len(self._running))
         for attempt in self._running.values():
             attempt.release()
         with contextlib.suppress(DatabaseUnavailableError):
@@ -258,7 +258,7 @@ class Dispatcher:
                 self._strays_at = time.monotonic()
                 remove_strays(self._store, self._artifacts)
         except Exception:  # file stores raise arbitrary errors; running jobs must not suffer
-            _log.exception("not everything that is no longer needed could be removed; this is tried again")
+            _log.exception("expired files could not all be removed; retrying later")
 
 
 def main() -> None:

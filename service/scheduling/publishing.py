@@ -57,7 +57,7 @@ class Publisher:
         self.publish(put)
         if refused is not None:
             self._refused_at = time.monotonic()
-            _log.warning("%s: not everything could be stored: %s", self._lease.job_id, _reason(refused))
+            _log.warning("%s: some files could not be stored: %s", self._lease.job_id, _reason(refused))
 
     def publish(self, files: Sequence[Published]) -> None:
         """Make stored files visible; results are held back until the end."""
@@ -72,7 +72,7 @@ class Publisher:
             for location in locations:
                 self._artifacts.remove(location)
         except StoreError as error:
-            _log.warning("%s: what was replaced stays for now: %s", self._lease.job_id, _reason(error))
+            _log.warning("%s: replaced files could not be deleted yet: %s", self._lease.job_id, _reason(error))
 
     def _grown_log(self, *, now: bool) -> dict[str, Path]:
         """Return a copy of the log if one is due, because the process keeps writing to the log itself."""
@@ -108,7 +108,7 @@ class Publisher:
         try:
             sweep(self._store, self._artifacts, self._lease.job_id, self._lease.epoch)
         except StoreError as error:
-            _log.warning("%s: could not be swept: %s", self._lease.job_id, _reason(error))
+            _log.warning("%s: leftover files could not be deleted: %s", self._lease.job_id, _reason(error))
 
     def log_tail(self) -> str | None:
         """Return the end of the log; None if there is no log."""
@@ -133,7 +133,7 @@ def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Publishe
             return done
         if given_up() or time.monotonic() - started > PATIENCE_SECONDS:
             raise refused
-        _log.warning("results could not be stored, this is tried again: %s", _reason(refused))
+        _log.warning("results could not be stored; retrying: %s", _reason(refused))
         time.sleep(_AGAIN_SECONDS)
 
 

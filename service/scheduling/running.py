@@ -128,7 +128,7 @@ class RunningAttempt:
         except LeaseLostError:
             _log.warning("the lease was lost: another dispatcher has the job", extra=self._log_fields)
         except Exception as error:
-            _log.exception("the attempt broke", extra=self._log_fields)
+            _log.exception("the attempt failed unexpectedly", extra=self._log_fields)
             told = (
                 {"code": error.code, "message": str(error)}
                 if isinstance(error, ServiceError)
@@ -293,7 +293,7 @@ class RunningAttempt:
         kept = self.grant.gpus[:left] if self._cluster else tuple(x for x in self.grant.gpus if x not in gpus)
         self.grant = replace(self.grant, ranks=len(kept), gpus=kept)
         self._count_gpus()
-        _log.info("needs %d GPUs and gives %d back", len(kept), len(gpus), extra=self._log_fields)
+        _log.info("needs %d GPUs; releasing %d", len(kept), len(gpus), extra=self._log_fields)
 
     def _write_progress(self, *, now: bool = False) -> None:
         moment = time.monotonic()
@@ -329,7 +329,7 @@ class RunningAttempt:
 
     def _fail(self, error: dict[str, Any], *, permanent: bool) -> None:
         again = self._store.leases.fail(self.lease, error, permanent=permanent)
-        _log.warning("%s: %s", "will be tried again" if again else "failed", error["message"], extra=self._log_fields)
+        _log.warning("%s: %s", "will be retried" if again else "failed", error["message"], extra=self._log_fields)
         if not again:
             self._publisher.sweep()
 

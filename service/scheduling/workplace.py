@@ -213,10 +213,10 @@ class _Shipper:
             try:
                 refused = self._ship()
             except Exception:  # the job continues whatever the error is
-                _log.exception("what the job has made could not be stored")
+                _log.exception("the files of the job could not be stored")
                 refused = None
             if refused is not None:
-                _log.warning("what the job has made could not be stored: %s", refused.__cause__ or refused)
+                _log.warning("the files of the job could not be stored: %s", refused.__cause__ or refused)
                 self._stop.wait(_AGAIN_SECONDS)
 
     def _ship(self) -> StoreError | None:

@@ -221,7 +221,7 @@ class Jobs:
             job = _job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.RETRY):
                 raise ConflictError(
-                    f"The job has status {job.status}; only one that failed or was canceled can be tried again.",
+                    f"The job has status {job.status}; only failed or canceled jobs can be retried.",
                     job_status=job.status,
                 )
             _check_queue(session, job.owner, limit)
@@ -325,7 +325,8 @@ def _check_queue(session: Session, owner: str, limit: int) -> None:
     """Raise QueueFullError if an owner has `limit` unfinished jobs."""
     if session.execute(_UNFINISHED_OF, {"owner": owner}).scalar_one() >= limit:
         raise QueueFullError(
-            f"There are {limit} unfinished jobs of this key already. Wait for one to end, or cancel one.", limit=limit
+            f"There are already {limit} unfinished jobs of this key. Wait for one to finish, or cancel one.",
+            limit=limit,
         )
 
 

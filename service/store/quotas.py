@@ -114,14 +114,15 @@ def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
     tomorrow = _DAY - int(now % _DAY)
     if quotas.jobs_a_day is not None and jobs > quotas.jobs_a_day:
         raise QuotaError(
-            f"This key may submit {quotas.jobs_a_day:,} jobs a day, and has. Come back tomorrow (UTC).",
+            f"This key may submit {quotas.jobs_a_day:,} jobs a day, and has done so. Try again tomorrow (UTC).",
             quota="jobs-a-day",
             limit=quotas.jobs_a_day,
             retry_after=tomorrow,
         )
     if quotas.gpu_seconds_a_day is not None and seconds >= quotas.gpu_seconds_a_day:
         raise QuotaError(
-            f"This key may use {quotas.gpu_seconds_a_day:,.0f} GPU seconds a day, and has. Come back tomorrow (UTC).",
+            f"This key may use {quotas.gpu_seconds_a_day:,.0f} GPU seconds a day, and has used them. "
+            "Try again tomorrow (UTC).",
             quota="gpu-seconds-a-day",
             limit=quotas.gpu_seconds_a_day,
             retry_after=tomorrow,
@@ -144,7 +145,8 @@ def check_bytes(session: Session, owner: str, quotas: Quotas) -> None:
     limit = quotas.stored_bytes
     if limit is not None and (used := stored_bytes(session, owner)) > limit:
         raise QuotaError(
-            f"With this, {used:,} bytes would be kept for this key; {limit:,} may be. Delete jobs or uploads first.",
+            f"With this, {used:,} bytes would be kept for this key. At most {limit:,} are allowed. "
+            "Delete jobs or uploads first.",
             quota="stored-bytes",
             limit=limit,
             retry_after=_BYTES_AGAIN,

@@ -71,7 +71,7 @@ def ensure_writable_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = "there is a file of that name" if isinstance(error, FileExistsError) else error.strerror
-        raise OutputError(f"{path}: cannot be used as output folder: {reason}. Name another folder.") from error
+        raise OutputError(f"{path}: cannot be used as output folder: {reason}. Choose another folder.") from error
     # os.access is no proof: it returns True for root, and for read-only network mounts.
     _reserve(path / "trial").unlink()
 

@@ -190,7 +190,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except Exception as error:  # Pillow's decoders raise many types
         if isinstance(error, OSError) and error.strerror:
             raise ImageError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
-        raise ImageError(f"{path}: is truncated or corrupt ({error}). Give another copy.") from error
+        raise ImageError(f"{path}: is truncated or corrupt ({error}). Use an intact copy.") from error
 
 
 def _check_scans(path: Path) -> None:
@@ -214,7 +214,7 @@ def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:
     if image.mode.startswith(("I", "F")):  # gray with more than 8 bits; Pillow would clip it at 255
         values: NDArray[np.float32] = np.asarray(image, dtype=np.float32)
         if not np.isfinite(values).all():
-            raise ImageError(f"{path}: holds NaN or infinite pixels. Give another image.")
+            raise ImageError(f"{path}: holds NaN or infinite pixels. Use another image.")
         gray = np.clip(values / np.float32(_full_scale(image.mode, float(values.max()))), 0, 1)
         key = image.info.get("transparency")
         if isinstance(key, int):
@@ -269,7 +269,7 @@ def _check_aspect(path: Path, size: tuple[int, int], camera: Camera) -> None:
     if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > allowed:
         raise ImageError(
             f"{path}: is {size[0]} x {size[1]}, but its camera {camera.name!r} {camera.width} x {camera.height}, "
-            "another aspect. Give the photos that the cameras were computed from, neither cropped nor turned."
+            "another aspect. Give the photos that the cameras were computed from, neither cropped nor rotated."
         )
 
 

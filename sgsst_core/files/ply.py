@@ -498,13 +498,13 @@ def _valid_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool)
     flawed = [f"hold NaN or infinite values: {', '.join(found)}"] if found else []
     if len(unrotated):
         flawed += [
-            f"have a quaternion of length 0, which is no rotation ({len(unrotated)}, first: Gaussian {min(unrotated)})"
+            f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {min(unrotated)})"
         ]
     summary = f"{path}: {bad} of {len(kept)} Gaussians {', or '.join(flawed)}"
     if bad == len(kept):
-        raise SceneError(f"{summary}. None is left: train or export the scene again.")
+        raise SceneError(f"{summary}. No valid Gaussians remain. Train or export the scene again.")
     if not drop_invalid:
-        raise SceneError(f"{summary}. Give --drop-invalid to leave these Gaussians out.")
+        raise SceneError(f"{summary}. Use --drop-invalid to drop these Gaussians.")
     return kept
 
 

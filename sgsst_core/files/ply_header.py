@@ -140,7 +140,7 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
                 properties[prop.name] = prop
             case _:
                 shown = line[:80].decode("latin-1")
-                raise SceneError(f"{path}: line {number} of the PLY header makes no sense: {shown!r}. Export it again.")
+                raise SceneError(f"{path}: line {number} of the PLY header is invalid: {shown!r}. Export it again.")
         position += len(line) + len(newline)
     if byte_order is None:
         raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")

@@ -175,7 +175,7 @@ def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, .
     if wrong or element.has_lists:
         what = f"{', '.join(wrong)} missing or of another type" if wrong else "a list"
         raise SceneError(
-            f"{path}: is no compressed PLY that can be read: element {element.name!r} has {what}. Export it again."
+            f"{path}: is not a readable compressed PLY: element {element.name!r} has {what}. Export it again."
         )
 
 

@@ -79,6 +79,6 @@ def check_sh_attenuation(path: Path, header: PlyHeader | None, attenuation: floa
     whole = [name for name, kind in kinds.items() if re.fullmatch(r"f_rest_\d+", name) and kind[0] != "f"]
     if whole:
         raise SceneError(
-            f"{path}: {whole[0]} is stored as integers, which cannot fade. Convert it to float first, or leave "
-            "--sh-attenuation out."
+            f"{path}: {whole[0]} is stored as integers, which cannot be attenuated. Convert it to float first, or "
+            "leave --sh-attenuation out."
         )

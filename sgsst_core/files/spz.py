@@ -186,7 +186,7 @@ def _ends_early(path: Path) -> SceneError:
 
 def _too_much(path: Path) -> SceneError:
     return SceneError(
-        f"{path}: the compressed data goes on behind all Gaussians that the header declares: the header is wrong. "
+        f"{path}: the compressed data continues after all Gaussians that the header declares: the header is wrong. "
         "Export it again."
     )
 

@@ -73,10 +73,12 @@ def normalized(weights: Sequence[float]) -> tuple[float, ...]:
         SettingsError: If there are no weights, or one is not a finite number above 0.
     """
     if not weights:
-        raise SettingsError("There is no style picture. Give one.")
+        raise SettingsError("There is no style image. Give at least one.")
     for weight in weights:
         if not (math.isfinite(weight) and weight > 0):
-            raise SettingsError(f"The weight {weight:g} of a style picture is no finite number above 0.")
+            raise SettingsError(
+                f"The weight {weight:g} of a style image is not a finite number greater than 0. Change it."
+            )
     largest = max(weights)  # dividing by it keeps the sum of finite weights finite
     shares = [weight / largest for weight in weights]
     total = math.fsum(shares)

@@ -319,7 +319,7 @@ class SosLoss:
             height, width = _size(pyramids[0][min(pyramids[0])])  # from the scales with a positive weight
             raise ImageError(
                 f"The style is used at {width} x {height} pixels, too few to match features with. "
-                "Give a larger picture, or larger views, or leave --style-loss at sos."
+                "Use a larger style image, larger views, or --style-loss sos."
             )
         return {scale: ScaleTarget(layers.get(scale, {}), found) for scale, found in vectors.items()}
 

@@ -26,7 +26,7 @@ from sgsst_core.planning.visits import MAP_BYTES, MAPS_OF_A_RENDER, Made, Visits
 from sgsst_core.scene.camera import Camera
 from sgsst_core.settings import Settings
 
-_ANOTHER_LOSS = "it is another loss than the paper's"
+_ANOTHER_LOSS = "differs from the paper's loss"
 
 
 def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
@@ -34,13 +34,13 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
     scene = probe.scene
     pruned = int(pruned_gaussians(plan.survey, plan.seen).sum())
     unseen = int((~plan.seen).sum()) - pruned
-    change = "keep their colors" if settings.unseen == "freeze" else "take their neighbors' color change at the end"
+    change = "keep their colors" if settings.unseen == "freeze" else "follow their neighbors' color change at the end"
     decisions = []
     if unseen:
         decisions.append(
             Decision(
                 "unseen Gaussians",
-                f"{unseen:,} of {scene.gaussians:,} are not rendered and not optimized; they {change}",
+                f"{unseen:,} of {scene.gaussians:,} are neither rendered nor optimized; they {change}",
                 "their blend weights are 0 in every pixel of every view",
                 bytes=unseen * OPTIMIZER_BYTES,
             )
@@ -50,11 +50,11 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
         decisions.append(
             Decision(
                 "pruned Gaussians",
-                f"{pruned:,} of {scene.gaussians:,} are not rendered and not optimized; they {change}",
-                f"their blend weights over all views add up to at most {settings.prune_weight:g} each",
+                f"{pruned:,} of {scene.gaussians:,} are neither rendered nor optimized; they {change}",
+                f"the blend weights of each sum to at most {settings.prune_weight:g} over all views",
                 bytes=pruned * OPTIMIZER_BYTES,
-                error=f"of colors in 0..255, no pixel of a view changes by more than "
-                f"{255 * probe.pruned_error.largest:.3g}, the mean pixel by no more than "
+                error=f"in 8-bit levels, no pixel of a view changes by more than "
+                f"{255 * probe.pruned_error.largest:.3g}, and the mean pixel by no more than "
                 f"{255 * probe.pruned_error.mean:.2g}",
             )
         )
@@ -64,7 +64,7 @@ def of_scene(probe: Probe, plan: Plan, settings: Settings) -> list[Decision]:
 def _of_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
     scene, degree = probe.scene, probe.scene.used_degree
     if not scene.sh_degree:
-        nothing = ": there is nothing to fade" if settings.sh_attenuation else ""
+        nothing = ": there is nothing to attenuate" if settings.sh_attenuation else ""
         return [Decision("spherical harmonics", "no view directions are computed", f"the scene has degree 0{nothing}")]
     if settings.sh_attenuation:
         return [_of_sh_attenuation(probe, settings.sh_attenuation)]
@@ -85,17 +85,17 @@ def _of_sh_attenuation(probe: Probe, attenuation: float) -> Decision:
     if attenuation == 1:
         return Decision(
             "spherical harmonics",
-            f"degrees 1 to {scene.sh_degree} are faded out: no view directions are computed, and the result has zeros",
-            "asked for",
+            f"degrees 1 to {scene.sh_degree} are attenuated to 0, in the result too; no view directions are computed",
+            "requested",
             bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - 1) * 4,
-            error="no color depends on the direction of view any more",
+            error="colors no longer depend on the view direction",
         )
     return Decision(
         "spherical harmonics",
-        f"coefficients of degrees 1 to {scene.sh_degree} are {1 - attenuation:.3g} times as large, in the result too; "
+        f"coefficients of degrees 1 to {scene.sh_degree} are multiplied by {1 - attenuation:.3g}, in the result too; "
         f"evaluated up to degree {scene.used_degree}",
-        "asked for",
-        error="colors depend less on the direction of view",
+        "requested",
+        error="colors depend less on the view direction",
     )
 
 
@@ -105,16 +105,16 @@ def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_b
     total = len(probe.sizes)
     blind = total - len(plan.survey.covered)
     if blind:
-        decisions.append(Decision("views", f"{blind} of {total} are left out", "they see no Gaussian"))
+        decisions.append(Decision("views", f"{blind} of {total} are skipped", "they see no Gaussian"))
     similar = len(plan.survey.covered) - len(plan.covered)
     if similar:
         decisions.append(
             Decision(
                 "similar views",
-                f"{similar} of {total} are left out",
-                f"their picture is that of another view, shifted by less than {settings.similar_views:.1%} of its side",
+                f"{similar} of {total} are skipped",
+                f"each shows the same as another view, shifted by less than {settings.similar_views:.1%} of its side",
                 bytes=content_bytes,
-                error="what only these views show gets fewer steps, or none",
+                error="surfaces that only these views show get fewer steps, or none",
             )
         )
     share = f"{plan.survey.uncovered_share:.1%} of the views' pixels are uncovered"
@@ -122,7 +122,7 @@ def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_b
         decisions.append(
             Decision(
                 "uncovered pixels",
-                f"{1 - work.pixels / work.without_region:.0%} of the pixels do not go through the network",
+                f"{1 - work.pixels / work.without_region:.0%} of the pixels skip the network",
                 share,
                 seconds=(work.without_region - work.pixels) * probe.network.rate.both,
             )
@@ -148,28 +148,32 @@ def of_training_background(plan: Plan, settings: Settings, visits: Visits) -> li
             plan.training_background
         ]
         reason = (
-            f"{share}: colors would be fitted to one that stays"
+            f"{share}: colors would be fitted to a fixed background"
             if settings.training_background == "auto"
-            else "asked for"
+            else "requested"
         )
         cost = visits.content.always + visits.images.always
         if cost:
-            reason += f"; content features are computed with it, {cost:.2g} s in every iteration"
+            reason += f"; content features are recomputed with it, {cost:.2g} s per step"
         decisions.append(Decision("training_background", f"{color} each time", reason, error=_ANOTHER_LOSS))
     if plan.warm_start:
-        reason = "steps change slowly what all colors have in common"
+        reason = "steps change the overall color only slowly"
         if is_scan(plan.survey, weighted=plan.weighted):
-            reason = f"{share}: nothing beside the object tells how bright it should be"
+            reason = f"{share}: nothing around the object determines how bright it should be"
         by_luminance = settings.preserve_colors == "luminance"
-        begins = "luminance begins with the style's mean and spread" if by_luminance else "colors begin as the style's"
+        begins = (
+            "luminance starts with the style's mean and standard deviation"
+            if by_luminance
+            else "colors start with the style's distribution"
+        )
         if ends_with_transfer(settings, warm=True):
-            begins += f"; the same once more behind the last step, because {settings.style_loss} lets them go"
+            begins += f"; they are reset to it after the last step, because {settings.style_loss} lets them drift"
         decisions.append(
             Decision(
                 "start",
                 begins,
-                reason if settings.warm_start is None else "asked for",
-                error="it is another start than the paper's",
+                reason if settings.warm_start is None else "requested",
+                error="differs from the paper's start",
             )
         )
     return decisions
@@ -182,8 +186,8 @@ def of_colors(settings: Settings) -> list[Decision]:
     return [
         Decision(
             "colors",
-            "luminance alone is compared and optimized: each Gaussian keeps its chroma",
-            "asked for",
+            "only luminance is compared and optimized; each Gaussian keeps its chroma",
+            "requested",
             error=_ANOTHER_LOSS,
         )
     ]
@@ -192,25 +196,29 @@ def of_colors(settings: Settings) -> list[Decision]:
 def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -> list[Decision]:
     """Return the lines about layers, content, partition and forward passes. `activations` is their budget in bytes."""
     layers = f"{probe.network.deepest}, the deepest one used"
-    decisions = [Decision("network layers", f"none behind {layers}", "the loss reads no deeper one")]
+    decisions = [Decision("network layers", f"up to {layers}", "the loss reads no deeper layer")]
     if settings.style_loss != "sos":
         decisions.append(_of_style_loss(probe, settings, work))
     if not settings.content_weight:
-        decisions.append(Decision("content", "no content features are computed or kept", "its weight is 0"))
-    gigabytes = f"{activations / 1e9:.1f} GB for activations"
+        decisions.append(Decision("content", "no content features are computed or cached", "its weight is 0"))
+    gigabytes = f"the {activations / 1e9:.1f} GB for activations"
     if work.tiles <= 1:
-        decisions.append(Decision("partition", "none: a view goes through the network whole", f"it fits {gigabytes}"))
+        decisions.append(
+            Decision("partition", "none: the network takes each view as a whole", f"it fits in {gigabytes}")
+        )
     else:
-        decisions.append(Decision("partition", f"up to {work.tiles} tiles a view", f"more would not fit {gigabytes}"))
+        decisions.append(
+            Decision("partition", f"up to {work.tiles} tiles per view", f"larger tiles would not fit in {gigabytes}")
+        )
     if work.again:
-        reason = f"activations of {1 - work.again / work.pixels:.0%} of the pixels fit {gigabytes}"
+        reason = f"activations of {1 - work.again / work.pixels:.0%} of the pixels fit in {gigabytes}"
         decisions.append(Decision("second forward", f"for {work.again / work.pixels:.0%} of the pixels", reason))
     else:
         decisions.append(
             Decision(
                 "second forward",
-                "none: activations are kept between statistics and gradient",
-                f"they fit {gigabytes}",
+                "none: activations are cached between statistics and gradient",
+                f"they fit in {gigabytes}",
                 seconds=work.pixels * probe.network.rate.forward,
             )
         )
@@ -220,21 +228,23 @@ def of_network(probe: Probe, settings: Settings, work: Work, activations: int) -
 def _of_style_loss(probe: Probe, settings: Settings, work: Work) -> Decision:
     """Return the line about a style loss that matches features."""
     weight, network = NEAREST_WEIGHTS[settings.style_loss], probe.network
-    what = "takes the place of the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
+    what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
     return Decision(
         "style loss",
-        f"the distance of relu3 features to the nearest of at most {MOST_VECTORS:,} of the style's {what}, with "
-        f"weight {weight:.3g}; the search takes {work.pairs * network.rate.search:.2g} s a view",
-        f"{settings.style_loss} was asked for",
-        error="it is another loss than the paper's",
+        f"the distance of relu3 features to the nearest of at most {MOST_VECTORS:,} style features {what}, with "
+        f"weight {weight:.3g}; the search takes {work.pairs * network.rate.search:.2g} s per view",
+        f"{settings.style_loss} was requested",
+        error=_ANOTHER_LOSS,
     )
 
 
 def of_styles(style: StyleMixture, settings: Settings) -> list[Decision]:
     """Return the line about the mixture of several style images."""
-    reason = f"{len(style.pictures)} pictures were given"
+    reason = f"{len(style.pictures)} images were given"
     if not has_statistics(settings.style_loss):
-        reason += "; features are matched with those of all of them, whose weights count where there are too many"
+        reason += (
+            "; features are matched with those of all images, whose weights matter only if there are too many features"
+        )
     return [Decision("styles", f"a mixture: {style.text}", reason, error=_ANOTHER_LOSS)]
 
 
@@ -252,21 +262,21 @@ def of_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[
     for place, region in enumerate(asked.every):
         own, now = asked.members(place), resolved.members(place)
         count, share = int(now.sum()), float(weights[now].sum() / weights.sum())
-        reason = region.select or "no selection names them"
+        reason = region.select or "not in any other region"
         taken = region.selected - int(own.sum())
         if taken > 0:
-            reason += f"; {taken:,} more belong to a region that was given later, too, which has them"
+            reason += f"; {taken:,} more are also in a later region, which takes precedence"
         what = f"{count:,} of {len(weights):,} Gaussians, {share:.1%} of what the views show,"
         if place and not bool(own.any()):
-            done = f"warning: left out, because it has no Gaussians{' of its own' if taken > 0 else ''}"
+            done = f"warning: ignored, because it has no Gaussians{' of its own' if taken > 0 else ''}"
         elif region.freeze:
-            done = f"{int(own.sum()):,} Gaussians stay as they are"
+            done = f"{int(own.sum()):,} Gaussians stay unchanged"
         elif place and place not in resolved.active:
-            done = f"warning: left out, because no view sees its {int(own.sum()):,} Gaussians: they are of the rest"
+            done = f"warning: ignored, because no view sees its {int(own.sum()):,} Gaussians; they count as rest"
         elif place not in resolved.active:
             continue  # the rest is empty
         else:
-            done = f"{what} take {region.style.text if region.style else 'the style'}"
+            done = f"{what} use {region.style.text if region.style else 'the style'}"
             done += f", with weight {region.weight:g}" if region.weight != 1 else ""
         found.append(Decision(f"region {region.name}", done, reason, error=_ANOTHER_LOSS))
     if not resolved.mapped:
@@ -277,9 +287,9 @@ def of_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[
         -(-len(resolved.active) // MAPS_OF_A_RENDER) + 1,
     )
     several = "1 region" if len(resolved.active) == 1 else f"{len(resolved.active)} regions"
-    how = f"statistics of {several} are weighted by their share of each pixel's blend weights"
+    how = f"statistics of {several} are weighted by each region's fraction of a pixel's blend weights"
     how += f"; {renders} renders at a view's first visit, {total / 1e6:.1f} MB for all views"
-    return [*found, Decision("regions", how, "one style must not leak into another's region", error=_ANOTHER_LOSS)]
+    return [*found, Decision("regions", how, "otherwise styles would leak into other regions", error=_ANOTHER_LOSS)]
 
 
 def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
@@ -289,21 +299,21 @@ def of_rasterizer(probe: Probe, plan: Plan) -> list[Decision]:
     names = {"cuda": "gsplat", "triton": "Triton"}
     how = f"{names[plan.uncached]} on the GPU" if plan.uncached in names else "on the CPU"
     if plan.rasterizer == "cached":
-        how += ", with kept blend weights"
+        how += ", with cached blend weights"
     failed = [f"{names[name]} cannot be used: {problem}" for name, problem in probe.machine.problems.items()]
     if plan.uncached in names:
         failed.append(f"{names[plan.uncached]} works here")
-    return [Decision("rasterizer", how, "; ".join(failed) or "asked for")]
+    return [Decision("rasterizer", how, "; ".join(failed) or "requested")]
 
 
 def of_search(plan: Plan, passes: int) -> list[Decision]:
     """Return the line about cuDNN's algorithms on a GPU. `passes` is the number of passes per image size."""
     if plan.device != "cuda":
         return []
-    reason = f"pictures of one size go through the network about {passes:,} times"
+    reason = f"the network evaluates images of one size about {passes:,} times"
     if plan.search:
-        return [Decision("convolutions", "cuDNN tries its algorithms", reason, error="runs may round differently")]
-    return [Decision("convolutions", "cuDNN's algorithms are not tried first", reason)]
+        return [Decision("convolutions", "cuDNN benchmarks its algorithms", reason, error="runs may round differently")]
+    return [Decision("convolutions", "cuDNN does not benchmark its algorithms", reason)]
 
 
 def ranks_of_a_view(probe: Probe, settings: Settings) -> int:
@@ -315,32 +325,32 @@ def of_launches(probe: Probe, plan: Plan, settings: Settings, visits: int) -> li
     """Return the line about kernel launches on a GPU. `visits` is the number of visits of views that share a graph."""
     if plan.device != "cuda":
         return []
-    launches, come = probe.launches, f"views of one size come about {visits:,} times"
+    launches, come = probe.launches, f"views of one size are visited about {visits:,} times"
     if plan.graphs:
         assert launches is not None
         reason = f"{_against_graphs(launches)}; {come}"
-        return [Decision("launches", "a view's loss is captured, and launched as one", reason, seconds=launches.saved)]
+        return [Decision("launches", "the loss of a view is captured as a CUDA graph", reason, seconds=launches.saved)]
     if "launches" in settings.keep:
-        reason = "asked for"
+        reason = "requested"
     elif ranks_of_a_view(probe, settings) > 1:
-        reason = "a graph cannot hold what workers tell each other"
+        reason = "a graph cannot contain communication between workers"
     elif launches is None:
         reason = come
     elif launches.problem is not None:
-        reason = f"there are no graphs: {launches.problem}"
+        reason = f"CUDA graphs are unavailable: {launches.problem}"
     elif launches.least_visits is None:
-        reason = f"a graph saves hardly anything: {_against_graphs(launches)}"
+        reason = f"a graph saves hardly any time: {_against_graphs(launches)}"
     else:
-        pays = f"a graph of each phase pays from {launches.least_visits:.1f} visits on"
-        reason = f"{come}, and {pays}: {_against_graphs(launches)}"
+        pays = f"one graph per phase pays off from {launches.least_visits:.1f} visits"
+        reason = f"{come}, but {pays}; {_against_graphs(launches)}"
     return [Decision("launches", "kernel by kernel", reason)]
 
 
 def _against_graphs(launches: LaunchCost) -> str:
     """Return the measured times of graphs and of single launches as text."""
     return (
-        f"{1e3 * launches.replayed:.3g} ms a view were measured as a graph, {1e3 * launches.seconds:.3g} ms kernel by "
-        f"kernel, {1e3 * launches.capture:.3g} ms to capture it"
+        f"measured per view: {1e3 * launches.replayed:.3g} ms as a graph, {1e3 * launches.seconds:.3g} ms kernel by "
+        f"kernel, {1e3 * launches.capture:.3g} ms to capture"
     )
 
 
@@ -349,26 +359,26 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
     raster = probe.raster
     if plan.cached_weights == "none":
         visits = (plan.steps_coarse + settings.steps_sos) * settings.views_per_step / len(plan.covered)
-        reason = f"a view comes {visits:.1f} times"
+        reason = f"a view is visited {visits:.1f} times"
         if settings.cached_weights == "none" or "blend-weights" in settings.keep:
-            reason = "asked for"
+            reason = "requested"
         elif raster.bytes is None:
-            reason = "gsplat keeps none"
+            reason = "gsplat cannot cache them"
         elif plan.uncached in GPU_RASTERIZERS:
             reason = _why_not_on_a_gpu(raster, reason)
-        return Decision("blend weights", "computed anew in every iteration", reason, bytes=raster.bytes)
-    room = f"{budget / 1e9:.1f} GB are there for blend weights"
+        return Decision("blend weights", "recomputed in every step", reason, bytes=raster.bytes)
+    room = f"{budget / 1e9:.1f} GB are available for blend weights"
     saved = raster.seconds - raster.kept_seconds if raster.kept_seconds else None
     size, error = raster.bytes or 0, "none"
     if plan.cached_weights == "half":
         size = raster.half_bytes or 0
-        error = "each weight is off by at most 1/2048 of itself: 0.12 of 255 levels in a pixel"
+        error = "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
     share = Made(0.0, size, budget, len(plan.covered)).kept
     part = "all" if share == 1 else f"{share:.0%} of the views'"
-    decision = f"{part} kept in {'half precision' if plan.cached_weights == 'half' else 'float32'}"
+    decision = f"{part} cached in {'half precision' if plan.cached_weights == 'half' else 'float32'}"
     if plan.coarse_weights:
         decision += "; in phase 1 only those of the coarsest scale"
-    reason = f"they take {size / 1e9:.2f} GB of all views; {room}"
+    reason = f"they take {size / 1e9:.2f} GB for all views; {room}"
     if plan.uncached in GPU_RASTERIZERS and raster.kept_seconds is not None:
         reason += f"; {_against(raster)}"
     return Decision(
@@ -379,16 +389,16 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
 def _why_not_on_a_gpu(raster: RasterCost, visits: str) -> str:
     """Return the reason, from measurements, why no weights are cached on a GPU."""
     if raster.kept_seconds is None:
-        return "those of one view do not fit"
+        return "the weights of one view do not fit"
     if raster.least_visits is None:
-        return f"kept ones are not faster here: {_against(raster)}"
-    return f"{visits}, and keeping pays from {raster.least_visits:.1f} on: {_against(raster)}"
+        return f"cached weights are not faster here: {_against(raster)}"
+    return f"{visits}, but caching pays off from {raster.least_visits:.1f} visits; {_against(raster)}"
 
 
 def _against(raster: RasterCost) -> str:
     """Return the measured times of cached and of recomputed weights as text."""
     return (
-        f"{1e3 * (raster.kept_seconds or 0):.3g} ms a view were measured, {1e3 * raster.seconds:.3g} ms computed anew"
+        f"measured per view: {1e3 * (raster.kept_seconds or 0):.3g} ms cached, {1e3 * raster.seconds:.3g} ms recomputed"
     )
 
 
@@ -404,24 +414,24 @@ def of_schedule(plan: Plan, settings: Settings, counts: Sequence[int]) -> list[D
         decisions.append(
             Decision(
                 "phase 1",
-                f"its {settings.steps_coarse} steps are left out",
-                "one scale is the only one that counts, so that it would be the same as phase 2"
+                f"its {settings.steps_coarse} steps are skipped",
+                "only one scale has a weight, so it would be the same as phase 2"
                 if settings.scales
-                else "the coarsest scale is the only one, so that it would be the same as phase 2",
-                error="the steps, which work on the same loss",
+                else "there is only one scale, so it would be the same as phase 2",
+                error="these steps, which would reduce the same loss",
             )
         )
     if settings.early_stop and plan.training_background != "background":
-        reason = "losses with different colors behind the Gaussians do not tell whether they still fall"
-        decisions.append(Decision("early stop", "none: every step is made", reason))
+        reason = "losses on different backgrounds cannot be compared"
+        decisions.append(Decision("early stop", "none: all steps are run", reason))
     elif settings.early_stop:
         decisions.append(
             Decision(
                 "early stop",
                 f"when the mean loss of {window_length(len(plan.covered))} steps is less than {LEAST_FALL:.1%} below "
-                "that of as many steps before",
-                "later steps would buy little",
-                error="what the loss would still have fallen",
+                "that of the same number of steps before",
+                "later steps would gain little",
+                error="the remaining decrease of the loss",
             )
         )
     return decisions
@@ -433,7 +443,7 @@ def _of_scale_weights(settings: Settings, most: int) -> Decision:
     told = ", ".join(f"scale {scale} {weights.of(scale):g}" for scale in chosen)
     left = most - len(chosen)
     nothing = f"; {left} of {most} scales are not computed" if left else ""
-    return Decision("weights of scales", f"{told}{nothing}", "asked for", error=_ANOTHER_LOSS)
+    return Decision("weights of scales", f"{told}{nothing}", "requested", error=_ANOTHER_LOSS)
 
 
 def of_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
@@ -443,7 +453,9 @@ def of_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
     if choice.ranks == available:
         return Decision("ranks", f"all {available} take part, {speed}", measured)
     other = choice.seconds[1] / choice.seconds[available]
-    reason = f"all of them would be {other:.2f} times as fast: the rest would only add communication; {measured}"
+    reason = (
+        f"all of them would be {other:.2f} times as fast, because the others would only add communication; {measured}"
+    )
     return Decision("ranks", f"{choice.ranks} of {available} take part, {speed}", reason)
 
 
@@ -453,16 +465,16 @@ def of_precision(probe: Probe, settings: Settings) -> list[Decision]:
     if asked == "float32":
         return []
     if ratio is None:
-        reason = f"{asked} was asked for, which NVIDIA GPUs of compute capability 8.0 and above have: as float32 here"
+        reason = f"{asked} was requested, but needs an NVIDIA GPU of compute capability 8.0 or higher"
         return [Decision("precision", "features in float32", reason)]
     if precision_of(asked, ratio) == "float32":
-        reason = f"{asked} was asked for, but takes {1 / ratio:.1f} times as long as float32 on this processor"
+        reason = f"{asked} was requested, but takes {1 / ratio:.1f} times as long as float32 on this processor"
         return [Decision("precision", "features in float32", reason)]
-    known = "that of the colors is measured during the run"
+    known = "the error of the colors is measured during the run"
     if error is not None:
         known = (
-            f"the first view's pixel gradient is off by {error.relative_error:.2g} of its norm (cosine "
+            f"the first view's pixel gradient has a relative error of {error.relative_error:.2g} (cosine "
             f"{error.cosine:.5f}); {known}"
         )
     what = {"bfloat16": "features in bfloat16", "tf32": "convolutions in TF32"}[asked]
-    return [Decision("precision", what, f"asked for, {ratio:.1f} times faster here", error=known)]
+    return [Decision("precision", what, f"requested, {ratio:.1f} times faster here", error=known)]

@@ -109,20 +109,19 @@ def _prices(expected: Prediction, plan: Plan, probe: Probe, settings: Settings, 
 def of_measuring(plan: Plan, expected: Prediction, settings: Settings) -> Decision:
     """Return the plan's line about measurements outside the steps and their cost."""
     steps = expected.job - expected.measuring
-    cost = f"about {expected.measuring:.2g} s beside {steps:.3g} s of steps"
+    cost = f"about {expected.measuring:.2g} s in addition to {steps:.3g} s of steps"
     losses = f"the loss before and after on {_count(plan.loss_views, 'view')}"
     if not settings.measure:
-        return Decision("measuring", f"{losses} alone", f"asked for; {cost}")
+        return Decision("measuring", f"{losses} only", f"requested; {cost}")
     level = LEVELS[plan.measuring]
     moments = level.moments(plan.steps_coarse + settings.steps_sos)
     when = f"at {len(moments)} moments" if len(moments) > 1 else "at the end"
-    found = f", and {when} up to {_count(level.views, 'view')} between the cameras" if moments else " alone"
+    found = f", and {when} up to {_count(level.views, 'novel view')}" if moments else " only"
     allowed = f"{allowed_seconds(settings.measure, steps):.3g} s are allowed, {settings.measure:.0%} of the steps' time"
     return Decision(
         "measuring",
         f"{losses}{found}",
-        f"{cost}; {allowed} or {LEAST_ALLOWED:.0f} s, and less is measured where the first view between the cameras "
-        "takes longer",
+        f"{cost}; {allowed} or {LEAST_ALLOWED:.0f} s, and less is measured if the first novel view takes longer",
     )
 
 

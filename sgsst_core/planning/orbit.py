@@ -137,44 +137,44 @@ def orbit_decisions(made: Orbit, cameras: Sequence[Camera], looked: Survey) -> l
     decisions = [Decision("up", made.up.name, made.up.reason)]
     angles = _listed([f"{angle:g}" for angle in made.elevations])
     rings = f"{len(made.elevations)} rings" if len(made.elevations) > 1 else "a ring"
-    reason = "as asked for"
+    reason = "requested"
     if len(made.tried) > 1:
         others = f"rings at {min(made.tried):g} to {max(made.tried):g} degrees"
         reason = f"they show {made.shown:.0%} of the surface that {others} show"
-        reason += f"; another one would add {made.next:.1%}" if made.next is not None else ""
+        reason += f"; another ring would add {made.next:.1%}" if made.next is not None else ""
     views = f"{len(cameras)} view{'s' if len(cameras) > 1 else ''}"
     decisions.append(
-        Decision("cameras", f"{views} in {rings} at {angles} degrees, {made.radius:.3g} from the middle", reason)
+        Decision("cameras", f"{views} in {rings} at {angles} degrees, {made.radius:.3g} from the center", reason)
     )
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     shapes = f"{sizes[0][0]}x{sizes[0][1]}"
     shapes += f" to {sizes[-1][0]}x{sizes[-1][1]}, {len(sizes)} shapes" if len(sizes) > 1 else ""
     if looked.uncovered is not None:
         covered = [1 - share for share in looked.uncovered]
-        shown = f"the scene covers {sum(covered) / len(covered):.0%} of their pixels ({min(covered):.0%} at least)"
-        decisions.append(Decision("frames", shapes, f"they follow the subject's shape; {shown}"))
+        shown = f"the scene covers {sum(covered) / len(covered):.0%} of their pixels (at least {min(covered):.0%})"
+        decisions.append(Decision("frames", shapes, f"fitted to the subject's shape; {shown}"))
     return decisions + _doubts(made)
 
 
 def _doubts(made: Orbit) -> list[Decision]:
     """Return warnings about reasons against an orbit around this scene."""
     found = []
-    better = "cameras of its capture (--cameras) would show it better"
+    better = "the cameras of its capture (--cameras) would show it better"
     if made.outside > _OUTSIDE:
-        decision = f"warning: {made.outside:.0%} of the scene lies around what is framed"
-        found.append(Decision("subject", decision, f"it is no single object; {better}"))
+        decision = f"warning: {made.outside:.0%} of the scene lies outside the frames"
+        found.append(Decision("subject", decision, f"it is not a single object; {better}"))
     if made.hidden:
-        decision = f"warning: in {made.hidden:.0%} of the views, other things hide the subject"
-        found.append(Decision("subject", decision, f"the cameras stand beyond what is around it; {better}"))
+        decision = f"warning: in {made.hidden:.0%} of the views, other objects hide the subject"
+        found.append(Decision("subject", decision, f"the cameras stand outside of its surroundings; {better}"))
     if made.inside > _INSIDE:
-        decision = f"warning: {made.inside:.0%} of the scene lies inside, where no view from around it looks"
+        decision = f"warning: {made.inside:.0%} of the scene lies inside, hidden from all views around it"
         found.append(Decision("subject", decision, f"it may be a room; {better}"))
     return found
 
 
 def _asked_up(direction: tuple[float, float, float]) -> Up:
     axis = torch.tensor(direction, dtype=torch.float64)
-    return Up(axis / axis.norm().clamp_min(1e-300), "as asked for")
+    return Up(axis / axis.norm().clamp_min(1e-300), "requested")
 
 
 def _listed(words: Sequence[str]) -> str:

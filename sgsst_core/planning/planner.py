@@ -73,7 +73,7 @@ def make_plan(
         WeightsError: If there are no weights.
     """
     if not cameras:
-        raise CameraError("There are no cameras. Give a camera file, or let --orbit make some.")
+        raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
     timer = timer or Timer()
     with timer("planning"):
         fitted = fit_cameras(cameras, settings)

@@ -172,15 +172,15 @@ def choose_pieces(
 def refine_decision(refinement: Refinement, settings: Settings) -> Decision:
     """Return the plan's line about split Gaussians."""
     before, item = len(refinement.pieces), "refined Gaussians"
-    back = f"; {refinement.taken_back:,} stay whole, whose parts would change the picture"
+    back = f"; {refinement.taken_back:,} are not split, because their parts would change the image"
     back = back if refinement.taken_back else ""
     if not refinement.split or refinement.psnr is None:
-        return Decision(item, "none is cut", f"none is large where the gradient asks for several colors{back}")
+        return Decision(item, "none is split", f"none is large where the gradient calls for several colors{back}")
     return Decision(
         item,
-        f"{refinement.split:,} are cut, which makes {refinement.gaussians:,} of {before:,}",
-        f"they are larger than {refinement.size:.2g} pixels in the views, and the gradient asks for several colors "
-        f"in them; at most {settings.refine:g} times as many were asked for{back}",
-        error=f"the unstylized picture has {refinement.psnr:.1f} dB against that of before, no measured view less than "
-        f"{refinement.lowest_psnr:.1f} dB",
+        f"{refinement.split:,} are split, which turns {before:,} Gaussians into {refinement.gaussians:,}",
+        f"they are larger than {refinement.size:.2g} pixels in the views, and the gradient calls for several colors "
+        f"in them; at most {settings.refine:g} times as many were requested{back}",
+        error=f"unstylized renders have {refinement.psnr:.1f} dB PSNR against those of the original scene, each "
+        f"measured view at least {refinement.lowest_psnr:.1f} dB",
     )

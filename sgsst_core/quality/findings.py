@@ -164,7 +164,7 @@ class _Scene:
         if kept is None:
             return []
         first = int(np.flatnonzero(~kept)[0])
-        done = "stylize refuses the scene; with --drop-invalid they are left out, of the stylized scene too"
+        done = "stylize rejects the scene; --drop-invalid drops these Gaussians, from the result too"
         return [
             Finding(
                 "scene",
@@ -183,7 +183,7 @@ class _Scene:
             length = self.scene.quats[part].double().norm(dim=1)
             return [(length < low, length), (length > high, length)]
 
-        normalized = "normalized in float64, as all are"
+        normalized = "normalized in float64, like all quaternions"
         return self.ask(
             look,
             _Question(f"quaternion shorter than {low:g}", normalized, largest=False),
@@ -206,19 +206,19 @@ class _Scene:
 
         return self.ask(
             look,
-            _Question("size that overflows", "never drawn (value: the logarithm)"),
+            _Question("size that overflows (value: its logarithm)", "never drawn"),
             _Question(
-                "longer than the scene's extent (value: how many times)",
-                "drawn; each touches every raster tile of every view, which costs time and memory",
+                "longer than the scene's extent (value: ratio)",
+                "drawn; each may cover all raster tiles of all views, which costs time and memory",
             ),
             _Question(
-                f"smaller than {SMALL_SCALE:g} of the scene's extent (value: share)",
-                "drawn as a point of one pixel's blur",
+                f"smaller than {SMALL_SCALE:g} of the scene's extent (value: fraction)",
+                "drawn as a point, blurred over one pixel",
                 largest=False,
             ),
             _Question(
-                f"needles more than {NEEDLE:g} times longer than thick (value: ratio)",
-                "drawn exactly: the determinant is a sum of positive terms and cannot cancel",
+                f"needles more than {NEEDLE:g} times as long as thick (value: ratio)",
+                "drawn exactly: the determinant is a sum of positive terms, so nothing cancels",
             ),
         )
 
@@ -229,15 +229,15 @@ class _Scene:
 
         return self.ask(
             look,
-            _Question("opacity below 1/255", "never drawn, not optimized", largest=False),
-            _Question(f"opacity above {ALPHA_MAX:g}", f"drawn with {ALPHA_MAX:g}, as in training"),
+            _Question("opacity below 1/255", "neither drawn nor optimized", largest=False),
+            _Question(f"opacity above {ALPHA_MAX:g}", f"drawn with opacity {ALPHA_MAX:g}, as in training"),
         )
 
     def harmonics(self) -> list[Finding]:
         found = []
         for name, values in (("DC", self.scene.sh_dc), ("higher", self.scene.sh_rest)):
             if values.shape[1]:
-                done = "kept; gradients grow with their third power, and a job whose gradient exceeds 1e19 stops"
+                done = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
                 question = _Question(f"{name} SH coefficients above {LARGE_COEFFICIENT:g}", done)
                 found += self.ask(_large_coefficients(values), question)
         return found
@@ -248,11 +248,11 @@ class _Scene:
             return []
         step = float(np.spacing(np.float32(self.center.abs().max())))
         done = (
-            "differences are taken in float64 on the CPU, but what lies between the file's float32 positions is lost: "
-            "move the scene to the origin before training. gsplat on a GPU loses more"
+            "the file's float32 positions are too coarse here; move the scene to the origin before training. The CPU "
+            "subtracts positions in float64, gsplat on a GPU loses more precision"
         )
-        worst = f"center {far:.3g} extents away; positions step by {step:.3g}, {step / self.extent:.1e} of the extent"
-        return [Finding("scene", "world far from its origin", len(self.scene), len(self.scene), worst, done)]
+        worst = f"center {far:.3g} extents away; positions are {step:.3g} apart, {step / self.extent:.1e} of the extent"
+        return [Finding("scene", "scene far from its origin", len(self.scene), len(self.scene), worst, done)]
 
 
 def scene_extent(scene: Scene) -> tuple[Tensor, float]:
@@ -310,29 +310,29 @@ def _lenses(cameras: Sequence[Camera]) -> list[Finding]:
             angles,
             [angle > WIDE for angle in angles],
             cameras,
-            "drawn; a Gaussian's perspective is linearized at its center, but no farther outside the view than "
-            f"{FRUSTUM_MARGIN:.0%} of half its width",
+            f"drawn; the perspective is linearized at each Gaussian's center, or at most {FRUSTUM_MARGIN:.0%} of "
+            "half the view's width outside the view",
         ),
         *_of_views(
             f"field of view below {NARROW:g} degree",
             angles,
             [angle < NARROW for angle in angles],
             cameras,
-            "drawn as any other",
+            "drawn like any other view",
         ),
         *_of_views(
-            "principal point outside the picture (value: widths from its middle)",
+            "principal point outside the image (value: widths from its center)",
             off,
             [value > 0.5 for value in off],
             cameras,
-            "drawn as any other; check that it is meant",
+            "drawn like any other view; check that this is intended",
         ),
         *_of_views(
-            f"fewer than {ALIGNMENT} pixels to a side",
+            f"fewer than {ALIGNMENT} pixels on a side",
             small,
             [value < ALIGNMENT for value in small],
             cameras,
-            "feature layers without a cell are left out of their loss",
+            "feature layers without a cell are skipped in its loss",
         ),
     ]
 
@@ -342,11 +342,11 @@ def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]
     centers = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(camera.center[None].double() for camera in cameras)])
     close = [float(count) for count in closer(scene.means, centers, near)]
     return _of_views(
-        f"camera inside the scene: Gaussians within {near:g} of it (value: how many)",
+        f"camera inside the scene: Gaussians within {near:g} of it (value: count)",
         close,
         [count > 0 for count in close],
         cameras,
-        "nearer than the near plane they are not drawn; --near moves it",
+        "not drawn if they are in front of the near plane; use --near to move it",
     )
 
 
@@ -383,7 +383,7 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
         uncovered.append(float((1 - coverage).mean(dtype=torch.float64)) if seen else 1.0)
         blend_weights += weights.cpu()
     found = (
-        [Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops a job")]
+        [Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops the job")]
         if refused
         else []
     )
@@ -399,14 +399,14 @@ def _uncovered(shares: list[float], cameras: Sequence[Camera]) -> list[Finding]:
             shares,
             [share == 1 for share in shares],
             cameras,
-            "left out; a job needs one that does",
+            "skipped; a job needs at least one view that sees a Gaussian",
         ),
         *_of_views(
-            f"more than {UNCOVERED:.0%} uncovered (value: share)",
+            f"more than {UNCOVERED:.0%} uncovered (value: fraction)",
             shares,
             [UNCOVERED < share < 1 for share in shares],
             cameras,
-            "statistics are weighted by coverage where the views' mean is above 1 % (--position-weights auto)",
+            "statistics are weighted by coverage if the mean over all views exceeds 1 % (--position-weights auto)",
         ),
     ]
 
@@ -422,11 +422,11 @@ def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
         look,
         _Question(
             "in no view",
-            "neither drawn nor optimized; at the end they take their neighbors' color change (`paper`: none)",
+            "neither drawn nor optimized; their colors follow their neighbors' at the end (preset paper: unchanged)",
         ),
         _Question(
             "hardly seen: blend weights of all pixels sum to less than 1/255 (value: sum)",
-            "optimized as all others, and as fast: from other viewpoints their colors may be extreme",
+            "optimized at the same rate as all others; their colors may be extreme from other viewpoints",
             largest=False,
         ),
         subject="views",
@@ -439,19 +439,19 @@ def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
     found = []
     spread = float(style.double().std(dim=(0, 1), correction=0).max())
     if spread < FLAT_STYLE:
-        done = "its features hardly vary: the scene is drawn to one flat color"
+        done = "its features hardly vary, so the scene is pulled toward one flat color"
         found.append(Finding("style", "one color throughout", 1, 1, f"standard deviation {spread:.2g}", done))
     aspect = max(height, width) / min(height, width)
     if aspect > LONG_STYLE:
-        done = "used whole; its shorter side decides to what size it is brought down"
-        found.append(Finding("style", "extreme aspect", 1, 1, f"{width} x {height}", done))
+        done = "used as a whole; its shorter side determines its size in the loss"
+        found.append(Finding("style", "extreme aspect ratio", 1, 1, f"{width} x {height}", done))
     used = [style_size((height, width), (camera.height, camera.width)) for camera in cameras]
     tiny = [size for size in used if min(size) < ALIGNMENT]
     if tiny:
-        done = f"feature layers without a cell in it are left out of the loss; give one of at least {ALIGNMENT} pixels"
+        done = f"feature layers without a cell are skipped in the loss; use an image of at least {ALIGNMENT} pixels"
         smallest = min(tiny, key=min)
         found.append(
-            Finding("style", "too small for the deep layers", 1, 1, f"used at {smallest[1]} x {smallest[0]}", done)
+            Finding("style", "too small for deep layers", 1, 1, f"used at {smallest[1]} x {smallest[0]}", done)
         )
     return found
 

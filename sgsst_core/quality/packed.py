@@ -44,7 +44,7 @@ class PackedLoss:
     @property
     def text(self) -> str:
         """One-line description of the result."""
-        psnr = "the same pictures as" if self.psnr is None else f"{self.psnr:.1f} dB PSNR against"
+        psnr = "renders identical to" if self.psnr is None else f"{self.psnr:.1f} dB PSNR against"
         return f"{self.form}, {self.size / 1e6:.1f} MB, {psnr} the PLY"
 
 

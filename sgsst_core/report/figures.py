@@ -73,33 +73,33 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
         _figure(
             "loss",
             "Loss, relative to the start",
-            "Loss over that of the unstylized scene." + _undrawn(report),
+            "Loss, divided by that of the unstylized scene." + _undrawn(report),
             partial(draw_loss, history=history, moments=moments),
         ),
         _figure(
             "split",
-            "What the loss is made of",
-            "The terms that the loss of a scale is the sum of.",
+            "Terms of the loss",
+            "The loss of a scale is the sum of these terms.",
             partial(_draw_split, history=history),
             rows=math.ceil(len(history.terms) / 2),
         ),
     ]
     if any(_known(_consistency(moments, reach, metric)[1:]) for reach in _REACHES for metric in _METRICS):
         caption = (
-            "What a view and another one, warped into it, differ by. Dashed: the unstylized scene, "
-            "whose views differ by highlights, too."
+            "Difference between a view and another one that is warped into it. Dashed: the unstylized scene, "
+            "whose views also differ, by highlights."
         )
         draw = partial(_draw_consistency, history=history, moments=moments)
         figures.append(_figure("consistency", "Consistency of novel views", caption, draw))
     if drawable(column([probe.get("relative_error") for probe in probes])).any():
-        caption = "Norm of the difference of the gradients over that of the exact one, on a sampled view."
+        caption = "Norm of the error, relative to the norm of the exact gradient, on a sampled view."
         draw = partial(_draw_approximations, history=history, probes=probes)
         figures.append(_figure("approximations", "Error of the approximated gradient", caption, draw))
     if np.isfinite(history.memory).any():
         predicted = (report.get("plan") or {}).get("prediction") or {}
         draw = partial(_draw_memory, history=history, predicted=predicted)
-        caption = "Held by the process"
-        caption += "; of the GPU's, the most so far." if np.isfinite(history.device_memory).any() else "."
+        caption = "Memory of the process"
+        caption += "; on the GPU, the peak so far." if np.isfinite(history.device_memory).any() else "."
         figures.append(_figure("memory", "Memory", caption, draw))
     return figures
 
@@ -120,7 +120,7 @@ def _undrawn(report: dict[str, Any]) -> str:
     """Return a sentence about losses that a logarithmic axis cannot show; empty if there are none."""
     losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
     count = int((~drawable(losses)).sum())
-    return f" Not drawn: {count:,} of {len(losses):,} values, which are zero or not finite." if count else ""
+    return f" Not shown: {count:,} of {len(losses):,} values, which are zero or not finite." if count else ""
 
 
 # --- drawing -------------------------------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ def _draw_memory(figure: Figure, against: Against, history: History, predicted: 
         marker = "o" if len(line.x) == 1 else None
         axes.plot(line.x, line.high, color=color, marker=marker, label=f"measured{where}")
         if peak is not None and math.isfinite(peak):
-            label = f"peak{where} that the plan predicted"
+            label = f"peak{where}, predicted by the plan"
             axes.axhline(peak / 1e9, color=dashed, linestyle="--", linewidth=1, label=label)
     axes.set_ylim(bottom=0)
     axes.set_ylabel("GB")

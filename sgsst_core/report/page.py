@@ -33,7 +33,7 @@ _LIST = 40
 #: Fields of a report that have a section of their own on the page.
 _PLACED = ("history", "novel_views", "approximations", "bought", "findings", "plan", "seconds_by_part")
 _STOPPED = {
-    "finished": "all planned steps were done",
+    "finished": "all planned steps are done",
     "max-seconds": "stopped at the time limit",
     "target-loss": "stopped when the target loss was reached",
     "converged": "stopped when the loss had converged",
@@ -51,9 +51,9 @@ _PARTS = {
     "prepare": "preparing views and style",
     "loss": "loss and pyramid",
     "checkpoint": "checkpoints",
-    "measuring": "measuring, beside the steps",
-    "reading": "reading, before the steps",
-    "refining": "cutting large Gaussians, before the steps",
+    "measuring": "measuring, besides the steps",
+    "reading": "reading the inputs, before the steps",
+    "refining": "splitting large Gaussians, before the steps",
     "survey": "survey of the views, before the steps",
     "planning": "planning, before the steps",
     "preparing": "preparing the job, before the steps",
@@ -141,7 +141,7 @@ def _sheet_bytes(path: Path | None) -> bytes | None:
         return path.read_bytes() if path else None
     except OSError as error:
         raise OutputError(
-            f"{path}: the contact sheet cannot be read: {error.strerror}. Write it before the page."
+            f"{path}: cannot read the contact sheet: {error.strerror}. Write it before the page."
         ) from error
 
 
@@ -253,5 +253,5 @@ def _text(name: str, value: Any) -> str:
         return number(value, 6)
     if isinstance(value, list):
         shown = ", ".join(_text(name, member) for member in value[:_LIST])
-        return shown if len(value) <= _LIST else f"{shown} … ({len(value):,} in all)"
+        return shown if len(value) <= _LIST else f"{shown} … ({len(value):,} in total)"
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

@@ -28,7 +28,7 @@ class Table:
 def loss_table(report: dict[str, Any]) -> Table:
     """Return the loss before and after, as mean over scales and for each scale."""
     loss = report["loss"]
-    rows = [["mean of the scales", loss["before"]["total"], loss["after"]["total"], loss["relative"]]]
+    rows = [["mean over scales", loss["before"]["total"], loss["after"]["total"], loss["relative"]]]
     for scale, before in loss["before"]["scales"].items():
         after = loss["after"]["scales"].get(scale, {})
         rows.append([f"scale {scale}", before["total"], after.get("total"), loss["relative_by_scale"].get(scale)])
@@ -63,11 +63,11 @@ def novel_views_table(report: dict[str, Any]) -> Table | None:
 #: Title and text format of each measure in the judgment of a result.
 _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "style": ("distance to the style", number),
-    "color_distance": ("distance to its colors, in levels of 8 bits", number),
-    "content": ("content lost (LPIPS)", number),
-    "features": ("features turned (1 - cosine)", number),
-    "background_sensitivity": ("style on black against white", number),
-    "saturated": ("colors that no screen shows", percent),
+    "color_distance": ("distance to its colors, in 8-bit levels", number),
+    "content": ("content loss (LPIPS)", number),
+    "features": ("feature distance (1 - cosine)", number),
+    "background_sensitivity": ("background sensitivity: style on black against white", number),
+    "saturated": ("colors outside the displayable range", percent),
 }
 
 
@@ -87,9 +87,9 @@ def decision_table(report: dict[str, Any]) -> Table:
         Column("item"),
         Column("decision"),
         Column("reason"),
-        Column("saves a step", True),
+        Column("saves per step", True),
         Column("saves memory", True),
-        Column("costs"),
+        Column("error"),
     ]
     return Table(
         columns,
@@ -108,14 +108,14 @@ def decision_table(report: dict[str, Any]) -> Table:
 
 
 #: Rows for first visits; the other rows are about views visited before.
-_VISITS = {"first_visit": "a view's first visit, beside it", "first_visit_coarse": "the same in phase 1"}
+_VISITS = {"first_visit": "first visit of a view, in addition", "first_visit_coarse": "the same in phase 1"}
 
 
 def prediction_table(report: dict[str, Any]) -> Table:
     """Return the plan's predictions beside the measured values."""
     predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
     rows = [
-        _beside("a step on all scales", predicted.get("seconds"), measured.get("seconds"), duration),
+        _beside("step on all scales", predicted.get("seconds"), measured.get("seconds"), duration),
         *(
             _beside(text, predicted.get(name), measured[name], duration)
             for name, text in _VISITS.items()
@@ -124,17 +124,24 @@ def prediction_table(report: dict[str, Any]) -> Table:
         _beside("peak memory", predicted.get("peak_bytes"), measured.get("peak_bytes"), byte_count),
     ]
     if predicted.get("measuring") and measured.get("measuring") is not None:
-        rows.append(_beside("measuring, in all", predicted["measuring"], measured["measuring"], duration))
+        rows.append(_beside("measuring, total", predicted["measuring"], measured["measuring"], duration))
         planned = _share(predicted["measuring"], predicted["job"] - predicted["measuring"])
-        rows.append(_beside("of the steps' time", planned, _share(measured["measuring"], report["seconds"]), percent))
+        rows.append(
+            _beside(
+                "measuring, relative to the steps' time",
+                planned,
+                _share(measured["measuring"], report["seconds"]),
+                percent,
+            )
+        )
     on_device = predicted.get("device_bytes"), measured.get("device_bytes")
     if any(value is not None for value in on_device):
         rows.append(_beside("peak memory of the GPU", *on_device, byte_count))
     one_rank, seconds = predicted.get("seconds_one_rank"), predicted.get("seconds")
     if one_rank and seconds:
         waiting = predicted["communication"], measured.get("communication")
-        rows.append(_beside("of it waiting for other ranks", *waiting, duration))
-        rows.append(_beside("speed-up over one rank", one_rank / seconds, measured.get("speed_up"), number))
+        rows.append(_beside("waiting for other ranks, per step", *waiting, duration))
+        rows.append(_beside("speedup over one rank", one_rank / seconds, measured.get("speed_up"), number))
     columns = [Column(""), Column("predicted", True), Column("measured", True), Column("measured / predicted", True)]
     return Table(columns, rows)
 
@@ -162,7 +169,7 @@ def finding_table(report: dict[str, Any]) -> Table | None:
         ]
         for entry in findings
     ]
-    columns = [Column("in"), Column("what"), Column("how many", True), Column("worst"), Column("what is done")]
+    columns = [Column("input"), Column("finding"), Column("count", True), Column("worst"), Column("consequence")]
     return Table(columns, rows) if rows else None
 
 
@@ -189,9 +196,9 @@ def approximation_table(report: dict[str, Any]) -> Table | None:
         Column("step", True),
         Column("view"),
         Column("relative error of the gradient", True),
-        Column("cosine to the exact one", True),
+        Column("cosine to the exact gradient", True),
         Column("time", True),
-        Column("time, exact", True),
-        Column("times faster", True),
+        Column("exact time", True),
+        Column("speedup", True),
     ]
     return Table(columns, rows) if rows else None

@@ -149,7 +149,7 @@ def look_at(
     forward = target.to(torch.float64) - position.to(torch.float64)
     right = torch.linalg.cross(forward, up)
     if not bool(right.norm() > 1e-9 * forward.norm() * up.norm()):
-        raise CameraError(f"Camera {name!r} looks along its own up direction {up.tolist()}. Give another one.")
+        raise CameraError(f"Camera {name!r} looks along its up direction {up.tolist()}. Give another up direction.")
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack([axis / axis.norm() for axis in (right, down, forward)])
     world_to_camera = torch.eye(4, dtype=torch.float64)

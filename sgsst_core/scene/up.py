@@ -66,23 +66,23 @@ def find_up(subject: Subject) -> Up:
     axes = _principal_axes(subject)
     ground = _ground(subject, [*axes.T, *torch.eye(3, dtype=torch.float64)])
     if ground is not None:
-        return Up(_snapped(ground), "a flat layer lies under all of it, and none above", ground=True)
+        return Up(_snapped(ground), "there is a flat layer below the whole subject, and none above", ground=True)
     usual = torch.tensor(USUAL_UP, dtype=torch.float64)
     spreads = ((subject.points - _mean(subject)) @ axes).square().mul(subject.weights[:, None]).sum(0).sqrt()
     longer = float(spreads[2] / spreads[1].clamp_min(1e-300)) if float(spreads[2]) > 0 else 1.0
     if longer < _STANDS or subject.left_out > _WHOLE:
-        return Up(usual, "nothing shows it, neither a ground nor a long axis, and most captures have it so", sure=False)
+        return Up(usual, "neither a ground nor a long axis was found, and most captures point this way", sure=False)
     long = axes[:, 2]
     ends = [_foot(subject, long), _foot(subject, -long)]
     lying = abs(float(long @ usual)) < 0.5 and _foot(subject, usual) >= max(_LIES, _WIDER * max(ends))
     if lying:
-        return Up(usual, f"it is {longer:.1f} times as long as wide, and rests along its length on a broad foot there")
-    stands = f"it stands {longer:.1f} times as tall as wide"
+        return Up(usual, f"the subject is {longer:.1f} times as long as wide, and rests lengthwise on a broad foot")
+    stands = f"the subject is {longer:.1f} times as tall as wide"
     if max(ends) > max(_LEAST_FOOT, _WIDER * min(ends)):
         up = long if ends[0] > ends[1] else -long
-        return Up(_snapped(up), f"{stands}, and its foot is {_times(max(ends), min(ends))} its other end")
+        return Up(_snapped(up), f"{stands}, and its foot is {_times(max(ends), min(ends))} the other end")
     up = long if _habit(long) > 0 else -long
-    return Up(_snapped(up), f"{stands}; both ends are alike, and most captures have it so", sure=False)
+    return Up(_snapped(up), f"{stands}; both ends are alike, and most captures point this way", sure=False)
 
 
 def _times(larger: float, smaller: float) -> str:

@@ -58,7 +58,7 @@ def check_style_size(style: Tensor | StyleMixture, cameras: Sequence[Camera], sc
         if max(height, width) > MAX_RESOLUTION:
             raise SettingsError(
                 f"--style-scale {scale:g} would make the style image {width:,} x {height:,} pixels for views of "
-                f"{size[1]} x {size[0]}; {MAX_RESOLUTION:,} may be the longer side. Give a smaller scale."
+                f"{size[1]} x {size[0]}. Its longer side must be at most {MAX_RESOLUTION:,}. Use a smaller scale."
             )
 
 

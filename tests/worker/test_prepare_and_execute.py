@@ -119,7 +119,7 @@ def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_pat
     assert refined["lowest_psnr"] >= 40
     if form != "ply":
         assert len(read_scene(resumed.out).scene) == refined["gaussians"]
-    assert "cutting large Gaussians" in resumed.out.with_name("s.report.html").read_text()
+    assert "splitting large Gaussians" in resumed.out.with_name("s.report.html").read_text()
 
 
 def test_planning_is_shown(request_: StylizeRequest) -> None:
@@ -198,7 +198,7 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
     warnings: list[str] = []
     assert go_on(prepare(request_), checkpoint_seconds=0, warnings=warnings).stopped == "finished"
     assert len(warnings) == 1
-    assert "No checkpoint could be written" in warnings[0]
+    assert "The checkpoint could not be written" in warnings[0]
     assert len(read_scene(request_.out).scene) == 616
     left = {path.suffix for path in request_.out.parent.iterdir()}
     assert ".safetensors" not in left

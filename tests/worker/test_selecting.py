@@ -106,11 +106,11 @@ def test_rows_that_were_dropped_are_dropped_of_masks_and_properties_too(tmp_path
 @pytest.mark.parametrize(
     ("array", "message"),
     [
-        (np.zeros(23), r"has the shape \(23,\); .* has 24 Gaussians"),
+        (np.zeros(23), r"has the shape \(23,\), but .* has 24 Gaussians"),
         (np.zeros((24, 1)), r"has the shape \(24, 1\)"),
         (np.full(24, 2), "values other than 0 and 1"),
         (np.full(24, np.nan), "values other than 0 and 1"),
-        (np.array(["a"] * 24), "no array of flags or numbers"),
+        (np.array(["a"] * 24), "does not hold an array of flags or numbers"),
         (np.array([None] * 24), "cannot be read as .npy"),
         (b"no npy at all", "cannot be read as .npy"),
         (b"\x93NUMPY\x01\x00\x02\x00{\n", "cannot be read as .npy"),

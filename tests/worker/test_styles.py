@@ -34,12 +34,12 @@ def test_a_file_of_the_whole_name_wins(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("weight", ["0", "-1", "1e999"])
 def test_weights_that_cannot_be(weight: str) -> None:
-    with pytest.raises(SettingsError, match=f"the weight {weight} is no finite number above 0"):
+    with pytest.raises(SettingsError, match=f"the weight {weight} is not a finite number greater than 0"):
         parse_style(f"a.jpg:{weight}")
 
 
 def test_how_many_there_may_be() -> None:
     assert len(parse_styles(["a.jpg"] * MOST_PICTURES)) == MOST_PICTURES
     for count in (0, MOST_PICTURES + 1):
-        with pytest.raises(SettingsError, match=f"There are {count} style pictures"):
+        with pytest.raises(SettingsError, match=f"There are {count} style images"):
             parse_styles(["a.jpg"] * count)

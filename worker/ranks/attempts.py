@@ -293,6 +293,6 @@ class _Attempts:
         lost.seconds_lost, lost.seconds_to_resume = round(now - self._relay.safe_at, 3), round(now - self._lost_at, 3)
         ranks = len(self._group.handles)
         self._listener.happened(
-            f"Going on from step {self._relay.first_step} with {ranks} worker{'s' if ranks > 1 else ''}, "
+            f"Resuming from step {self._relay.first_step} with {ranks} worker{'s' if ranks > 1 else ''}, "
             f"{lost.seconds_to_resume:.1f} s after the loss."
         )

@@ -92,7 +92,7 @@ class Cluster:
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
         except Exception as error:  # Ray raises many types here, some of them built-in ones
             raise ClusterAwayError(
-                f"The Ray cluster at {self.address} cannot be joined: {first_line(error)}. Check RAY_ADDRESS, or "
+                f"The Ray cluster at {self.address} cannot be reached: {first_line(error)}. Check RAY_ADDRESS, or "
                 "leave it out for workers on this machine."
             ) from error
 

@@ -89,7 +89,7 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
             threads = 1
         else:
             wanted -= 1
-    raise NoRoomError(f"Ray has no free place for a worker, which takes {_told(_bundle(nodes, 1, threads, scene))}")
+    raise NoRoomError(f"Ray has no capacity for a worker, which needs {_told(_bundle(nodes, 1, threads, scene))}")
 
 
 def _told(bundle: dict[str, int]) -> str:

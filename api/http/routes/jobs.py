@@ -226,7 +226,8 @@ def _resolve_inputs(
         upload = uploads.get(upload_id)
         if upload is None:
             raise RefusedInputError(
-                f"{upload_id[:60]!r} is no id of an upload that can be used, and {role!r} came without a file name.",
+                f"{upload_id[:60]!r} is not the ID of a usable upload, and {role!r} has no file name. Send an upload's "
+                "ID, or a file with its name.",
                 "unknown-upload",
                 input=role,
             )
@@ -357,21 +358,21 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
         **problems(
             _NOT_THERE,
             ConflictError(
-                "The job has status running; only one that failed or was canceled can be tried again.",
+                "The job has status running; only failed or canceled jobs can be retried.",
                 job_status="running",
             ),
             QueueFullError(
-                "There are 100 unfinished jobs of this key already. Wait for one to end, or cancel one.", limit=100
+                "There are already 100 unfinished jobs of this key. Wait for one to finish, or cancel one.", limit=100
             ),
             QuotaError(
-                "This key may submit 1,000 jobs a day, and has. Come back tomorrow (UTC).",
+                "This key may submit 1,000 jobs a day, and has done so. Try again tomorrow (UTC).",
                 quota="jobs-a-day",
                 limit=1000,
                 retry_after=30_000,
             ),
             RefusedInputError(
-                "Setting sharpness = 3: Extra inputs are not permitted. The job was stored by a version of the service "
-                "that took this. Submit it anew without.",
+                "Setting sharpness = 3: Extra inputs are not permitted. The job was stored by an earlier version "
+                "that accepted this. Submit a new job without it.",
                 "invalid-settings",
             ),
             DamagedWeightsError(),

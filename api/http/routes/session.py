@@ -43,7 +43,7 @@ _ELSEWHERE = CrossOriginError("Pages of 'https://example.com' may not use the se
         **problems(
             NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one."),
             _ELSEWHERE,
-            TooManyTriesError("Too many keys that are no good came from this address. Try again later."),
+            TooManyTriesError("Too many invalid keys came from this address. Try again later."),
             invalid("key", "Field required"),
             MediaTypeError("The body must be application/json."),
             TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", limit=_MAX_BODY),

@@ -130,11 +130,14 @@ def describe_uploads(context: ContextDep) -> Response:
             BadRequestError("The file is empty. Give its size as Upload-Length."),
             ConflictError(f"There are {MAX_OPEN_UPLOADS} unfinished uploads of this key. Finish or delete some."),
             _wrong_version("0.2.2"),
-            TooLargeError("The file has 20,000,000,000 bytes; 16,000,000,000 may be.", limit=16_000_000_000),
+            TooLargeError(
+                "The file has 20,000,000,000 bytes. At most 16,000,000,000 are allowed.", limit=16_000_000_000
+            ),
             invalid("header.Upload-Length", "Field required"),
             IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key."),
             QuotaError(
-                "With this, 120,000,000,000 bytes would be kept for this key; 100,000,000,000 may be. Delete jobs or "
+                "With this, 120,000,000,000 bytes would be kept for this key. At most 100,000,000,000 are allowed. "
+                "Delete jobs or "
                 "uploads first.",
                 quota="stored-bytes",
                 limit=100_000_000_000,
@@ -162,7 +165,7 @@ def create_upload(
     """Start an upload. Send its bytes with PATCH to the `Location` of the answer."""
     limit = context.settings.max_upload_bytes
     if length > limit:
-        raise TooLargeError(f"The file has {length:,} bytes; {limit:,} may be.", limit=limit)
+        raise TooLargeError(f"The file has {length:,} bytes. At most {limit:,} are allowed.", limit=limit)
     if not length:
         raise BadRequestError("The file is empty. Give its size as Upload-Length.")
     context.blobs.ensure_room(length)

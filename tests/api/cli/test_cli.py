@@ -91,7 +91,7 @@ def test_several_styles(files: Files, capsys: pytest.CaptureFixture[str]) -> Non
     assert main([*plan, "--out", str(files.out.with_suffix(".json"))]) == 0
     assert shares in files.out.with_suffix(".json").read_text()
     assert main([*files.stylize(), "--style", f"{other}:0"]) == 2
-    assert "the weight 0 is no finite number above 0" in capsys.readouterr().err
+    assert "the weight 0 is not a finite number greater than 0" in capsys.readouterr().err
 
 
 def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,8 +101,8 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     told += ["--region", "left:half-space=-1,0,0,0.5", "--region-freeze", "left", "--region", "far:sphere=0,0,99,1"]
     assert main(files.stylize("--steps-sos", "2", "--warm-start", "--clamp-aware-gradient", *told)) == 0
     said = capsys.readouterr().out
-    assert "take other.png, with weight 2" in said
-    assert "region far:           warning: left out, because it has no Gaussians" in said
+    assert "use other.png, with weight 2" in said
+    assert "region far:           warning: ignored, because it has no Gaussians" in said
     before, after = second_reader(files.ply), second_reader(files.out)
     kept = before["x"] <= -0.5
     for name, values in before.items():
@@ -131,7 +131,7 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--region", "a:cube=1"], "selects nothing that is known"),
+        (["--region", "a:cube=1"], "is not a known selection"),
         (["--region", "a:mask=nowhere.npy"], "cannot be read as .npy"),
         (["--region", "a:property=color>1"], "no property 'color'"),
         (["--region-freeze", "rest"], "Every Gaussian is frozen (rest)"),
@@ -155,7 +155,7 @@ def test_stylize_reads_and_writes_packed_scenes(
     files.out = files.out.with_name(f"wall.{form}")
     assert main(files.stylize("--steps-sos", "3")) == 0
     shown = capsys.readouterr().out
-    assert f"packed:               {form}, " in shown
+    assert f"compressed:           {form}, " in shown
     assert "dB PSNR against the PLY" in shown
     assert str(files.out) in shown
     assert str(files.out.with_name("wall.ply")) in shown
@@ -278,7 +278,7 @@ def test_orbit_needs_no_camera_file(files: Files) -> None:
     assert [decision["item"] for decision in report["plan"]["decisions"][:3]] == ["up", "cameras", "frames"]
     with Image.open(files.out.with_name("stylized.views.jpg")) as views:
         assert views.format == "JPEG"
-    assert "The orbit's views" in files.out.with_name("stylized.report.html").read_text()
+    assert "Views of the orbit" in files.out.with_name("stylized.report.html").read_text()
     assert report["position_weights"]["used"] is True
 
 
@@ -293,7 +293,7 @@ def test_a_plan_shows_the_views_of_an_orbit_before_the_start(files: Files, capsy
         assert views.width > 4 * 30
     decisions = {each["item"]: each for each in json.loads(out.read_text())["decisions"]}
     assert decisions["up"]["decision"] == "z"
-    assert decisions["cameras"]["decision"] == "4 views in a ring at 30 degrees, 5 from the middle"
+    assert decisions["cameras"]["decision"] == "4 views in a ring at 30 degrees, 5 from the center"
     assert main([*command, "--sheet", str(out)]) == 2
     assert "views.jpg" in capsys.readouterr().err
 
@@ -325,7 +325,7 @@ def test_a_target_ends_the_run_and_the_report_says_what_the_time_bought(
 ) -> None:
     assert main(files.stylize("--steps-sos", "60", "--target-loss", "0.8", "--learning-rate", "0.1")) == 0
     shown = capsys.readouterr().out
-    assert "come down to --target-loss" in shown
+    assert "reached --target-loss" in shown
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     assert report["stopped"] == "target-loss"
     assert 3 <= len(report["history"]) < 60
@@ -337,7 +337,7 @@ def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.Captur
     """With almost no learning rate the loss does not fall, so the run ends after two windows of 24 steps."""
     options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9", "--no-bounded"]
     assert main(files.stylize(*options)) == 0
-    assert "has stopped falling" in capsys.readouterr().out
+    assert "no longer falls" in capsys.readouterr().out
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     assert (report["stopped"], len(report["history"])) == ("converged", 48)
 
@@ -481,7 +481,7 @@ def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, comm
         arguments, stdout=theirs, stderr=theirs, env=environment, cwd=files.ply.parent, start_new_session=True
     ) as process:
         os.close(theirs)
-        shown = _shown_until(ours, rf"Looking at the views.* [1-9]\d*/{views}")
+        shown = _shown_until(ours, rf"Surveying the views.* [1-9]\d*/{views}")
         process.send_signal(signal.SIGINT)
         shown += _shown_until(ours, None)
         assert process.wait(timeout=60) == 130, shown
@@ -511,7 +511,7 @@ def test_time_budget_writes_the_result_and_keeps_the_checkpoint(
     options = files.stylize("--steps-sos", "5")
     assert main([*options, "--max-seconds", "0.000001"]) == 0
     shown = capsys.readouterr().out
-    assert "The time was up at step 1 of 5" in shown
+    assert "Reached --max-seconds at step 1 of 5" in shown
     assert "--resume" in shown
     checkpoint = files.out.with_name("stylized.checkpoint.safetensors")
     assert checkpoint.exists()
@@ -536,7 +536,7 @@ def test_an_old_checkpoint_is_mentioned_when_a_job_starts_anew(
     main(files.stylize("--steps-sos", "3", "--max-seconds", "0.000001"))
     capsys.readouterr()
     assert main(files.stylize("--steps-sos", "2")) == 0
-    assert "of an earlier run is there" in capsys.readouterr().out
+    assert "exists from an earlier run" in capsys.readouterr().out
     assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
 
 

@@ -39,8 +39,8 @@ def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.
     assert main(command("stylize", tmp_path, "--out", str(out), *steps, *CONTROLS)) == 0
     shown = capsys.readouterr().out
     for line in (
-        "luminance alone is compared and optimized",
-        "0.75 times as large",
+        "only luminance is compared and optimized",
+        "multiplied by 0.75",
         "scale 0 1, scale 2 0.5; 1 of 3 scales are not computed",
         "2 of 3 scales",
     ):
@@ -74,7 +74,7 @@ def test_a_plan_tells_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["--scales", "0,0"], "no scale has a weight"),
         (["--scales", "1,-1"], "greater than or equal to 0"),
         (["--scales", "nan"], "finite"),
-        (["--scales", "fine"], "are no numbers with commas between them"),
+        (["--scales", "fine"], "is not a list of weights"),
         (["--scales", "0,1"], "the views have one scale, 0"),
         (["--sh-attenuation", "1.5"], "less than or equal to 1"),
         (["--preserve-colors", "hue"], "hue"),

@@ -31,7 +31,7 @@ def shown(*, terminal: bool) -> str:
 
 def test_a_terminal_shows_views_and_then_steps() -> None:
     found = shown(terminal=True)
-    for text in ("Looking at the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123 1:01 left"):
+    for text in ("Surveying the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123 1:01 left"):
         assert text in found
 
 
@@ -39,9 +39,9 @@ def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown(terminal=False).strip() == ""
     monkeypatch.setattr(progress_bars, "LOG_SECONDS", 0.0)
     assert shown(terminal=False).strip().splitlines() == [
-        "Looking at the views: 0 of 8",
-        "Looking at the views: 3 of 8, 2:05 left",
-        "Looking at the views: 8 of 8, 0:00 left",
+        "Surveying the views: 0 of 8",
+        "Surveying the views: 3 of 8, 2:05 left",
+        "Surveying the views: 8 of 8, 0:00 left",
         "coarsest scale: step 1 of 50, loss 123, 1:01 left",
         "coarsest scale: step 2 of 50, loss 123, 1:01 left",
     ]

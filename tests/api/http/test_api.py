@@ -246,8 +246,8 @@ def test_regions_have_styles_by_their_files_names(client: httpx.Client, files: d
     good = answer(right, {"name": "left", "select": "box=-9,-9,-9,-1,9,9", "freeze": True}, style_weights=[1])
     assert good.status_code == 200, good.text
     decisions = {each["item"]: each["decision"] for each in good.json()["plan"]["decisions"]}
-    assert "take night sky.png, with weight 2" in decisions["region right"]
-    assert "stay as they are" in decisions["region left"]
+    assert "use night sky.png, with weight 2" in decisions["region right"]
+    assert "stay unchanged" in decisions["region left"]
     assert "regions" in decisions
     wrong: list[tuple[httpx.Response, str]] = [
         (answer({**right, "style": "day.png"}), "invalid-request"),

@@ -159,7 +159,7 @@ def test_killed_ranks_cost_time_only(service: Service, files: dict[str, Path], e
     found = ended(service, job_id)
     assert found["result"]["steps"] == STEPS
     log = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/log.txt", timeout=60).text
-    assert "Going on from step" in log
+    assert "Resuming from step" in log
     (service.data / "two.ply").write_bytes(check_published_once(service, job_id))
     two, one = (read_scene(path).scene for path in (service.data / "two.ply", expected))
     before = read_scene(files["scene"]).scene

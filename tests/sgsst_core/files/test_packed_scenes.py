@@ -391,7 +391,7 @@ ROW = 20 + 9
         (spz_bytes(3, 616, 1, bytes(616 * ROW - 1)), "ends before all Gaussians"),
         (spz_bytes(3, 616, 1, bytes(616 * ROW))[:-9], "ends before all Gaussians"),
         (spz_bytes(3, 4_000_000_000, 3, bytes(1000)), "declares 4000000000 Gaussians, which take 260000000016 bytes"),
-        (spz_bytes(3, 616, 1, bytes(616 * ROW + (64 << 20))), "goes on behind all Gaussians"),
+        (spz_bytes(3, 616, 1, bytes(616 * ROW + (64 << 20))), "continues after all Gaussians"),
         (spz_bytes(5, 616, 1, bytes(616 * ROW)), "version 5, which cannot be read.*splat-transform"),
         (spz_bytes(3, 616, 4, bytes(100)), "SH degree 4; 0 to 3 can be read.*splat-transform"),
         (spz_bytes(3, 0, 0), "holds no Gaussians"),
@@ -432,7 +432,7 @@ def test_extensions_behind_the_data_are_passed_over(tmp_path: Path) -> None:
 def test_spz_4_streams_that_lie(tmp_path: Path) -> None:
     """Streams are truncated, too long or damaged, behind a correct table."""
     sections = [bytes(size) for size in (9, 1, 3, 3, 4)]
-    for index, wrong, message in ((0, bytes(8), "ends before"), (2, bytes(1 << 27), "goes on"), (4, None, "damaged")):
+    for index, wrong, message in ((0, bytes(8), "ends before"), (2, bytes(1 << 27), "continues"), (4, None, "damaged")):
         bodies = [zstandard.compress(section) for section in sections]
         bodies[index] = zstandard.compress(wrong) if wrong is not None else b"nonsense"
         table = b"".join(struct.pack("<QQ", len(body), len(s)) for body, s in zip(bodies, sections, strict=True))

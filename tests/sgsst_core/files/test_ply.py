@@ -312,7 +312,7 @@ def test_non_finite_values_are_counted_by_property_and_may_be_dropped(tmp_path: 
 
 
 def test_a_scene_without_any_finite_gaussian_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match="None is left"):
+    with pytest.raises(SceneError, match="No valid Gaussians remain"):
         read_scene(save(tmp_path, simple(x=float("nan"))), drop_invalid=True)
 
 
@@ -403,7 +403,7 @@ GAUSSIAN = [f"property float {name}" for name in BASE]
             header("element vertex 1", "property float x", "element face 1", "property list uchar int i"),
             "a mesh .*missing: y, z, rot_0",
         ),
-        (header("element vertex 1", "property uint packed_position"), "no compressed PLY that can be read"),
+        (header("element vertex 1", "property uint packed_position"), "not a readable compressed PLY"),
         (
             header("element vertex 1", *(line for line in GAUSSIAN if "scale_2" not in line)),
             "something else; missing: scale_2",

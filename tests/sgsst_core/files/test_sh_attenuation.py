@@ -133,7 +133,7 @@ def test_whole_numbers_cannot_fade(tmp_path: Path) -> None:
     PlyData([PlyElement.describe(vertices.astype(kinds), "vertex")], byte_order="<").write(tmp_path / "whole.ply")
     source = read_scene(tmp_path / "whole.ply")
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
-    with pytest.raises(SceneError, match="f_rest_0 is stored as integers, which cannot fade"):
+    with pytest.raises(SceneError, match="f_rest_0 is stored as integers, which cannot be attenuated"):
         write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
 
 

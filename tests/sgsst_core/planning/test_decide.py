@@ -77,7 +77,9 @@ def said(plan: Plan, item: str) -> str:
 def test_unseen_gaussians_are_left_out_unless_they_are_kept() -> None:
     plan = plan_of(probe())
     assert plan.seen.tolist() == plan.optimized.tolist() == [False, True, True, True, True, True]
-    assert said(plan, "unseen Gaussians").startswith("1 of 6 are not rendered and not optimized; they take their neigh")
+    assert said(plan, "unseen Gaussians").startswith(
+        "1 of 6 are neither rendered nor optimized; they follow their neigh"
+    )
     assert line(plan, "unseen Gaussians").bytes == OPTIMIZER_BYTES  # type: ignore[union-attr]
     assert "they keep their colors" in said(plan_of(probe(), unseen="freeze"), "unseen Gaussians")
     everything = plan_of(probe(), keep=("unseen",))
@@ -89,7 +91,7 @@ def test_unseen_gaussians_are_left_out_unless_they_are_kept() -> None:
 def test_pruned_gaussians_come_with_their_error() -> None:
     plan = plan_of(probe(pruned_error=ImageError(0.1, 0.01)), prune_weight=1.0, keep=("unseen",))
     assert plan.seen.tolist() == [False, False, False, True, True, True]
-    assert said(plan, "pruned Gaussians").startswith("2 of 6 are not rendered")
+    assert said(plan, "pruned Gaussians").startswith("2 of 6 are neither rendered")
     assert "no pixel of a view changes by more than 25.5" in line(plan, "pruned Gaussians").error  # type: ignore[union-attr]
     assert line(plan_of(probe()), "pruned Gaussians") is None
     with pytest.raises(SettingsError, match="the largest total blend weight is 8"):
@@ -116,8 +118,8 @@ def test_spherical_harmonics(degree: int, used: int, keep: tuple[Any, ...], expe
 def test_blind_and_similar_views_are_left_out() -> None:
     plan = plan_of(probe(covered=[0, 1, 3], distinct=(0, 3)), similar_views=0.01)
     assert plan.covered == (0, 3)
-    assert said(plan, "views") == "1 of 4 are left out: they see no Gaussian"
-    assert said(plan, "similar views").startswith("1 of 4 are left out")
+    assert said(plan, "views") == "1 of 4 are skipped: they see no Gaussian"
+    assert said(plan, "similar views").startswith("1 of 4 are skipped")
     assert line(plan, "similar views").bytes > 0  # type: ignore[union-attr, operator]
     whole = plan_of(probe())
     assert line(whole, "views") is line(whole, "similar views") is None
@@ -157,7 +159,7 @@ def test_what_is_behind_a_scan_and_what_its_colors_begin_with(
     assert (behind is not None, start is not None) == (training_background != "background", warm)
     for found, setting in ((behind, "training_background"), (start, "warm_start")):
         if found:
-            assert ("asked for" in found.reason) is (setting in values)
+            assert ("requested" in found.reason) is (setting in values)
             scan = share == 0.5 and "position_weights" not in values
             assert ("50.0% of the views' pixels are uncovered" in found.reason) is (setting not in values and scan)
 
@@ -173,10 +175,10 @@ def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end()
     pixels = HEIGHT * WIDTH * (1 + 1 / 4)
     assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 1e-6, rel=0.01)
     assert drawn.prediction.first_visit < fixed.prediction.first_visit
-    assert "0.6 s in every iteration" in said(drawn, "training_background")
-    assert said(drawn, "early stop").startswith("none: every step is made: losses with different colors")
+    assert "0.6 s per step" in said(drawn, "training_background")
+    assert said(drawn, "early stop").startswith("none: all steps are run: losses on different backgrounds")
     without = plan_of(probe(uncovered_share=0.5), training_background="random", content_weight=0.0)
-    assert "every iteration" not in said(without, "training_background")
+    assert "per step" not in said(without, "training_background")
     uncached = plan_of(probe(uncovered_share=0.5), training_background="random", keep=("content",))
     assert uncached.prediction is not None
     assert uncached.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # also a render of the content
@@ -186,7 +188,7 @@ def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end()
 def test_uncovered_pixels_do_not_go_through_the_network() -> None:
     scan = probe(uncovered_share=0.5, regions=[Rectangle(160, 160, 320, 320)] * VIEWS)
     plan, kept = plan_of(scan), plan_of(scan, keep=("uncovered",))
-    assert "of the pixels do not go through the network: 50.0% of" in said(plan, "uncovered pixels")
+    assert "of the pixels skip the network: 50.0% of" in said(plan, "uncovered pixels")
     assert line(kept, "uncovered pixels") is None
     assert plan.prediction is not None
     assert kept.prediction is not None
@@ -198,11 +200,14 @@ def test_uncovered_pixels_do_not_go_through_the_network() -> None:
 
 def test_partition_and_second_forward_follow_from_the_memory() -> None:
     roomy = plan_of(probe())
-    assert said(roomy, "partition") == "none: a view goes through the network whole: it fits 5.0 GB for activations"
-    assert said(roomy, "second forward").startswith("none: activations are kept")
+    assert (
+        said(roomy, "partition")
+        == "none: the network takes each view as a whole: it fits in the 5.0 GB for activations"
+    )
+    assert said(roomy, "second forward").startswith("none: activations are cached")
     tight = plan_of(probe(memory_limit=GIGABYTE))
     assert said(tight, "partition").startswith("up to ")
-    assert "of the pixels fit 0.5 GB for activations" in said(tight, "second forward")
+    assert "of the pixels fit in the 0.5 GB for activations" in said(tight, "second forward")
     again = plan_of(probe(), keep=("activations",))
     assert said(again, "second forward").startswith("for 100% of the pixels")
     assert roomy.prediction is not None
@@ -233,8 +238,10 @@ def test_matching_features_is_in_seconds_and_memory() -> None:
         more = found.prediction.peak_bytes - plain.prediction.peak_bytes
         assert vectors + 16 * sum(positions) < more < vectors + 16 * sum(positions) + (16 << 20)
         assert line(plain, "style loss") is None
-        assert said(found, "style loss").startswith("the distance of relu3 features to the nearest of at most 8,192 of")
-        assert said(found, "network layers").startswith("none behind relu4_2")
+        assert said(found, "style loss").startswith(
+            "the distance of relu3 features to the nearest of at most 8,192 style"
+        )
+        assert said(found, "network layers").startswith("up to relu4_2")
 
 
 def test_content_is_left_out_without_weight() -> None:
@@ -246,20 +253,19 @@ def test_content_is_left_out_without_weight() -> None:
     ("asked", "ratio", "precision", "text"),
     [
         ("float32", None, "float32", None),
-        ("bfloat16", 1.7, "bfloat16", "features in bfloat16: asked for, 1.7 times faster here"),
+        ("bfloat16", 1.7, "bfloat16", "features in bfloat16: requested, 1.7 times faster here"),
         (
             "bfloat16",
             0.04,
             "float32",
-            "features in float32: bfloat16 was asked for, but takes 25.0 times as long as float32 on this processor",
+            "features in float32: bfloat16 was requested, but takes 25.0 times as long as float32 on this processor",
         ),
-        ("tf32", 3.0, "tf32", "convolutions in TF32: asked for, 3.0 times faster here"),
+        ("tf32", 3.0, "tf32", "convolutions in TF32: requested, 3.0 times faster here"),
         (
             "tf32",
             None,
             "float32",
-            "features in float32: tf32 was asked for, which NVIDIA GPUs of compute capability 8.0 and above have: "
-            "as float32 here",
+            "features in float32: tf32 was requested, but needs an NVIDIA GPU of compute capability 8.0 or higher",
         ),
     ],
 )
@@ -288,7 +294,7 @@ def test_algorithms_are_tried_where_sizes_come_back(device: str, weights: str, s
     decision = line(plan, "convolutions")
     assert (decision is not None) is (device == "cuda")
     if decision:
-        assert ("not tried" in decision.decision) is not search
+        assert ("does not benchmark" in decision.decision) is not search
 
 
 #: A graph saves 4 of 10 ms and takes 40 ms to capture, so it pays off from the twelfth visit on.
@@ -299,17 +305,33 @@ CAPTURED = LaunchCost(seconds=0.010, replayed=0.006, capture=0.040)
     ("changes", "values", "reason"),
     [
         ({}, {"steps_sos": 12}, None),
-        ({}, {"steps_sos": 11}, "come about 11 times, and a graph of each phase pays from 12.0 visits on: 6 ms a view"),
+        (
+            {},
+            {"steps_sos": 11},
+            "visited about 11 times, but one graph per phase pays off from 12.0 visits; measured per view: 6 ms",
+        ),
         ({}, {"steps_sos": 12, "steps_coarse": 12}, None),  # each phase has its own graph
-        ({}, {"steps_sos": 12, "steps_coarse": 11}, "come about 23 times, and a graph of each phase pays from 12.0"),
-        ({}, {"steps_sos": 12, "position_weights": "on"}, "come about 3 times"),  # views are cropped to different sizes
+        (
+            {},
+            {"steps_sos": 12, "steps_coarse": 11},
+            "visited about 23 times, but one graph per phase pays off from 12.0",
+        ),
+        (
+            {},
+            {"steps_sos": 12, "position_weights": "on"},
+            "visited about 3 times",
+        ),  # views are cropped to different sizes
         ({}, {"steps_sos": 12 * VIEWS, "position_weights": "on"}, None),
-        ({}, {"steps_sos": 400, "keep": ("launches",)}, "asked for"),
-        ({"ranks": 2}, {"steps_sos": 400}, "a graph cannot hold what workers tell each other"),
+        ({}, {"steps_sos": 400, "keep": ("launches",)}, "requested"),
+        ({"ranks": 2}, {"steps_sos": 400}, "a graph cannot contain communication between workers"),
         ({"ranks": 2}, {"steps_sos": 6, "views_per_step": 2}, None),  # every worker has a view of its own
-        ({"launches": None}, {"steps_sos": 400}, "views of one size come about 400 times"),
-        ({"launches": LaunchCost(problem="no")}, {"steps_sos": 400}, "there are no graphs: no"),
-        ({"launches": LaunchCost(1.0, 0.98, 0.0)}, {"steps_sos": 400}, "a graph saves hardly anything: 980 ms a view"),
+        ({"launches": None}, {"steps_sos": 400}, "views of one size are visited about 400 times"),
+        ({"launches": LaunchCost(problem="no")}, {"steps_sos": 400}, "CUDA graphs are unavailable: no"),
+        (
+            {"launches": LaunchCost(1.0, 0.98, 0.0)},
+            {"steps_sos": 400},
+            "a graph saves hardly any time: measured per view: 980 ms",
+        ),
     ],
 )
 def test_the_loss_is_captured_where_that_saves_time(
@@ -321,8 +343,8 @@ def test_the_loss_is_captured_where_that_saves_time(
     assert decision is not None
     assert plan.graphs is (reason is None)
     if reason is None:
-        assert decision.decision == "a view's loss is captured, and launched as one"
-        assert decision.reason.startswith("6 ms a view were measured as a graph, 10 ms kernel by kernel, 40 ms to")
+        assert decision.decision == "the loss of a view is captured as a CUDA graph"
+        assert decision.reason.startswith("measured per view: 6 ms as a graph, 10 ms kernel by kernel, 40 ms to")
         assert decision.seconds == pytest.approx(0.004)
     else:
         assert decision.decision == "kernel by kernel"
@@ -350,7 +372,7 @@ def test_a_graph_has_memory_of_its_own() -> None:
 def test_the_measured_error_of_a_precision_is_said() -> None:
     measured = probe(precision_ratio=2.0, gradient_error=Difference(0.1234, 0.98765))
     error = line(plan_of(measured, precision="bfloat16"), "precision").error  # type: ignore[union-attr]
-    assert error.startswith("the first view's pixel gradient is off by 0.12 of its norm (cosine 0.98765)")
+    assert error.startswith("the first view's pixel gradient has a relative error of 0.12 (cosine 0.98765)")
     slower = probe(precision_ratio=0.5)
     assert line(plan_of(slower, precision="bfloat16"), "precision").error == "none"  # type: ignore[union-attr]
 
@@ -362,10 +384,10 @@ def test_on_the_cpu_weights_are_kept_where_they_pay() -> None:
     kept, once = plan_of(probe()), plan_of(probe(), steps_coarse=0, steps_sos=4 * VIEWS)
     assert (kept.rasterizer, kept.cached_weights) == ("cached", "float32")
     assert said(kept, "blend weights") == (
-        "all kept in float32: they take 1.00 GB of all views; 2.5 GB are there for blend weights"
+        "all cached in float32: they take 1.00 GB for all views; 2.5 GB are available for blend weights"
     )
     assert (once.rasterizer, once.cached_weights) == ("cpu", "none")
-    assert said(once, "blend weights") == "computed anew in every iteration: a view comes 4.0 times"
+    assert said(once, "blend weights") == "recomputed in every step: a view is visited 4.0 times"
     assert line(kept, "rasterizer") is line(once, "rasterizer") is None
     assert kept.prediction is not None
     assert plan_of(probe(), cached_weights="none").prediction.seconds == pytest.approx(  # type: ignore[union-attr]
@@ -390,13 +412,13 @@ def test_weights_that_do_not_fit(values: dict[str, Any], form: str, coarse: bool
     assert (plan.cached_weights, plan.coarse_weights) == (form, coarse)
     assert plan.rasterizer == ("cpu" if form == "none" else "cached")
     assert ("phase 1 only those of the coarsest scale" in said(plan, "blend weights")) is coarse
-    assert ("% of the views' kept" in said(plan, "blend weights")) is (form != "none")
+    assert ("% of the views' cached" in said(plan, "blend weights")) is (form != "none")
 
 
 def test_half_precision_where_only_that_fits() -> None:
     plan = plan_of(probe(raster=RasterCost(0.3, None, 3 * GIGABYTE, 2 * GIGABYTE)))
     assert (plan.cached_weights, plan.coarse_weights) == ("half", False)
-    assert said(plan, "blend weights").startswith("all kept in half precision: they take 2.00 GB")
+    assert said(plan, "blend weights").startswith("all cached in half precision: they take 2.00 GB")
     assert "1/2048" in line(plan, "blend weights").error  # type: ignore[union-attr]
 
 
@@ -423,10 +445,10 @@ def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
         "float32",
         False,
     )
-    assert said(kept, "rasterizer") == "Triton on the GPU, with kept blend weights: Triton works here"
+    assert said(kept, "rasterizer") == "Triton on the GPU, with cached blend weights: Triton works here"
     assert said(kept, "blend weights") == (
-        "all kept in float32: they take 1.00 GB of all views; 2.5 GB are there for blend weights; 4 ms a view were "
-        "measured, 10 ms computed anew"
+        "all cached in float32: they take 1.00 GB for all views; 2.5 GB are available for blend weights; measured per "
+        "view: 4 ms cached, 10 ms recomputed"
     )
     assert line(kept, "blend weights").seconds == pytest.approx(0.006)  # type: ignore[union-attr]
     assert kept.prediction is not None
@@ -435,8 +457,8 @@ def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
     assert (once.rasterizer, once.uncached, once.cached_weights) == ("triton", "triton", "none")
     assert said(once, "rasterizer") == "Triton on the GPU: Triton works here"
     assert said(once, "blend weights") == (
-        "computed anew in every iteration: a view comes 1.0 times, and keeping pays from 2.0 on: 4 ms a view were "
-        "measured, 10 ms computed anew"
+        "recomputed in every step: a view is visited 1.0 times, but caching pays off from 2.0 visits; measured per "
+        "view: 4 ms cached, 10 ms recomputed"
     )
 
 
@@ -445,15 +467,15 @@ def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
     [
         (
             replace(FASTER, kept_seconds=0.011),
-            "kept ones are not faster here: 11 ms a view were measured, 10 ms computed anew",
+            "cached weights are not faster here: measured per view: 11 ms cached, 10 ms recomputed",
         ),
-        (RasterCost(0.01, None, 40 * GIGABYTE, 20 * GIGABYTE), "those of one view do not fit"),
+        (RasterCost(0.01, None, 40 * GIGABYTE, 20 * GIGABYTE), "the weights of one view do not fit"),
     ],
 )
 def test_on_a_gpu_weights_are_not_kept_where_they_do_not_pay(raster: RasterCost, reason: str) -> None:
     plan, asked_for = plan_of(on_a_gpu(raster)), plan_of(on_a_gpu(raster), cached_weights="half")
     assert (plan.rasterizer, plan.cached_weights) == ("triton", "none")
-    assert said(plan, "blend weights") == f"computed anew in every iteration: {reason}"
+    assert said(plan, "blend weights") == f"recomputed in every step: {reason}"
     assert (asked_for.rasterizer, asked_for.uncached, asked_for.cached_weights) == ("cached", "triton", "half")
 
 
@@ -462,7 +484,7 @@ def test_on_a_gpu_half_precision_where_only_that_fits() -> None:
     assert (plan.cached_weights, plan.coarse_weights) == ("half", False)
     assert "1/2048" in line(plan, "blend weights").error  # type: ignore[union-attr]
     most = plan_of(on_a_gpu(replace(FASTER, bytes=10 * GIGABYTE, half_bytes=5 * GIGABYTE)))
-    assert said(most, "blend weights").startswith("50% of the views' kept in half precision")
+    assert said(most, "blend weights").startswith("50% of the views' cached in half precision")
     assert not most.coarse_weights
 
 
@@ -472,7 +494,7 @@ def test_gsplat_keeps_no_weights() -> None:
         assert (plan.rasterizer, plan.uncached, plan.cached_weights) == ("cuda", "cuda", "none")
         expected = "gsplat on the GPU: Triton cannot be used: no driver; gsplat works here"
         assert said(plan, "rasterizer") == expected
-        assert said(plan, "blend weights") == "computed anew in every iteration: gsplat keeps none"
+        assert said(plan, "blend weights") == "recomputed in every step: gsplat cannot cache them"
 
 
 def test_on_a_gpu_without_a_rasterizer_weights_are_kept_on_the_cpu() -> None:
@@ -485,15 +507,15 @@ def test_on_a_gpu_without_a_rasterizer_weights_are_kept_on_the_cpu() -> None:
         "float32",
         False,
     )
-    assert said(plan, "rasterizer") == f"on the CPU, with kept blend weights: {why}"
+    assert said(plan, "rasterizer") == f"on the CPU, with cached blend weights: {why}"
     assert (once.rasterizer, once.cached_weights) == ("cpu", "none")
     assert said(once, "rasterizer") == f"on the CPU: {why}"
 
 
 def test_the_reason_for_no_kept_weights_may_be_a_wish() -> None:
     for values in ({"cached_weights": "none"}, {"keep": ("blend-weights",)}):
-        assert said(plan_of(probe(), **values), "blend weights").endswith("in every iteration: asked for")
-        assert said(plan_of(on_a_gpu(FASTER), **values), "blend weights").endswith("in every iteration: asked for")
+        assert said(plan_of(probe(), **values), "blend weights").endswith("in every step: requested")
+        assert said(plan_of(on_a_gpu(FASTER), **values), "blend weights").endswith("in every step: requested")
 
 
 # --- the schedule --------------------------------------------------------------------------------------------------
@@ -504,7 +526,7 @@ def test_phase_1_is_left_out_where_views_have_one_scale() -> None:
     assert said(plan_of(probe()), "scales") == "2: the shorter side is halved until it is at most 511 pixels"
     small = probe(sizes=((300, 400),) * VIEWS, regions=[Rectangle(0, 0, 300, 400)] * VIEWS)
     assert plan_of(small).steps_coarse == 0
-    assert said(plan_of(small), "phase 1").startswith("its 40 steps are left out")
+    assert said(plan_of(small), "phase 1").startswith("its 40 steps are skipped")
     assert plan_of(small, preset="paper").steps_coarse == 40
     mixed = probe(sizes=((300, 400), *((HEIGHT, WIDTH),) * 3))
     assert said(plan_of(mixed), "scales").startswith("1 to 2")

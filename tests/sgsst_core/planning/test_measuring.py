@@ -96,17 +96,17 @@ def test_a_plan_keeps_to_the_share_where_a_level_does() -> None:
         found = expected(plan)
         allowed = max(LEAST_ALLOWED, 0.1 * (found.job - found.measuring))
         assert found.measuring <= allowed
-        assert f"{found.measuring:.2g} s beside" in said(plan, "measuring")
+        assert f"{found.measuring:.2g} s in addition to" in said(plan, "measuring")
     assert [plan_of(SLOW, steps_sos=steps).measuring for steps in (16, 20_000)] == [NOTHING, 0]
-    assert said(plan_of(SLOW), "measuring").startswith("the loss before and after on 4 views alone: about ")
+    assert said(plan_of(SLOW), "measuring").startswith("the loss before and after on 4 views only: about ")
     least = expected(plan_of(VERY_SLOW, steps_sos=4))
     assert least.measuring == least.losses > LEAST_ALLOWED
-    assert "at 7 moments up to 4 views between" in said(plan_of(RasterCost(0.01), steps_sos=300), "measuring")
+    assert "at 7 moments up to 4 novel views" in said(plan_of(RasterCost(0.01), steps_sos=300), "measuring")
 
 
 def test_nothing_is_measured_without_a_share() -> None:
     plan = plan_of(SLOW, measure=0.0)
-    assert said(plan, "measuring").startswith("the loss before and after on 4 views alone: asked for")
+    assert said(plan, "measuring").startswith("the loss before and after on 4 views only: requested")
     assert expected(plan).measuring == expected(plan).losses == 2 * expected(plan).evaluation > 0
 
 

@@ -85,9 +85,9 @@ def test_what_was_asked_for_is_obeyed() -> None:
     assert elevations(scene, made) == pytest.approx([35.0] * 14)
     assert made.radius == pytest.approx(6.5)
     decisions = told(scene, made)
-    assert (decisions["up"].decision, decisions["up"].reason) == ("z", "as asked for")
-    assert decisions["cameras"].decision == "14 views in a ring at 35 degrees, 6.5 from the middle"
-    assert decisions["cameras"].reason == "as asked for"
+    assert (decisions["up"].decision, decisions["up"].reason) == ("z", "requested")
+    assert decisions["cameras"].decision == "14 views in a ring at 35 degrees, 6.5 from the center"
+    assert decisions["cameras"].reason == "requested"
 
 
 def test_an_orbit_tells_why_it_is_as_it_is() -> None:
@@ -105,7 +105,7 @@ def test_an_orbit_tells_why_it_is_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("room", "what"),
     [
-        (scene_of(box((-4, -4, -4), (4, 4, 4), 1000), 0.05), "around what is framed"),
+        (scene_of(box((-4, -4, -4), (4, 4, 4), 1000), 0.05), "outside the frames"),
         (scene_of(box((-1, -1, -1), (1, 1, 1), 3000), 0.05), "lies inside"),
     ],
 )

@@ -142,10 +142,10 @@ def test_a_plan_tells_what_was_cut_and_what_that_costs(taken_back: int) -> None:
     pieces[:10, 0] = 5
     made = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, taken_back)
     line = refine_decision(made, make_settings(refine=4))
-    assert line.decision == "10 are cut, which makes 1,040 of 1,000"
+    assert line.decision == "10 are split, which turns 1,000 Gaussians into 1,040"
     assert "6.5 pixels" in line.reason
-    assert ("7 stay whole" in line.reason) == bool(taken_back)
+    assert ("7 are not split" in line.reason) == bool(taken_back)
     assert "43.2 dB" in line.error
     assert "41.1 dB" in line.error
     none = refine_decision(Refinement(torch.ones(9, 3, dtype=torch.uint8), 0, 9), make_settings(refine=4))
-    assert none.decision == "none is cut"
+    assert none.decision == "none is split"

@@ -148,7 +148,7 @@ def test_invalid_rows_are_told_and_indices_are_those_of_the_file(tmp_path: Path)
 def test_a_world_far_from_its_origin_is_told_with_what_is_lost(tmp_path: Path) -> None:
     scene = replace(wall(), means=wall().means + torch.tensor([1e6, 0.0, 0.0]))
     finding = the(found_in(tmp_path, scene), "far from its origin")
-    assert "positions step by 0.0625" in finding.worst
+    assert "positions are 0.0625 apart" in finding.worst
 
 
 def test_extent_ignores_a_few_floaters() -> None:
@@ -194,7 +194,7 @@ def test_extreme_lenses_and_sizes_are_told(tmp_path: Path) -> None:
     assert the(found, "above 140 degrees").worst.startswith("'wide': 169")
     assert the(found, "below 1 degree").worst.startswith("'narrow'")
     assert the(found, "principal point").worst.startswith("'shifted'")
-    assert the(found, "fewer than 16 pixels").worst == "'small': 9"
+    assert the(found, "fewer than 16 pixels on a side").worst == "'small': 9"
 
 
 def test_cameras_inside_the_scene_are_told(tmp_path: Path) -> None:

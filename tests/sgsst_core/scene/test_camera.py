@@ -86,5 +86,5 @@ def test_look_at_sees_its_target_in_the_middle_and_up_above() -> None:
     assert torch.allclose(view.center, position.double())
     assert float(torch.linalg.det(view.world_to_camera[:3, :3])) == pytest.approx(1)
     for wrong in (target - position, torch.zeros(3)):
-        with pytest.raises(CameraError, match="own up direction"):
+        with pytest.raises(CameraError, match="its up direction"):
             look_at("a", position, target, wrong, width=3, height=2, focal=2.0)

@@ -47,7 +47,7 @@ def in_bfloat16(weights: BackboneWeights) -> Stylizer:
 
 
 def told(plan: Plan) -> bool:
-    return any("behind the last step" in line.decision for line in plan.decisions)
+    return any("after the last step" in line.decision for line in plan.decisions)
 
 
 def test_results_have_the_styles_distribution_and_steps_go_on_without_it(tiny_weights: BackboneWeights) -> None:

@@ -96,7 +96,7 @@ def test_nothing_is_cut_that_would_change_the_picture(
     found = made(tiny_weights, 4.0)
     assert found.split == 0
     assert found.taken_back > 0
-    assert "stay whole" in choice.refine_decision(found, settings(refine=4)).reason
+    assert "are not split" in choice.refine_decision(found, settings(refine=4)).reason
     monkeypatch.setattr(refining, "LEAST_PSNR", 0.0)
     loose = made(tiny_weights, 4.0)
     assert loose.taken_back == 0

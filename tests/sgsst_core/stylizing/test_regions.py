@@ -136,7 +136,7 @@ def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
         run(stylizer)
     assert torch.equal(found.stylized(), wanted.stylized())
     (line,) = [each for each in found.plan.decisions if each.item == "region empty"]
-    assert line.decision == "warning: left out, because it has no Gaussians"
+    assert line.decision == "warning: ignored, because it has no Gaussians"
 
 
 def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights) -> None:
@@ -237,8 +237,8 @@ def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
     plan, _ = make_plan(scene, cameras(), settings, weights=tiny_weights, regions=halves(scene))
     lines = {line.item: line for line in plan.decisions}
     assert "2 renders at a view's first visit, 0.1 MB for all views" in lines["regions"].decision
-    assert "% of what the views show, take the style" in lines["region rest"].decision
-    assert "take picture 1" in lines["region right"].decision
+    assert "% of what the views show, use the style" in lines["region rest"].decision
+    assert "use picture 1" in lines["region right"].decision
 
 
 def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: BackboneWeights) -> None:

@@ -73,8 +73,8 @@ def test_the_picture_of_the_result_is_what_was_optimized(
 
 
 def test_the_plan_says_what_fades(tiny_weights: BackboneWeights) -> None:
-    assert "there is nothing to fade" in line(make(tiny_weights, wall(), sh_attenuation=0.5))
-    assert "0.75 times as large" in line(make(tiny_weights, wall(sh_degree=1), sh_attenuation=0.25))
+    assert "there is nothing to attenuate" in line(make(tiny_weights, wall(), sh_attenuation=0.5))
+    assert "multiplied by 0.75" in line(make(tiny_weights, wall(sh_degree=1), sh_attenuation=0.25))
     out = make(tiny_weights, wall(sh_degree=1), sh_attenuation=1)
-    assert "faded out: no view directions are computed" in line(out)
+    assert "attenuated to 0, in the result too; no view directions are computed" in line(out)
     assert out.views.scene.sh_degree == 0

@@ -151,7 +151,7 @@ def test_a_lost_rank_costs_no_more_than_a_checkpoint_interval(
     lost = ended.attempts[0]
     assert 0 < lost.saved_step <= lost.last_step
     assert len(heard.prepared) == 1
-    assert "Going on from step" in heard.happened[-1]
+    assert "Resuming from step" in heard.happened[-1]
     # Two ranks again add in the same order, so the file is the same.
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
     assert request.out.read_bytes() == undisturbed[1]
@@ -187,7 +187,7 @@ def test_a_full_disk_costs_a_checkpoint_and_a_cancelled_job_goes_on(
 ) -> None:
     request, heard = small_request(tmp_path, STEPS), Heard(stop_at=8)
     ended = run(request, cluster, heard, Fault(0, "checkpoint", 1, "full"))
-    assert ["No checkpoint could be written" in line for line in heard.warnings] == [True]
+    assert ["The checkpoint could not be written" in line for line in heard.warnings] == [True]
     assert ended.interrupted
     assert ended.attempts == []
     assert 8 <= ended.step < STEPS
