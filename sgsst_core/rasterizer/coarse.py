@@ -21,7 +21,7 @@ from sgsst_core.rasterizer import coarse_kernels, kernels
 from sgsst_core.rasterizer.arguments import CameraKey, Rows, camera_key, check_colors
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
-from sgsst_core.rasterizer.raster_lists import RasterLists, tile_grid
+from sgsst_core.rasterizer.raster_lists import RasterLists, run_starts, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 
@@ -85,20 +85,16 @@ def _count(lists: RasterLists, grid: _Grid, alpha_max: float) -> _Counts:
     return counts
 
 
-def _offsets(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
-    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
-
-
 class CoarseOperator:
     """D W of one view, at most at the scale where a raster tile is a pixel. See `coarse_kernels` for the layout."""
 
     def __init__(self, lists: RasterLists, counts: _Counts, grid: _Grid, alpha_max: float) -> None:
         self.scale, self.across = grid.piece_scale, grid.across
         self.gaussians = lists.projection.gaussians
-        slot_starts = _offsets(counts.slot_used)
+        slot_starts = run_starts(counts.slot_used)
         self.first_slots = slot_starts[lists.first_slots]
         self.pieces = coarse_kernels.Pieces(
-            starts=_offsets(counts.tile_pieces),
+            starts=run_starts(counts.tile_pieces),
             gaussians=np.empty(counts.pieces, dtype=np.int32),
             slots=np.empty(counts.pieces, dtype=np.int32),
             weights=np.empty(counts.pieces * (RASTER_TILE >> self.scale) ** 2, dtype=np.float32),

@@ -97,11 +97,11 @@ def build_raster_lists(
         parts = np.linspace(0, len(values), threads * _PARTS + 1).astype(np.int64)
         places = np.zeros((len(parts) - 1, across * down), dtype=np.int64)
         _count_tiles(values, *size, parts, threads, counts, places)
-    first_slots = _starts(counts)
+    first_slots = run_starts(counts)
     total = int(first_slots[-1])
     check_intersections(total, len(counts), camera)
     _check_memory(total, len(counts), camera)
-    starts = _starts(places.sum(axis=0))
+    starts = run_starts(places.sum(axis=0))
     # First position that each part writes to in each tile: after the entries of all preceding parts.
     places = starts[:-1] + np.cumsum(places, axis=0) - places
     ranks, slots = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
@@ -124,11 +124,11 @@ def lists_of_subset(lists: RasterLists, places: NDArray[np.int32]) -> RasterList
         kept = gaussians >= 0
         # For every rank: its new rank (-1 if removed), and the offset by which its slots move.
         ranks = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
-        first_slots = _starts(np.where(kept, np.diff(lists.first_slots), 0))
+        first_slots = run_starts(np.where(kept, np.diff(lists.first_slots), 0))
         moves = (lists.first_slots - first_slots)[:-1]
         counts = np.empty(len(lists.starts) - 1, dtype=np.int64)
         _count_kept(lists.ranks, lists.starts, ranks, counts)
-        starts = _starts(counts)
+        starts = run_starts(counts)
         values = np.empty((int(kept.sum()), projection.values.shape[1]))
         take_rows(projection.values, np.flatnonzero(kept), values)
         own_ranks, own_slots = np.empty(starts[-1], dtype=np.int32), np.empty(starts[-1], dtype=np.int32)
@@ -137,9 +137,9 @@ def lists_of_subset(lists: RasterLists, places: NDArray[np.int32]) -> RasterList
     return RasterLists(own, starts, own_ranks, own_slots, np.append(first_slots[:-1][kept], first_slots[-1]))
 
 
-def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def run_starts(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the start offsets of consecutive runs with these lengths, and the end of the last one."""
-    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
+    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
 
 
 def check_intersections(total: int, gaussians: int, camera: Camera) -> None:

@@ -17,14 +17,11 @@ from sgsst_core.rasterizer import kernels
 from sgsst_core.rasterizer.arguments import Rows
 from sgsst_core.rasterizer.cached_weights import Precision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.raster_lists import run_starts
 from sgsst_core.scene.camera import Camera
 
 _ITEM_BYTES = 20  # Gaussian index, slot, gradient
 _PIECE_BYTES = 4  # item index
-
-
-def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
 
 
 class CountedStrips:
@@ -73,7 +70,7 @@ class WeightStrips:
         self.gaussians = lists.projection.gaussians
         self.nbytes = counted.nbytes(precision)
         self._total = len(rasterizer.scene)
-        slot_starts = _offsets(counted.slot_items)
+        slot_starts = run_starts(counted.slot_items)
         self.first_slots = slot_starts[lists.first_slots]
         items, pieces = int(counted.items.sum()), int(counted.pieces.sum())
         weights: NDArray[np.float32] | NDArray[np.uint16]
@@ -82,8 +79,8 @@ class WeightStrips:
         else:
             weights = np.empty(pieces * kernels.PIECE, dtype=np.uint16)
         self.strips = kernels.Strips(
-            item_starts=_offsets(counted.items),
-            piece_starts=_offsets(counted.pieces),
+            item_starts=run_starts(counted.items),
+            piece_starts=run_starts(counted.pieces),
             gaussians=np.empty(items, dtype=np.int32),
             slots=np.empty(items, dtype=np.int32),
             items=np.empty(pieces, dtype=np.int32),

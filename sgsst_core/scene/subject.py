@@ -12,7 +12,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import Scene, sampled_rows
 
 #: Gaussians sampled for computing the extent, accurate to well under a percent, and points stored of them.
 _SAMPLE, _POINTS = 100_000, 20_000
@@ -64,7 +64,7 @@ class Subject:
 
 def find_subject(scene: Scene) -> Subject:
     """Find the subject of a scene with at least one Gaussian."""
-    rows = _sample(len(scene), _SAMPLE)
+    rows = sampled_rows(len(scene), _SAMPLE)
     points = scene.means[rows].double()
     # beyond e^60 a length is practically infinite, and its square still fits
     lengths = scene.scales[rows].double().clamp(-60, 60).exp()
@@ -82,7 +82,7 @@ def find_subject(scene: Scene) -> Subject:
     hull = _hull(points[kept], turned, reach)
     left_out = float(weights[~kept].sum())
     points, weights = points[kept], weights[kept]
-    some = _sample(len(points), _POINTS)
+    some = sampled_rows(len(points), _POINTS)
     return Subject(points[some], weights[some] / weights[some].sum(), hull, left_out)
 
 
@@ -109,17 +109,6 @@ def rotations(quats: Tensor) -> Tensor:
     given = torch.where((quats != 0).any(1, keepdim=True), quats, nothing)
     turned: Tensor = torch.from_numpy(Rotation.from_quat(given.roll(-1, 1).numpy()).as_matrix())
     return turned
-
-
-def _sample(total: int, count: int) -> Tensor:
-    """Return a random row from each run of equal length, with a fixed seed.
-
-    Regular sampling could coincide with a period in the order of the file.
-    """
-    step = -(-total // count)
-    first = torch.arange(0, total, step)
-    chance = torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
-    return (first + chance).clamp_max(total - 1)
 
 
 def _without_strays(points: Tensor, weights: Tensor) -> Tensor:
