@@ -52,7 +52,7 @@ from sgsst_core.rasterizer.projection import Shapes
 from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
@@ -454,9 +454,8 @@ def _search_seconds(units: Tensor) -> float:
 def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], budget: int) -> RasterCost:
     """Count and time blend weights on a few evenly spread views. `budget` is the memory for cached weights in bytes."""
     scene, rasterizer = planning_context.scene, planning_context.rasterizer
-    count = min(SAMPLED_VIEWS, len(cameras))
-    sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
-    middle = count // 2
+    sample = spread(cameras, SAMPLED_VIEWS)
+    count, middle = len(sample), len(sample) // 2
     if isinstance(rasterizer, CpuRasterizer):
         _raster_seconds(CpuRasterizer(scene.subset(torch.arange(1))), 1, sample[0])  # compiles
         seconds = []

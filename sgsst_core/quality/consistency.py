@@ -20,7 +20,7 @@ from torch import Tensor
 from sgsst_core.errors import SettingsError
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 
 #: Distance of a pair's two views in the list of views.
@@ -149,10 +149,8 @@ def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[i
     """
     if gap < 1 or (at_most is not None and at_most < 1):
         raise SettingsError(f"Pairs of views {gap} apart, at most {at_most}: both numbers must be at least 1.")
-    total = max(count - gap, 0)
-    parts = total if at_most is None else min(at_most, total)
-    firsts = [(2 * part + 1) * total // (2 * parts) for part in range(parts)]  # middle of each of `parts` equal parts
-    return [(i, i + gap) for i in firsts]
+    firsts = range(max(count - gap, 0))
+    return [(i, i + gap) for i in (firsts if at_most is None else spread(firsts, at_most))]
 
 
 def expected_depth(scene: Scene, camera: Camera, rasterizer: Rasterizer) -> DepthMap:

@@ -33,7 +33,7 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import repeatable
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.ahead import PhotoLoader
@@ -41,7 +41,6 @@ from sgsst_core.stylizing.evaluation import (
     Evaluation,
     StyleTargets,
     evaluate,
-    evaluation_views,
     mean_evaluation,
     mean_loss,
 )
@@ -365,8 +364,11 @@ class Stylizer:
 
     @property
     def evaluation_views(self) -> list[int]:
-        """Indices of the plan's `loss_views`, evenly spread over the views that see anything."""
-        return evaluation_views(self.views.covered, self.plan.loss_views)
+        """Indices of the plan's `loss_views`, evenly spread over the views that see anything.
+
+        The contact sheet shows the same views.
+        """
+        return spread(self.views.covered, self.plan.loss_views)
 
     def start(self) -> Evaluation:
         """Return the loss of the unstylized scene on the evaluation views; evaluated once, at the first call."""
