@@ -30,7 +30,7 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 
 def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camera: Camera, scale: int) -> None:
@@ -43,7 +43,7 @@ def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camer
 
 def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str, Any]:
     """Return the fastest seconds of each method, the cost of the operator, and the ratios, on one view."""
-    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
+    colors = scene_colors(scene, camera)
     gradient = torch.randn(camera.height >> scale, camera.width >> scale, 3, generator=torch.Generator().manual_seed(1))
     cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
     coarse = CoarseRasterizer(cpu, scale)

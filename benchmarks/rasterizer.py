@@ -30,7 +30,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 WIDTH, HEIGHT = 1280, 720
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scenes"
@@ -84,7 +84,7 @@ def both(rasterizer: Rasterizer, colors: Tensor, image_gradient: Tensor, camera:
 
 def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     """Return the fastest seconds of each rasterizer and the ratios between them, in turn on one view."""
-    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
+    colors = scene_colors(scene, camera)
     image_gradient = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
     threads = sorted({1, torch.get_num_threads()})
     cpu = CpuRasterizer(scene)

@@ -19,6 +19,7 @@ from torch import Tensor
 from sgsst_core.budget import MEMORY_SHARES
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.difference import psnr
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
@@ -33,7 +34,7 @@ from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.scene.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.style_picture import prepared_style
@@ -291,20 +292,10 @@ class _Refining:
 
 def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
     """Return the image [H, W, 3] of a scene, using a rasterizer with its geometry."""
-    device = rasterizer.device
-    rest = rest_colors(scene.sh_rest.to(device), scene.means.to(device), camera)
-    return rasterizer.render(view_colors(scene.sh_dc.to(device), rest), camera)
+    return rasterizer.render(scene_colors(scene, camera, rasterizer.device), camera)
 
 
 def spread_evenly(views: Sequence[int], most: int) -> list[int]:
     """Return at most `most` views, evenly spread and including the first."""
     count = min(most, len(views))
     return [views[place * len(views) // count] for place in range(count)]
-
-
-def psnr(error: float) -> float:
-    """Return the PSNR in dB for a mean squared error of values in 0..1.
-
-    Errors are at least 1e-14, the float32 resolution.
-    """
-    return -10 * math.log10(max(error, 1e-14))
