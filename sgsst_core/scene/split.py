@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.subject import rotations
+from sgsst_core.scene.rotations import rotations
 
 #: Maximum along one axis. A Gaussian that is as thick as it is long is split into at most a third as many per axis.
 MOST_PIECES = 32

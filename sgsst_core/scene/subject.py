@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 import torch
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sgsst_core.scene.gaussians import Scene, sampled_rows
+from sgsst_core.scene.rotations import rotations
 
 #: Gaussians sampled for computing the extent, accurate to well under a percent, and points stored of them.
 _SAMPLE, _POINTS = 100_000, 20_000
@@ -101,14 +101,6 @@ def spread_directions(count: int) -> Tensor:
     angle = place * math.pi * (1 + math.sqrt(5))
     across = (1 - height**2).sqrt()
     return torch.stack([across * angle.cos(), across * angle.sin(), height], dim=1)
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """Return the rotation matrices [P, 3, 3] of wxyz quaternions [P, 4]; the identity for a zero quaternion."""
-    nothing = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    given = torch.where((quats != 0).any(1, keepdim=True), quats, nothing)
-    turned: Tensor = torch.from_numpy(Rotation.from_quat(given.roll(-1, 1).numpy()).as_matrix())
-    return turned
 
 
 def _without_strays(points: Tensor, weights: Tensor) -> Tensor:

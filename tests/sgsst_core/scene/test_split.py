@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sgsst_core.files.ply import read_scene, write_scene
-from sgsst_core.rasterizer.reference import ReferenceRasterizer, rotation_matrices
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene import split as module
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rotations import unit_rotations
 from sgsst_core.scene.split import (
     MOST_PIECES,
     can_be_split,
@@ -36,7 +37,9 @@ NUMBERS = [1, *range(3, MOST_PIECES + 1)]
 
 def covariances(scene: Scene) -> Tensor:
     """Return covariances [N, 3, 3] in float64."""
-    factors = rotation_matrices(scene.quats.double()) * scene.scales.double().exp()[:, None, :]
+    factors = (
+        unit_rotations(torch.nn.functional.normalize(scene.quats.double())) * scene.scales.double().exp()[:, None, :]
+    )
     return factors @ factors.transpose(1, 2)
 
 
