@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import psutil
 import torch
@@ -17,12 +17,27 @@ V = TypeVar("V")
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
 #: Fraction of the total memory of a GPU, which a job has to itself.
 GPU_SHARE = 0.7
-#: Fractions of the memory limit: activations of one iteration, view targets and colors, and the rasterizer's tile
-#: intersections or cached weights.
-MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
-#: Where blend weights are cached, the memory limit divided by this, taken from the views' fraction, is left for tile
-#: intersections: views whose weights do not fit are rendered from them.
-LISTS_BESIDE_WEIGHTS = 16
+#: Fractions of the memory limit by use: see `memory_for`.
+_FRACTIONS = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
+
+
+def memory_for(use: Literal["activations", "views", "rasterizer"], memory: int) -> int:
+    """Return the part of a rank's memory limit in bytes that one use may take.
+
+    Args:
+        use: Activations of one iteration; view targets and colors; or the rasterizer's tile intersections and cached
+            weights.
+        memory: Memory limit of the rank in bytes.
+    """
+    return int(memory * _FRACTIONS[use])
+
+
+def least_list_memory(memory: int) -> int:
+    """Return the size in bytes, as part of a rank's memory limit, left for tile intersections next to cached weights.
+
+    Views whose weights do not fit are rendered from them. The memory is taken from that for views.
+    """
+    return memory // 16
 
 
 def measuring_memory(memory: int) -> int:

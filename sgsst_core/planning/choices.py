@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import memory_for
 from sgsst_core.errors import SettingsError
 from sgsst_core.loss.style_losses import has_statistics
 from sgsst_core.planning.plan import Device
@@ -118,7 +118,7 @@ def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, 
     """
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
     if name in ("cpu", "triton"):
-        options["max_list_bytes"] = int(memory * MEMORY_SHARES["rasterizer"]) // (2 if name == "triton" else 1)
+        options["max_list_bytes"] = memory_for("rasterizer", memory) // (2 if name == "triton" else 1)
     return options
 
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import memory_for
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.tiling import Tiling
@@ -71,8 +71,8 @@ class _Deciding:
         self.measured = measured
         memory = probe.machine.memory
         network = probe.network
-        self.activations = int(memory * MEMORY_SHARES["activations"])
-        self.budget = int(memory * MEMORY_SHARES["rasterizer"])
+        self.activations = memory_for("activations", memory)
+        self.budget = memory_for("rasterizer", memory)
         self.tiling = Tiling(
             network.halo,
             self.activations / network.held_bytes,

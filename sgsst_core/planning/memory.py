@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, measuring_memory
+from sgsst_core.budget import least_list_memory, measuring_memory, memory_for
 from sgsst_core.planning.cost import OPTIMIZER_BYTES, STEP_BYTES, gaussian_bytes, image_bytes
 from sgsst_core.planning.measuring import LEVELS, RENDERED
 from sgsst_core.planning.plan import Plan
@@ -111,10 +111,10 @@ class PeakMemory:
         What the survey has already cached is not included.
         """
         memory, weights, visits = self.probe.machine.memory, self._weights(), self.visits
-        room = int(memory * MEMORY_SHARES["rasterizer"]) - weights
+        room = memory_for("rasterizer", memory) - weights
         lists = visits.lists.bytes + self._other_lists()
         if visits.weights is not None:  # the tile intersections of a view are dropped once its weights are cached
-            room = max(room, memory // LISTS_BESIDE_WEIGHTS)
+            room = max(room, least_list_memory(memory))
             lists -= visits.weights.kept * self._all_visited * visits.lists.bytes
         return max(int(min(lists, room)) + weights - visits.surveyed.kept_bytes, 0)
 
@@ -160,7 +160,7 @@ class PeakMemory:
         """Return by how many bytes the reference's activations exceed the job's."""
         if self.level is None or not self._approximated():
             return 0
-        budget = int(self.probe.machine.memory * MEMORY_SHARES["activations"])
+        budget = memory_for("activations", self.probe.machine.memory)
         return max(min(int(self.activations * self._exact_size()), budget) - self.activations, 0)
 
     def _exact_size(self) -> float:

@@ -16,7 +16,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES, default_memory_limit
+from sgsst_core.budget import default_memory_limit, memory_for
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork, use_whole_float32
 from sgsst_core.loss.difference import Difference
@@ -306,7 +306,7 @@ def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps:
     distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
     network = _network_facts(planning_context, cameras[distinct[0]], maps)
     launches = _launch_cost(planning_context, [cameras[index] for index in distinct])
-    budget = int(planning_context.machine.memory * MEMORY_SHARES["rasterizer"])
+    budget = memory_for("rasterizer", planning_context.machine.memory)
     raster = _raster_cost(planning_context, [cameras[index] for index in distinct], budget)
     pruned = pruned_gaussians(looked, seen)
     error = pruned_image_error(~seen, cameras, distinct, planning_context.rasterizer) if pruned.any() else None
@@ -375,7 +375,7 @@ def _loss(planning_context: PlanningContext, scales: ScaleWeights = EVEN) -> Sos
         planning_context.network,
         content_weight=settings.content_weight,
         style_loss=settings.style_loss,
-        memory=int(planning_context.machine.memory * MEMORY_SHARES["activations"]),
+        memory=memory_for("activations", planning_context.machine.memory),
         coarsest=settings.coarsest_side,
         scales=scales,
         keep_activations="activations" not in settings.keep,

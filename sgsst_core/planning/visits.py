@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES
+from sgsst_core.budget import least_list_memory, memory_for
 from sgsst_core.planning.cost import Work
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Probe
@@ -123,10 +123,10 @@ class Visits:
             content: Size in bytes of the content features of all views.
         """
         raster, memory, views = probe.raster, probe.machine.memory, len(plan.covered)
-        room = memory * MEMORY_SHARES["views"]
-        weighed = memory * MEMORY_SHARES["rasterizer"]
+        room = memory_for("views", memory)
+        weighed = memory_for("rasterizer", memory)
         surveyed = Made(0.0, len(probe.sizes) * raster.lists_bytes, weighed)
-        room_of_lists = weighed if plan.cached_weights == "none" else memory / LISTS_BESIDE_WEIGHTS
+        room_of_lists = weighed if plan.cached_weights == "none" else least_list_memory(memory)
         lists = Made(raster.first_seconds, views * raster.lists_bytes, room_of_lists)
         colors = views * int(plan.seen.sum()) * COLOR_BYTES if probe.scene.used_degree else 0
         weights = None

@@ -16,7 +16,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import memory_for
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.difference import psnr
@@ -202,7 +202,7 @@ class _Refining:
             self._planning_context.network,
             content_weight=0.0,
             style_loss=settings.style_loss,
-            memory=int(self._planning_context.machine.memory * MEMORY_SHARES["activations"]),
+            memory=memory_for("activations", self._planning_context.machine.memory),
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,
             scales=ScaleWeights(settings.scales),

@@ -15,7 +15,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, device_peak, forget_device_peak
+from sgsst_core.budget import device_peak, forget_device_peak, least_list_memory, memory_for
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
@@ -260,7 +260,7 @@ class Stylizer:
             self.network,
             content_weight=settings.content_weight,
             style_loss=settings.style_loss,
-            memory=int(self.memory * MEMORY_SHARES["activations"]),
+            memory=memory_for("activations", self.memory),
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,
             scales=ScaleWeights(settings.scales),
@@ -286,7 +286,7 @@ class Stylizer:
             uncached = make_rasterizer(name, seen, **options)
         if plan.rasterizer != "cached":
             return uncached, None
-        budget = int(self.memory * MEMORY_SHARES["rasterizer"])
+        budget = memory_for("rasterizer", self.memory)
         share = budget // 4 if plan.coarse_weights else 0
         cached = make_rasterizer(
             "cached",
@@ -306,7 +306,7 @@ class Stylizer:
     def _least_list_bytes(self) -> int:
         """Budget in bytes for tile intersections next to cached weights, taken from the memory for views."""
         on_cpu = self.plan.rasterizer == "cached" and self.plan.uncached == "cpu"
-        return self.memory // LISTS_BESIDE_WEIGHTS if on_cpu else 0
+        return least_list_memory(self.memory) if on_cpu else 0
 
     def _views(self, seen: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> Views:
         plan, settings = self.plan, self.settings
@@ -318,7 +318,7 @@ class Stylizer:
             covered=list(plan.covered),
             weighted=plan.weighted,
             photos=self.photos,
-            memory=int(self.memory * MEMORY_SHARES["views"]) - self._least_list_bytes,
+            memory=memory_for("views", self.memory) - self._least_list_bytes,
             keep_content="content" not in settings.keep,
             clamp_aware_gradient=settings.clamp_aware_gradient,
             regions=plan.survey.regions if plan.weighted else None,

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import memory_for
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -28,9 +28,8 @@ def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
     kept = CachedRasterizer(scene, precision="float32" if form == "float32" else "half")
     size = sum(kept.operator_bytes(camera) for camera in VIEWS) // 2
     settings = {"steps_coarse": 0, "steps_sos": STEPS, "position_weights": "on", "seed": 3, **settings}
-    chosen = make_settings(
-        "preview", cached_weights=form, memory_limit=int(size / MEMORY_SHARES["rasterizer"]), **settings
-    )
+    limit = size * 1024 // memory_for("rasterizer", 1024)
+    chosen = make_settings("preview", cached_weights=form, memory_limit=limit, **settings)
     return Stylizer.planned(scene, VIEWS, style(), chosen, weights=weights)
 
 
