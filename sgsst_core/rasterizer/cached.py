@@ -8,13 +8,14 @@ it: `strips` on the CPU, `triton_kept` on GPUs.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from sgsst_core.budget import Cache
 from sgsst_core.constants import ALPHA_MAX, NEAR
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.arguments import (
@@ -95,7 +96,6 @@ class CachedRasterizer:
         self.precision: Precision = precision
         self.max_bytes = max_bytes
         self.least_list_bytes = least_list_bytes
-        self.kept_bytes = 0
         self._at_first_use = at_first_use
         if uncached is None and torch.device(device).type == "cpu":
             uncached = CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
@@ -103,9 +103,14 @@ class CachedRasterizer:
             uncached = TritonRasterizer(scene, background=background, near=near, alpha_max=alpha_max, device=device)
         self.uncached = uncached
         self.device = uncached.device
-        self._kept: dict[tuple[CameraKey, Rows], _Kept | None] = {}
+        self._kept: Cache[tuple[CameraKey, Rows], _Kept] = Cache(max_bytes)
         self._lent: dict[tuple[CameraKey, Rows], _Kept] = {}
         self._lock = threading.Lock()
+
+    @property
+    def kept_bytes(self) -> int:
+        """Size of all cached weights in bytes."""
+        return self._kept.used
 
     def count(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
         """Count a band's weights without caching them; takes about as long as one render."""
@@ -125,8 +130,8 @@ class CachedRasterizer:
         """
         key, band = camera_key(camera), check_rows(camera, rows)
         with self._lock:
-            if self._serving(key, band, camera) is None and (key, band) not in self._kept:
-                self._kept[key, band] = self._keep(camera, band)
+            if self._serving(key, band, camera) is None:
+                self._kept.add((key, band), lambda: self._counted(camera, band))
             return self._serving(key, band, camera) is not None
 
     @contextmanager
@@ -194,19 +199,21 @@ class CachedRasterizer:
 
     def _serving(self, key: CameraKey, band: Rows, camera: Camera) -> _Kept | None:
         """Return the present cached weights for a band: those of the whole view, else its own, else temporary ones."""
-        whole = self._kept.get((key, (0, camera.height)))
-        return whole or self._kept.get((key, band)) or self._lent.get((key, band))
+        whole = self._kept.values.get((key, (0, camera.height)))
+        return whole or self._kept.values.get((key, band)) or self._lent.get((key, band))
 
-    def _keep(self, camera: Camera, band: Rows) -> _Kept | None:
+    def _counted(self, camera: Camera, band: Rows) -> tuple[int, Callable[[], _Kept]]:
+        """Return the size in bytes of a band's weights, and a function that computes them."""
         counted = self.count(camera, band)
-        size = counted.nbytes(self.precision)
-        if self.max_bytes is not None and self.kept_bytes + size > self.max_bytes:
-            return None
-        weights = counted.keep(self.precision)
-        self.kept_bytes += weights.nbytes
-        if self.max_bytes is not None and isinstance(self.uncached, CpuRasterizer):
-            self.uncached.let_go_of_lists(camera, max(self.max_bytes - self.kept_bytes, self.least_list_bytes))
-        return _Kept(band, weights)
+
+        def make() -> _Kept:
+            weights = counted.keep(self.precision)
+            if self.max_bytes is not None and isinstance(self.uncached, CpuRasterizer):
+                left = self.max_bytes - self.kept_bytes - weights.nbytes
+                self.uncached.let_go_of_lists(camera, max(left, self.least_list_bytes))
+            return _Kept(band, weights)
+
+        return counted.nbytes(self.precision), make
 
 
 def repeatable(rasterizer: Rasterizer) -> Rasterizer:

@@ -7,7 +7,7 @@ smaller than W and correspondingly faster to apply.
 
 from __future__ import annotations
 
-import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sgsst_core.budget import Cache
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import coarse_kernels, kernels
@@ -129,41 +130,6 @@ class CoarseOperator:
         return gradient
 
 
-class _Operators:
-    """Cache of operators at coarse scales, filled until the next one would exceed `max_bytes`."""
-
-    def __init__(self, cpu: CpuRasterizer, max_bytes: int | None, at_first_use: bool) -> None:
-        self.max_bytes = max_bytes
-        self.at_first_use = at_first_use
-        self.kept_bytes = 0
-        self.kept: dict[tuple[CameraKey, int], CoarseOperator | None] = {}
-        self._cpu = cpu
-        self._lock = threading.Lock()
-
-    def get(self, camera: Camera, scale: int, grid: _Grid) -> CoarseOperator | None:
-        """Return the view's cached operator, or None. With `at_first_use` it is built first, if it fits."""
-        if self.at_first_use:
-            self.keep(camera, scale, grid)
-        return self.kept.get((camera_key(camera), scale))
-
-    def keep(self, camera: Camera, scale: int, grid: _Grid) -> None:
-        """Build and cache the view's operator if it is new and fits."""
-        key = (camera_key(camera), scale)
-        with self._lock:
-            if key not in self.kept:
-                self.kept[key] = self._build(camera, grid)
-
-    def _build(self, camera: Camera, grid: _Grid) -> CoarseOperator | None:
-        lists = self._cpu.lists(camera)
-        counts = _count(lists, grid, self._cpu.alpha_max)
-        size = counts.nbytes(lists, grid)
-        if self.max_bytes is not None and self.kept_bytes + size > self.max_bytes:
-            return None
-        operator = CoarseOperator(lists, counts, grid, self._cpu.alpha_max)
-        self.kept_bytes += size
-        return operator
-
-
 class CoarseRasterizer:
     """Implementation of `sgsst_core.rasterizer.Rasterizer` at a coarse scale, on the CPU.
 
@@ -197,43 +163,41 @@ class CoarseRasterizer:
         self.scene = cpu.scene
         self.scale = scale
         self._cpu = cpu
-        self._operators = _Operators(cpu, max_bytes, at_first_use)
+        self._at_first_use = at_first_use
+        self._operators: Cache[tuple[CameraKey, int], CoarseOperator] = Cache(max_bytes)
 
     def at(self, scale: int) -> CoarseRasterizer:
         """Return the same rasterizer at another scale; both share the cache and its budget."""
-        other = CoarseRasterizer(self._cpu, scale)
+        other = CoarseRasterizer(self._cpu, scale, at_first_use=self._at_first_use)
         other._operators = self._operators
         return other
 
     @property
     def kept_bytes(self) -> int:
         """Size in bytes of all cached operators, at all scales."""
-        return self._operators.kept_bytes
+        return self._operators.used
 
     def operator_bytes(self, camera: Camera) -> int:
         """Return the size in bytes of a view's operator without caching it; takes about as long as one render."""
-        grid = _Grid.of(camera, self.scale)
-        lists = self._cpu.lists(camera)
-        return _count(lists, grid, self._cpu.alpha_max).nbytes(lists, grid)
+        return self._counted(camera, _Grid.of(camera, self.scale))[0]
 
     def keep(self, camera: Camera) -> bool:
         """Cache a view's operator if it fits, and return whether it is cached.
 
         Whether it fits is decided the first time that the view is named.
         """
-        self._operators.keep(camera, self.scale, _Grid.of(camera, self.scale))
-        return self.is_kept(camera)
+        return self._operator(camera, _Grid.of(camera, self.scale), add=True) is not None
 
     def is_kept(self, camera: Camera) -> bool:
         """Return whether the view has a cached operator."""
-        return self._operators.kept.get((camera_key(camera), self.scale)) is not None
+        return (camera_key(camera), self.scale) in self._operators
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Return the float32 image [h, W >> scale, 3] of colors [N, 3] over the background, for rows at the scale."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
         values = check_colors(colors, len(self.scene), torch.float32, _CPU)
-        operator = self._operators.get(camera, self.scale, grid)
+        operator = self._operator(camera, grid)
         if operator is None:
             return downscale(self._cpu.render(values, camera, self._full_size(band)), self.scale)
         image = torch.from_numpy(operator.render(values.numpy(), self._cpu.background))
@@ -243,7 +207,7 @@ class CoarseRasterizer:
         """Return 1 - T_final, [h, W >> scale] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
-        operator = self._operators.get(camera, self.scale, grid)
+        operator = self._operator(camera, grid)
         if operator is None:
             return downscale(self._cpu.coverage(camera, self._full_size(band)), self.scale)
         return 1 - downscale(torch.from_numpy(operator.transmittance), self.scale - operator.scale)[slice(*band)]
@@ -253,7 +217,7 @@ class CoarseRasterizer:
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
         pixels = self._whole(self._checked(image_gradient, camera, band), grid, band)
-        operator = self._operators.get(camera, self.scale, grid)
+        operator = self._operator(camera, grid)
         if operator is None:
             whole = torch.zeros((camera.height, camera.width, 3))
             add_upscaled_(whole, pixels, self.scale)
@@ -267,6 +231,19 @@ class CoarseRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [h, W >> scale], and each Gaussian's blend weight summed over all pixels [N]."""
         return plain_survey(self, camera)
+
+    def _operator(self, camera: Camera, grid: _Grid, *, add: bool = False) -> CoarseOperator | None:
+        """Return the view's cached operator, or None. With `add` or `at_first_use` it is built first, if it fits."""
+        key = (camera_key(camera), self.scale)
+        if add or self._at_first_use:
+            self._operators.add(key, lambda: self._counted(camera, grid))
+        return self._operators.values.get(key)
+
+    def _counted(self, camera: Camera, grid: _Grid) -> tuple[int, Callable[[], CoarseOperator]]:
+        """Return the size in bytes of a view's operator, and a function that builds it."""
+        lists, alpha_max = self._cpu.lists(camera), self._cpu.alpha_max
+        counts = _count(lists, grid, alpha_max)
+        return counts.nbytes(lists, grid), lambda: CoarseOperator(lists, counts, grid, alpha_max)
 
     def _band(self, camera: Camera, rows: Rows | None) -> Rows:
         """Return the band of rows at the scale as (start, stop); None is the whole view."""

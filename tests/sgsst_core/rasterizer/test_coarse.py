@@ -98,7 +98,7 @@ def test_what_fills_no_square_does_not_count(scale: int) -> None:
     assert image.shape == (2, 3, 3)
     assert not image.any()
     assert not coarse.color_gradient(torch.ones(2, 3, 3), view).any()
-    (operator,) = coarse._operators.kept.values()
+    (operator,) = coarse._operators.values.values()
     assert operator is not None
     assert len(operator.pieces.slots) == 0
 
@@ -205,7 +205,7 @@ def test_what_does_not_fit_the_budget_is_recomputed() -> None:
                     assert relative_error(one.color_gradient(pixels, view), gradient) < 1e-6
         assert [coarse.is_kept(view) for view in views] == [True, True, False]
         assert coarse.kept_bytes == budget
-        assert sum(o.nbytes for o in coarse._operators.kept.values() if o is not None) == budget
+        assert sum(operator.nbytes for operator in coarse._operators.values.values()) == budget
         assert whole.kept_bytes == sum(sizes)
 
 

@@ -328,9 +328,7 @@ def test_half_precision_weights_are_rounded_to_float16() -> None:
     assert bool(((half.render(colors, view) - image).abs() <= 2**-11 * image + 1e-6).all())
     assert relative_error(half.color_gradient(pixels, view), full.color_gradient(pixels, view)) < 5e-4
     assert half.kept_bytes < 0.65 * full.kept_bytes
-    (one,), (two,) = full._kept.values(), half._kept.values()
-    assert one is not None
-    assert two is not None
+    (one,), (two,) = full._kept.values.values(), half._kept.values.values()
     exact, rounded = (as_float(kept.weights.strips.weights) for kept in (one, two))  # type: ignore[attr-defined]
     assert np.array_equal(rounded, (exact * np.float32(2**14)).astype(np.float16).astype(np.float32) / 2**14)
     assert 0 < float(exact[exact > 0].min()) < 1e-5
@@ -349,7 +347,7 @@ def test_what_does_not_fit_the_budget_is_recomputed() -> None:
             assert relative_error(kept.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
     assert [kept.is_kept(view) for view in views] == [True, True, False]
     assert kept.kept_bytes == budget
-    weights = [k.weights for k in kept._kept.values() if k is not None]
+    weights = [k.weights for k in kept._kept.values.values()]
     real = sum(array.nbytes for each in weights for array in each.strips)  # type: ignore[attr-defined]
     assert 0.7 * budget < real <= budget
 

@@ -92,7 +92,7 @@ def test_a_job_that_was_resumed_in_phase_1_keeps_its_operators(tiny_weights: Bac
     steps(whole, 5)
     rest.load_state(steps(first, 3).state())
     steps(rest, 2)
-    assert list(operators[0]._operators.kept) == list(operators[1]._operators.kept)
+    assert list(operators[0]._operators.values) == list(operators[1]._operators.values)
     assert operators[0].kept_bytes == operators[1].kept_bytes
     assert torch.equal(rest.sh_dc, whole.sh_dc)
 
