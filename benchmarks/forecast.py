@@ -352,7 +352,7 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     of_a_view = {
         "content": (views / 2, content_bytes([size], loss.tiling, cell)),
         "lists": (
-            rasterizer_options("triton", make_settings(), int(memory_limit()))["max_list_bytes"],
+            rasterizer_options("triton", make_settings(), int(memory_limit()))["max_intersection_bytes"],
             LIST_BYTES[0] * job.visible + LIST_BYTES[1] * job.pairs,
         ),
         "colors": (views / 4, 12.0 * job.gaussians),

@@ -88,8 +88,8 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     image_gradient = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
     threads = sorted({1, torch.get_num_threads()})
     cpu = CpuRasterizer(scene)
-    CpuRasterizer(scene).lists(camera)  # compilation
-    prepare = timed(lambda: cpu.lists(camera))
+    CpuRasterizer(scene).intersections(camera)  # compilation
+    prepare = timed(lambda: cpu.intersections(camera))
     caches = {p: CachedRasterizer(scene, precision=p) for p in ("float32", "half")}
     for cache in caches.values():
         cache.render(colors, camera)
@@ -113,7 +113,7 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     best = {name: min(runs.values()) for name, runs in fastest.items()}
     return {
         "gaussians": len(scene),
-        "intersections": len(cpu.lists(camera).ranks),
+        "intersections": len(cpu.intersections(camera).ranks),
         "seconds": {name: round(value, 5) for name, value in best.items()},
         "seconds_by_threads": {name: {n: round(v, 5) for n, v in runs.items()} for name, runs in fastest.items()},
         "seconds_prepare": round(prepare, 5),

@@ -78,7 +78,7 @@ def _raster(cost: RasterCost, pixels: float, gaussians: float, views: float) -> 
         half_bytes=None if cost.half_bytes is None else int(cost.half_bytes * pixels * views),
         keeping_seconds=None if cost.keeping_seconds is None else cost.keeping_seconds * seconds,
         first_seconds=cost.first_seconds * seconds,
-        lists_bytes=int(cost.lists_bytes * seconds),
+        intersection_bytes=int(cost.intersection_bytes * seconds),
     )
 
 

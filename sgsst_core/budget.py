@@ -33,7 +33,7 @@ def memory_for(use: Literal["activations", "views", "rasterizer"], memory: int) 
     return int(memory * _FRACTIONS[use])
 
 
-def least_list_memory(memory: int) -> int:
+def least_intersection_memory(memory: int) -> int:
     """Return the size in bytes, as part of a rank's memory limit, left for tile intersections next to cached weights.
 
     Views whose weights do not fit are rendered from them. The memory is taken from that for views.

@@ -35,16 +35,16 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 def _anew(scene: Scene, cameras: list[Camera], place: str, repeats: int, found: Findings) -> None:
     """Measure survey, intersections, forward and backward pass without cached weights."""
-    rasterizer = TritonRasterizer(scene, device=device(), max_list_bytes=0)  # caches the last view only
+    rasterizer = TritonRasterizer(scene, device=device(), max_intersection_bytes=0)  # caches the last view only
     survey(scene, cameras, rasterizer)  # compilation
     looked = waited_seconds(lambda: survey(scene, cameras, rasterizer), device())
     found.add(f"{place}/survey_seconds_a_view", looked / len(cameras))
-    both = seconds(lambda: [rasterizer.lists(camera) for camera in cameras], device(), repeats)
-    lists = rasterizer.lists(cameras[0])
+    both = seconds(lambda: [rasterizer.intersections(camera) for camera in cameras], device(), repeats)
+    isects = rasterizer.intersections(cameras[0])
     found.add(f"{place}/lists_seconds", both / len(cameras))
-    found.add(f"{place}/lists_bytes", lists.nbytes)
-    found.add(f"{place}/visible", len(lists.gaussians))
-    found.add(f"{place}/pairs", len(lists.ranks))
+    found.add(f"{place}/lists_bytes", isects.nbytes)
+    found.add(f"{place}/visible", len(isects.gaussians))
+    found.add(f"{place}/pairs", len(isects.ranks))
     _passes(rasterizer, cameras[0], place, repeats, found)
 
 

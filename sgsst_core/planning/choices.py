@@ -118,7 +118,7 @@ def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, 
     """
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
     if name in ("cpu", "triton"):
-        options["max_list_bytes"] = memory_for("rasterizer", memory) // (2 if name == "triton" else 1)
+        options["max_intersection_bytes"] = memory_for("rasterizer", memory) // (2 if name == "triton" else 1)
     return options
 
 

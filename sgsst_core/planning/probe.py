@@ -49,7 +49,7 @@ from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cached_weights import Precision as WeightPrecision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.projection import Shapes
-from sgsst_core.rasterizer.raster_lists import build_raster_lists
+from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera, spread
@@ -460,18 +460,18 @@ def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], b
         _raster_seconds(CpuRasterizer(scene.subset(torch.arange(1))), 1, sample[0])  # compiles
         seconds = []
         for camera in sample:
-            rasterizer.lists(camera)  # the survey's, if it could cache them
+            rasterizer.intersections(camera)  # the survey's, if it could cache them
             seconds += _raster_seconds(rasterizer, len(scene), camera)
-        more, lists_bytes = _lists_cost(scene, sample, planning_context.settings.near)
+        more, intersection_bytes = _intersections_cost(scene, sample, planning_context.settings.near)
     else:
         timed = [_raster_seconds(rasterizer, len(scene), camera, visits=2) for camera in sample]
         seconds = [later for _, later in timed]
         # Minimum, because one of them may include compilation or waiting for memory.
-        more, lists_bytes = max(min(first - later for first, later in timed), 0.0), 0
+        more, intersection_bytes = max(min(first - later for first, later in timed), 0.0), 0
     mean = sum(seconds) / count
     known: dict[str, Any] = {
         "first_seconds": more,
-        "lists_bytes": lists_bytes,
+        "intersection_bytes": intersection_bytes,
         "colors_seconds": _colors_seconds(scene, sample[middle], rasterizer.device),
     }
     if rasterizer.name == "cuda":
@@ -503,12 +503,12 @@ def _comes_too_seldom(settings: Settings, views: int) -> bool:
     return settings.cached_weights == "auto" and visits < LEAST_VISITS
 
 
-def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
+def _intersections_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
     """Return the time in seconds and the size in bytes of recomputed tile intersections, mean over some views."""
     seconds, size, shapes = 0.0, 0, Shapes.of(scene)
     for camera in cameras:
         started = time.perf_counter()
-        size += build_raster_lists(scene, camera, near=near, shapes=shapes).nbytes
+        size += build_tile_intersections(scene, camera, near=near, shapes=shapes).nbytes
         seconds += time.perf_counter() - started
     return seconds / len(cameras), size // len(cameras)
 

@@ -62,7 +62,7 @@ class CachedRasterizer:
             per weight.
         max_bytes: Memory budget for weights; None for no limit. On the CPU they share it with the tile intersections of
             `uncached`, which get what the weights leave, and which are dropped for a view once its weights are cached.
-        least_list_bytes: Minimum budget for these tile intersections, however much the weights take.
+        least_intersection_bytes: Minimum budget for these tile intersections, however much the weights take.
         at_first_use: Whether to cache weights at first use; if False, only by `keep`. Then rendering any number of
             other views in between does not change later results by a single bit.
         device: Device that stores and applies the weights and holds the results.
@@ -87,7 +87,7 @@ class CachedRasterizer:
         alpha_max: float = ALPHA_MAX,
         precision: Precision = "float32",
         max_bytes: int | None = None,
-        least_list_bytes: int = 0,
+        least_intersection_bytes: int = 0,
         at_first_use: bool = True,
         device: torch.device | str = "cpu",
         uncached: CpuRasterizer | TritonRasterizer | None = None,
@@ -95,7 +95,7 @@ class CachedRasterizer:
         self.scene = scene
         self.precision: Precision = precision
         self.max_bytes = max_bytes
-        self.least_list_bytes = least_list_bytes
+        self.least_intersection_bytes = least_intersection_bytes
         self._at_first_use = at_first_use
         if uncached is None and torch.device(device).type == "cpu":
             uncached = CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
@@ -210,7 +210,7 @@ class CachedRasterizer:
             weights = counted.keep(self.precision)
             if self.max_bytes is not None and isinstance(self.uncached, CpuRasterizer):
                 left = self.max_bytes - self.kept_bytes - weights.nbytes
-                self.uncached.let_go_of_lists(camera, max(left, self.least_list_bytes))
+                self.uncached.drop_intersections(camera, max(left, self.least_intersection_bytes))
             return _Kept(band, weights)
 
         return counted.nbytes(self.precision), make

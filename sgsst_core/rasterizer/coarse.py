@@ -22,7 +22,7 @@ from sgsst_core.rasterizer import coarse_kernels, kernels
 from sgsst_core.rasterizer.arguments import CameraKey, Rows, camera_key, check_colors
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
-from sgsst_core.rasterizer.raster_lists import RasterLists, run_starts, tile_grid
+from sgsst_core.rasterizer.tile_intersections import TileIntersections, run_starts, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 
@@ -70,17 +70,17 @@ class _Counts:
     def pieces(self) -> int:
         return int(self.tile_pieces.sum())
 
-    def nbytes(self, lists: RasterLists, grid: _Grid) -> int:
+    def nbytes(self, isects: TileIntersections, grid: _Grid) -> int:
         """Return the size in bytes of all arrays of a `CoarseOperator`."""
         height, width = grid.shape(grid.piece_scale)
-        offsets = 8 * (len(self.tile_pieces) + 1) + lists.first_slots.nbytes + lists.projection.gaussians.nbytes
+        offsets = 8 * (len(self.tile_pieces) + 1) + isects.first_slots.nbytes + isects.projection.gaussians.nbytes
         return offsets + 4 * height * width + self.pieces * (8 + 4 * (RASTER_TILE >> grid.piece_scale) ** 2)
 
 
-def _count(lists: RasterLists, grid: _Grid, alpha_max: float) -> _Counts:
+def _count(isects: TileIntersections, grid: _Grid, alpha_max: float) -> _Counts:
     """Count the sizes of a view's operator; takes about as long as one render."""
-    counts = _Counts(np.zeros(len(lists.starts) - 1, dtype=np.int64), np.zeros(len(lists.ranks), dtype=np.bool_))
-    tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values)
+    counts = _Counts(np.zeros(len(isects.starts) - 1, dtype=np.int64), np.zeros(len(isects.ranks), dtype=np.bool_))
+    tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values)
     with kernel_threads():
         coarse_kernels.count_pieces(*tiles, grid.size, grid.across, alpha_max, counts.tile_pieces, counts.slot_used)
     return counts
@@ -89,11 +89,11 @@ def _count(lists: RasterLists, grid: _Grid, alpha_max: float) -> _Counts:
 class CoarseOperator:
     """D W of one view, at most at the scale where a raster tile is a pixel. See `coarse_kernels` for the layout."""
 
-    def __init__(self, lists: RasterLists, counts: _Counts, grid: _Grid, alpha_max: float) -> None:
+    def __init__(self, isects: TileIntersections, counts: _Counts, grid: _Grid, alpha_max: float) -> None:
         self.scale, self.across = grid.piece_scale, grid.across
-        self.gaussians = lists.projection.gaussians
+        self.gaussians = isects.projection.gaussians
         slot_starts = run_starts(counts.slot_used)
-        self.first_slots = slot_starts[lists.first_slots]
+        self.first_slots = slot_starts[isects.first_slots]
         self.pieces = coarse_kernels.Pieces(
             starts=run_starts(counts.tile_pieces),
             gaussians=np.empty(counts.pieces, dtype=np.int32),
@@ -101,7 +101,7 @@ class CoarseOperator:
             weights=np.empty(counts.pieces * (RASTER_TILE >> self.scale) ** 2, dtype=np.float32),
         )
         self.transmittance = np.empty(grid.shape(self.scale), dtype=np.float32)
-        tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values, self.gaussians)
+        tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values, self.gaussians)
         place = (grid.size, grid.across, self.scale)
         with kernel_threads():
             coarse_kernels.keep_pieces(*tiles, *place, alpha_max, slot_starts, self.pieces, self.transmittance)
@@ -241,9 +241,9 @@ class CoarseRasterizer:
 
     def _counted(self, camera: Camera, grid: _Grid) -> tuple[int, Callable[[], CoarseOperator]]:
         """Return the size in bytes of a view's operator, and a function that builds it."""
-        lists, alpha_max = self._cpu.lists(camera), self._cpu.alpha_max
-        counts = _count(lists, grid, alpha_max)
-        return counts.nbytes(lists, grid), lambda: CoarseOperator(lists, counts, grid, alpha_max)
+        isects, alpha_max = self._cpu.intersections(camera), self._cpu.alpha_max
+        counts = _count(isects, grid, alpha_max)
+        return counts.nbytes(isects, grid), lambda: CoarseOperator(isects, counts, grid, alpha_max)
 
     def _band(self, camera: Camera, rows: Rows | None) -> Rows:
         """Return the band of rows at the scale as (start, stop); None is the whole view."""

@@ -207,7 +207,7 @@ class ReferenceRasterizer:
 
     def _batches(self, camera: Camera, band: Rows) -> Iterator[tuple[Tensor, Splats]]:
         """Yield the pixels [b, n] of b raster tiles with the splats [b, k] to blend, padded with empty splats."""
-        splats, ranks, counts = self._lists(camera)
+        splats, ranks, counts = self._intersections(camera)
         starts = counts.cumsum(0) - counts
         first_row = torch.arange(len(counts)) // -(-camera.width // RASTER_TILE) * RASTER_TILE
         inside = (counts > 0) & (first_row < band[1]) & (first_row + RASTER_TILE > band[0])
@@ -223,7 +223,7 @@ class ReferenceRasterizer:
             for pixels in tile_pixels(tiles, camera, band).split(at_once, dim=1):
                 yield pixels, batch
 
-    def _lists(self, camera: Camera) -> tuple[Splats, Tensor, Tensor]:
+    def _intersections(self, camera: Camera) -> tuple[Splats, Tensor, Tensor]:
         """Return the tile intersections of a camera.
 
         Returns:
@@ -233,7 +233,7 @@ class ReferenceRasterizer:
         key = camera_key(camera)
         if self._prepared is None or self._prepared[0] != key:
             splats = splat(self.scene, camera, near=self.near)
-            ranks, counts = tile_lists(splats, camera)
+            ranks, counts = tile_intersections(splats, camera)
             empty = len(splats.gaussians)
             ranks = torch.cat([ranks, torch.tensor([empty])])
             fields = (getattr(splats, field) for field in Splats.__dataclass_fields__)
@@ -243,7 +243,7 @@ class ReferenceRasterizer:
         return self._prepared[1:]
 
 
-def tile_lists(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
+def tile_intersections(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return the ranks of the splats in each raster tile, and their number per tile [tiles].
 
     Extents are enlarged by one pixel.

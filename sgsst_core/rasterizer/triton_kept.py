@@ -35,15 +35,15 @@ class CountedPieces:
         from sgsst_core.rasterizer import triton_kept_kernels as kernels
 
         self.rasterizer, self.camera, self.band = rasterizer, camera, band
-        self.lists = lists = rasterizer.lists(camera)
+        self.intersections = isects = rasterizer.intersections(camera)
         device = rasterizer.device
         self.across, self.tiles = tiles_of(camera, band)
-        self.masks = torch.zeros(len(lists.ranks), dtype=torch.int32, device=device)
+        self.masks = torch.zeros(len(isects.ranks), dtype=torch.int32, device=device)
         self.slot_pieces = torch.zeros_like(self.masks)
         self.block_pieces = torch.empty(self.tiles * kernels.BLOCKS.value, dtype=torch.int32, device=device)
         self.ends = torch.empty(self.tiles, dtype=torch.int64, device=device)
         kernels.count_pieces[(self.tiles,)](
-            lists.ranks, lists.slots, lists.starts, lists.values, self.masks, self.slot_pieces, self.block_pieces,
+            isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces, self.block_pieces,
             self.ends, camera.width, *band, self.across,
             **rasterizer.cuts(),
         )  # fmt: skip
@@ -58,7 +58,7 @@ class CountedPieces:
         """Return the size of the weights in bytes."""
         from sgsst_core.rasterizer import triton_kept_kernels as kernels
 
-        index, visible = self.index_type.itemsize, len(self.lists.gaussians)
+        index, visible = self.index_type.itemsize, len(self.intersections.gaussians)
         pixels = (self.band[1] - self.band[0]) * self.camera.width
         piece = 4 + index + kernels.PIECE.value * _DTYPES[precision].itemsize
         starts = len(self.block_pieces) + 1 + visible + 1
@@ -85,13 +85,13 @@ class WeightPieces:
     def __init__(self, counted: CountedPieces, precision: Precision) -> None:
         from sgsst_core.rasterizer import triton_kept_kernels as kernels
 
-        rasterizer, lists, index_type = counted.rasterizer, counted.lists, counted.index_type
+        rasterizer, isects, index_type = counted.rasterizer, counted.intersections, counted.index_type
         self._rasterizer, self.camera, self.band = rasterizer, counted.camera, counted.band
         self.scale = kernels.HALF_SCALE if precision == "half" else 1.0
         slot_starts = _offsets(counted.slot_pieces, index_type)
         self.block_starts = _offsets(counted.block_pieces, index_type)
-        self.first_slots = slot_starts[lists.first_slots]
-        self.gaussians = lists.gaussians.to(torch.int32)
+        self.first_slots = slot_starts[isects.first_slots]
+        self.gaussians = isects.gaussians.to(torch.int32)
 
         def empty(*shape: int, dtype: torch.dtype) -> Tensor:
             return torch.empty(shape, dtype=dtype, device=rasterizer.device)
@@ -101,7 +101,7 @@ class WeightPieces:
         self.weights = empty(counted.pieces * kernels.PIECE.value, dtype=_DTYPES[precision])
         self.transmittance = empty(self.band[1] - self.band[0], self.camera.width, dtype=torch.float32)
         kernels.keep_pieces[(counted.tiles,)](
-            lists.ranks, lists.slots, lists.starts, lists.values, lists.gaussians, counted.masks, counted.ends,
+            isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
             slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights, self.transmittance,
             self.camera.width, *self.band, counted.across,
             **rasterizer.cuts(), SCALE=self.scale,

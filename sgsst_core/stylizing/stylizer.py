@@ -15,7 +15,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import device_peak, forget_device_peak, least_list_memory, memory_for
+from sgsst_core.budget import device_peak, forget_device_peak, least_intersection_memory, memory_for
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
@@ -281,7 +281,7 @@ class Stylizer:
         if whole is not None and whole.name == name and plan.seen.all():
             uncached = whole
         elif isinstance(whole, CpuRasterizer) and whole.name == name:
-            uncached = whole.of_subset(seen, plan.seen, max_list_bytes=options["max_list_bytes"])
+            uncached = whole.of_subset(seen, plan.seen, max_intersection_bytes=options["max_intersection_bytes"])
         else:  # data that a GPU rasterizer prepared for the whole scene refer to Gaussians by index
             uncached = make_rasterizer(name, seen, **options)
         if plan.rasterizer != "cached":
@@ -292,7 +292,7 @@ class Stylizer:
             "cached",
             seen,
             max_bytes=budget - share,
-            least_list_bytes=self._least_list_bytes,
+            least_intersection_bytes=self._least_intersection_bytes,
             precision="half" if plan.cached_weights == "half" else "float32",
             at_first_use=False,
             uncached=uncached,
@@ -303,10 +303,10 @@ class Stylizer:
         return cached, coarse
 
     @property
-    def _least_list_bytes(self) -> int:
+    def _least_intersection_bytes(self) -> int:
         """Budget in bytes for tile intersections next to cached weights, taken from the memory for views."""
         on_cpu = self.plan.rasterizer == "cached" and self.plan.uncached == "cpu"
-        return least_list_memory(self.memory) if on_cpu else 0
+        return least_intersection_memory(self.memory) if on_cpu else 0
 
     def _views(self, seen: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> Views:
         plan, settings = self.plan, self.settings
@@ -318,7 +318,7 @@ class Stylizer:
             covered=list(plan.covered),
             weighted=plan.weighted,
             photos=self.photos,
-            memory=memory_for("views", self.memory) - self._least_list_bytes,
+            memory=memory_for("views", self.memory) - self._least_intersection_bytes,
             keep_content="content" not in settings.keep,
             clamp_aware_gradient=settings.clamp_aware_gradient,
             regions=plan.survey.regions if plan.weighted else None,

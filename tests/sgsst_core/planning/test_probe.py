@@ -22,7 +22,7 @@ from sgsst_core.planning.ranks_model import Link
 from sgsst_core.planning.survey import survey
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.raster_lists import build_raster_lists
+from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -58,8 +58,8 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     assert probe.raster.half_bytes is not None
     assert 0 < probe.raster.half_bytes < probe.raster.bytes
     assert probe.raster.seconds > 0
-    sizes = [build_raster_lists(scene, camera).nbytes for camera in cameras(3)]
-    assert probe.raster.lists_bytes == sum(sizes) // 3
+    sizes = [build_tile_intersections(scene, camera).nbytes for camera in cameras(3)]
+    assert probe.raster.intersection_bytes == sum(sizes) // 3
     assert probe.raster.first_seconds > 0 < probe.raster.colors_seconds
     assert (probe.machine.memory_limit, probe.machine.memory, probe.machine.ranks) == (10**9, 10**9, 1)
     assert probe.process_bytes > 10**7

@@ -26,8 +26,8 @@ from sgsst_core.rasterizer import Rows, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
-from sgsst_core.rasterizer.raster_lists import MAX_INTERSECTIONS, check_intersections
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
+from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, check_intersections
 from sgsst_core.rasterizer.vectors import as_float
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
@@ -352,15 +352,15 @@ def test_what_does_not_fit_the_budget_is_recomputed() -> None:
     assert 0.7 * budget < real <= budget
 
 
-def test_lists_beyond_the_budget_are_held_one_at_a_time() -> None:
+def test_tile_intersections_beyond_the_budget_are_held_one_at_a_time() -> None:
     scene = cloud(300, seed=21)
     views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
-    first = CpuRasterizer(scene).lists(views[0])
-    cpu = CpuRasterizer(scene, max_list_bytes=first.nbytes)
-    kept = [cpu.lists(view) for view in views]
-    assert cpu.lists(views[0]) is kept[0]
-    assert cpu.lists(views[2]) is kept[2]
-    assert cpu.lists(views[1]) is not kept[1]
+    first = CpuRasterizer(scene).intersections(views[0])
+    cpu = CpuRasterizer(scene, max_intersection_bytes=first.nbytes)
+    kept = [cpu.intersections(view) for view in views]
+    assert cpu.intersections(views[0]) is kept[0]
+    assert cpu.intersections(views[2]) is kept[2]
+    assert cpu.intersections(views[1]) is not kept[1]
 
 
 def test_weights_and_lists_share_a_budget() -> None:
@@ -368,16 +368,16 @@ def test_weights_and_lists_share_a_budget() -> None:
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
     colors = colors_of(scene)
     weights = [CachedRasterizer(scene).operator_bytes(view) for view in views]
-    lists = [CpuRasterizer(scene).lists(view).nbytes for view in views]
-    cpu = CpuRasterizer(scene, max_list_bytes=sum(weights[:2]) + lists[2])
-    kept = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + lists[2], uncached=cpu)
+    isects = [CpuRasterizer(scene).intersections(view).nbytes for view in views]
+    cpu = CpuRasterizer(scene, max_intersection_bytes=sum(weights[:2]) + isects[2])
+    kept = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + isects[2], uncached=cpu)
     for view in views:
-        cpu.lists(view)
+        cpu.intersections(view)
     for view in views:
         kept.render(colors, view)
     assert [kept.is_kept(view) for view in views] == [True, True, False, False]
-    assert [cpu.has_lists(view) for view in views] == [False, False, True, False]
-    assert kept.kept_bytes + cpu._lists.kept_bytes <= sum(weights[:2]) + lists[2]
+    assert [cpu.has_intersections(view) for view in views] == [False, False, True, False]
+    assert kept.kept_bytes + cpu._intersections.kept_bytes <= sum(weights[:2]) + isects[2]
 
 
 def test_arguments_are_checked_before_any_work() -> None:

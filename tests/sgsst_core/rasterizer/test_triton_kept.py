@@ -194,7 +194,7 @@ def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monk
     """Intersections wait for their length, and weights for the number of pieces."""
     scene, view = cloud(60, seed=22), camera(20, 17)
     kept, colors, pixels = kept_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
-    kept.uncached.lists(view)
+    kept.uncached.intersections(view)
     with waits(monkeypatch) as found:
         kept.coverage(view)
     assert found == ["__int__"]

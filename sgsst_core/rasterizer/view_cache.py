@@ -23,7 +23,7 @@ class Sized(Protocol):
 L = TypeVar("L", bound=Sized)
 
 
-class KeptLists(Generic[L]):
+class ViewCache(Generic[L]):
     """Cache of per-view data. Beyond the budget, only the data of the latest view are held.
 
     Nothing is evicted: views are visited in rounds, so evicting the least recently used one would evict each just
@@ -43,16 +43,16 @@ class KeptLists(Generic[L]):
         self,
         build: Callable[[Camera], L],
         max_bytes: int,
-        before: KeptLists[L] | None = None,
-        adapt: Callable[[L], L] = lambda lists: lists,
-        host: KeptLists[Any] | None = None,
+        before: ViewCache[L] | None = None,
+        adapt: Callable[[L], L] = lambda data: data,
+        host: ViewCache[Any] | None = None,
     ) -> None:
         self._build = build
         self._max_bytes = max_bytes
         self._before = before
         self._adapt = adapt
         self._host = host
-        self._guests: WeakSet[KeptLists[Any]] = WeakSet()
+        self._guests: WeakSet[ViewCache[Any]] = WeakSet()
         if host is not None:
             host._guests.add(self)
         self._kept: dict[CameraKey, L] = {}
@@ -75,14 +75,14 @@ class KeptLists(Generic[L]):
                 return self._latest[1]
             self._latest = None  # free its memory before the next one is built
             given = self._before.take(camera) if self._before else None
-            lists = self._build(camera) if given is None else self._adapt(given)
-            if self.kept_bytes + lists.nbytes <= self._bound():
-                self._kept[key] = lists
-                self._kept_bytes += lists.nbytes
+            data = self._build(camera) if given is None else self._adapt(given)
+            if self.kept_bytes + data.nbytes <= self._bound():
+                self._kept[key] = data
+                self._kept_bytes += data.nbytes
                 self._make_room()
             else:
-                self._latest = (key, lists)
-            return lists
+                self._latest = (key, data)
+            return data
 
     def holds(self, camera: Camera) -> bool:
         """Return whether the data of a view are cached, so they need not be built."""
@@ -99,10 +99,10 @@ class KeptLists(Generic[L]):
             key = camera_key(camera)
             if latest is not None and latest[0] == key:
                 return latest[1]
-            lists = self._kept.pop(key, None)
-            if lists is not None:
-                self._kept_bytes -= lists.nbytes
-                return lists
+            data = self._kept.pop(key, None)
+            if data is not None:
+                self._kept_bytes -= data.nbytes
+                return data
             return self._before.take(camera) if self._before else None
 
     def limit(self, max_bytes: int) -> None:
