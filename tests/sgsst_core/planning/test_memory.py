@@ -76,7 +76,7 @@ def test_the_largest_of_what_comes_and_goes_counts() -> None:
     assert many.peak_bytes - few.peak_bytes > 10**8 * min(BUILDING_BYTES, SEARCH_BYTES) - 10 * GIGABYTE
 
 
-def test_the_exact_twin_computes_in_float32() -> None:
+def test_the_reference_computes_in_float32() -> None:
     """If the job is not in float32, its activations and view contents are needed a second time."""
     found = probe(precision_ratio=2.0)
     rises = []
