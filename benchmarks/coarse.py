@@ -73,11 +73,11 @@ def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str,
         "scale": scale,
         "seconds": {name: round(value, 5) for name, value in fastest.items()},
         "seconds_build": round(min(builds), 5),
-        "bytes_kept": {"cached": cached.kept_bytes, "coarse": coarse.kept_bytes},
+        "bytes_kept": {"cached": cached.cached_bytes, "coarse": coarse.cached_bytes},
         "ratio_cpu_to_coarse": round(fastest["cpu"] / fastest["coarse"], 2),
         "ratio_cached_to_coarse": round(fastest["cached"] / fastest["coarse"], 2),
         "ratio_build_to_cpu": round(min(builds) / fastest["cpu"], 2),
-        "ratio_bytes_cached_to_coarse": round(cached.kept_bytes / coarse.kept_bytes, 2),
+        "ratio_bytes_cached_to_coarse": round(cached.cached_bytes / coarse.cached_bytes, 2),
     }
 
 

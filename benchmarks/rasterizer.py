@@ -118,7 +118,7 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
         "seconds_by_threads": {name: {n: round(v, 5) for n, v in runs.items()} for name, runs in fastest.items()},
         "seconds_prepare": round(prepare, 5),
         "seconds_keep_weights": round(keep, 5),
-        "bytes_kept": {name: cache.kept_bytes for name, cache in caches.items()},
+        "bytes_kept": {name: cache.cached_bytes for name, cache in caches.items()},
         "ratio_reference_to_cpu": round(best["reference"] / best["cpu"], 1),
         "ratio_cpu_to_cached_float32": round(best["cpu"] / best["cached float32"], 2),
         "ratio_cpu_to_cached_half": round(best["cpu"] / best["cached half"], 2),

@@ -78,6 +78,6 @@ def _kept(scene: Scene, camera: Camera, place: str, repeats: int, found: Finding
     colors, _ = _operands(rasterizer, camera)
     first = waited_seconds(lambda: rasterizer.render(colors, camera), device())
     found.add(f"{place}/first_render_seconds", first)
-    found.add(f"{place}/bytes", rasterizer.kept_bytes)  # type: ignore[attr-defined]  # `cached` counts them
+    found.add(f"{place}/bytes", rasterizer.cached_bytes)  # type: ignore[attr-defined]  # `cached` counts them
     _passes(rasterizer, camera, place, repeats, found)
     found.add(f"{place}/device_peak_bytes", peak_bytes(device()))

@@ -118,7 +118,7 @@ class PeakMemory:
         if visits.weights is not None:  # the tile intersections of a view are dropped once its weights are cached
             room = max(room, least_intersection_memory(memory))
             intersections -= visits.weights.kept * self._all_visited * visits.intersections.bytes
-        return max(int(min(intersections, room)) + weights - visits.surveyed.kept_bytes, 0)
+        return max(int(min(intersections, room)) + weights - visits.surveyed.cached_bytes, 0)
 
     def _other_intersections(self) -> int:
         """Return the size in bytes of tile intersections for novel views, and for a reference with its own scene."""

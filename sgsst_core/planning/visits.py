@@ -64,7 +64,7 @@ class Made:
         return (1 - self.kept) * self.seconds
 
     @property
-    def kept_bytes(self) -> int:
+    def cached_bytes(self) -> int:
         """Final memory use in bytes."""
         return int(self.fitting())
 

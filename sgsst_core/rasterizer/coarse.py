@@ -173,7 +173,7 @@ class CoarseRasterizer:
         return other
 
     @property
-    def kept_bytes(self) -> int:
+    def cached_bytes(self) -> int:
         """Size in bytes of all cached operators, at all scales."""
         return self._operators.used
 
@@ -188,7 +188,7 @@ class CoarseRasterizer:
         """
         return self._operator(camera, _Grid.of(camera, self.scale), add=True) is not None
 
-    def is_kept(self, camera: Camera) -> bool:
+    def is_cached(self, camera: Camera) -> bool:
         """Return whether the view has a cached operator."""
         return (camera_key(camera), self.scale) in self._operators
 

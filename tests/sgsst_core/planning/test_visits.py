@@ -34,18 +34,18 @@ def expected(*arguments: Any, **values: Any) -> Prediction:
 
 def test_what_fits_is_made_once_and_the_rest_at_every_visit() -> None:
     made = Made(6.0, 400, 100)
-    assert (made.kept, made.once, made.always, made.kept_bytes) == (0.25, 1.5, 4.5, 100)
+    assert (made.kept, made.once, made.always, made.cached_bytes) == (0.25, 1.5, 4.5, 100)
     assert Made(6.0, 400, 500) == replace(made, room=500)
-    assert (Made(6.0, 400, 500).once, Made(6.0, 400, 500).always, Made(6.0, 400, 500).kept_bytes) == (6.0, 0.0, 400)
+    assert (Made(6.0, 400, 500).once, Made(6.0, 400, 500).always, Made(6.0, 400, 500).cached_bytes) == (6.0, 0.0, 400)
     assert (Made(6.0).once, Made(6.0, 400, 0).always) == (6.0, 6.0)
 
 
 def test_views_that_are_kept_whole_leave_a_part_of_the_room() -> None:
     made = Made(6.0, 400, 250, views=4)
-    assert (made.kept, made.once, made.always, made.kept_bytes) == (0.5, 3.0, 3.0, 200)
+    assert (made.kept, made.once, made.always, made.cached_bytes) == (0.5, 3.0, 3.0, 200)
     assert (made.fitting(2), made.fitting(4)) == (200, 100)
     alone = Made(6.0, 400, 250, views=1)
-    assert (alone.kept, alone.always, alone.kept_bytes, alone.fitting(2)) == (0.0, 6.0, 0, 200)
+    assert (alone.kept, alone.always, alone.cached_bytes, alone.fitting(2)) == (0.0, 6.0, 0, 200)
 
 
 def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
