@@ -159,7 +159,7 @@ def make_loss(precision: str) -> SosLoss:
     """Return the loss of VGG19 with the memory budget of a job on the device."""
     dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
     network = FeatureNetwork(shapes_of("vgg19"), dtype=dtype, device="meta", tf32=precision == "tf32")
-    return SosLoss(network, memory=memory_for("activations", memory_limit()))
+    return SosLoss(network, memory=memory_for("activations", int(memory_limit())))
 
 
 def memory_limit() -> float:
@@ -345,7 +345,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
 
 def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     """Return the fractions of views whose content features, intersections and frozen colors fit the caches."""
-    views = memory_for("views", memory_limit())
+    views = memory_for("views", int(memory_limit()))
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
     count = loss.scale_count(*job.size)
     size = (job.size[0] >> count - 1, job.size[1] >> count - 1) if coarse else job.size

@@ -8,7 +8,7 @@ from torch import Tensor
 from benchmarks.gpu.clock import forget_peak, peak_bytes, seconds, waited_seconds
 from benchmarks.gpu.inputs import surface_scene, views
 from benchmarks.gpu.part import Findings, Sizes, device
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
@@ -36,9 +36,9 @@ def run(sizes: Sizes, found: Findings) -> None:
 def _anew(scene: Scene, cameras: list[Camera], place: str, repeats: int, found: Findings) -> None:
     """Measure survey, intersections, forward and backward pass without cached weights."""
     rasterizer = TritonRasterizer(scene, device=device(), max_intersection_bytes=0)  # caches the last view only
-    survey(scene, cameras, rasterizer)  # compilation
-    looked = waited_seconds(lambda: survey(scene, cameras, rasterizer), device())
-    found.add(f"{place}/survey_seconds_a_view", looked / len(cameras))
+    survey_views(scene, cameras, rasterizer)  # compilation
+    surveying = waited_seconds(lambda: survey_views(scene, cameras, rasterizer), device())
+    found.add(f"{place}/survey_seconds_a_view", surveying / len(cameras))
     both = seconds(lambda: [rasterizer.intersections(camera) for camera in cameras], device(), repeats)
     isects = rasterizer.intersections(cameras[0])
     found.add(f"{place}/lists_seconds", both / len(cameras))

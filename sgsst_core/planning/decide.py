@@ -125,19 +125,19 @@ class _Deciding:
 
     def _without_decisions(self) -> Plan:
         probe, settings = self.probe, self.settings
-        looked = probe.survey
-        decided = optimized_gaussians(looked, settings)
+        survey = probe.survey
+        decided = optimized_gaussians(survey, settings)
         optimized = decided if probe.kept is None else decided & ~probe.kept
         weighted = settings.position_weights == "on" or (
-            settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
+            settings.position_weights == "auto" and survey.uncovered_share > UNCOVERED_SHARE
         )
-        scan = is_scan(looked, weighted=weighted)
+        scan = is_scan(survey, weighted=weighted)
         several = any(len(self.tiling.scales(size)) > 1 for size in probe.sizes)
         steps_coarse = settings.steps_coarse if several or settings.preset == "paper" else 0
         views = len(probe.distinct)
         form = self._kept_form((steps_coarse + settings.steps_sos) * settings.views_per_step / views)
         return Plan(
-            survey=looked,
+            survey=survey,
             optimized=optimized,
             seen=rendered_gaussians(decided, settings),
             covered=probe.distinct,

@@ -79,8 +79,8 @@ class PeakMemory:
 
     def _visited(self, steps: int) -> float:
         """Return the fraction of views visited by this many steps and by the loss before and after."""
-        looked_at = self.loss_views if self.level is not None else 0
-        return min((steps * self.settings.views_per_step + looked_at) / len(self.plan.covered), 1.0)
+        evaluated = self.loss_views if self.level is not None else 0
+        return min((steps * self.settings.views_per_step + evaluated) / len(self.plan.covered), 1.0)
 
     @property
     def _all_visited(self) -> float:

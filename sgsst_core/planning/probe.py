@@ -287,14 +287,14 @@ def make_network(weights: BackboneWeights, settings: Settings, precision: Precis
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
 
-def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps: int = 0) -> Probe:
+def measure(planning_context: PlanningContext, survey: Survey, link: Link, maps: int = 0) -> Probe:
     """Measure everything that decisions depend on.
 
     One rank does this for all, because timings differ between ranks.
 
     Args:
         workshop: Planning context.
-        looked: Survey of the views.
+        survey: Survey of the views.
         link: Connection between ranks.
         maps: Number of regions whose maps are rendered in each view.
 
@@ -302,20 +302,20 @@ def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps:
         SettingsError: If pruning would leave no Gaussian.
     """
     scene, cameras, settings = planning_context.scene, planning_context.cameras, planning_context.settings
-    seen = rendered_gaussians(optimized_gaussians(looked, settings), settings)
-    distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
+    seen = rendered_gaussians(optimized_gaussians(survey, settings), settings)
+    distinct = distinct_views(scene, cameras, survey.covered, survey.total_blend_weights, settings.similar_views)
     network = _network_facts(planning_context, cameras[distinct[0]], maps)
     launches = _launch_cost(planning_context, [cameras[index] for index in distinct])
     budget = memory_for("rasterizer", planning_context.machine.memory)
     raster = _raster_cost(planning_context, [cameras[index] for index in distinct], budget)
-    pruned = pruned_gaussians(looked, seen)
+    pruned = pruned_gaussians(survey, seen)
     error = pruned_image_error(~seen, cameras, distinct, planning_context.rasterizer) if pruned.any() else None
     used_degree = scene.used_degree(seen)
     held_degree = 0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree
     return Probe(
         SceneFacts(len(scene), planning_context.sh_degree, used_degree, held_degree),
         tuple((camera.height, camera.width) for camera in cameras),
-        looked,
+        survey,
         tuple(distinct),
         network,
         planning_context.rasterizer.name,

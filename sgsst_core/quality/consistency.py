@@ -134,7 +134,7 @@ def consistency(
     # Pairs are visited chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...). Each pair shares a view with the one
     # before it, so every view is rendered once and only two are in memory, whatever the gap.
     for i, j in sorted(view_pairs(len(cameras), gap, at_most), key=lambda pair: (pair[0] % gap, pair[0])):
-        views = {k: views.get(k) or _look(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
+        views = {k: views.get(k) or _image_and_depth(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
         (image, depth), (other, other_depth) = views[i], views[j]
         warped, valid = warp(other, other_depth, cameras[j], depth, cameras[i])
         results.append(compare(i, j, image, warped, valid, lpips))
@@ -345,7 +345,7 @@ def compare(
     return PairConsistency(first, second, compared, rmse, distance)
 
 
-def _look(image: Tensor, camera: Camera, rasterizer: Rasterizer, scene: Scene) -> tuple[Tensor, DepthMap]:
+def _image_and_depth(image: Tensor, camera: Camera, rasterizer: Rasterizer, scene: Scene) -> tuple[Tensor, DepthMap]:
     """Return the image and the depth map of a view."""
     return shown(image, camera, rasterizer.device), expected_depth(scene, camera, rasterizer)
 

@@ -136,7 +136,7 @@ class _Refining:
 
     def run(self) -> Refinement:
         """Run the refinement."""
-        covered = self._look()
+        covered = self._survey()
         count = len(self._scene)
         nothing = Refinement(torch.ones((count, 3), dtype=torch.uint8), 0, count)
         if not covered:
@@ -177,7 +177,7 @@ class _Refining:
             pieces = self._collectives.broadcast(partial(self._without_the_worst, pieces, change))
         return torch.ones_like(pieces), None
 
-    def _look(self) -> list[int]:
+    def _survey(self) -> list[int]:
         """Survey every view, and return those that see anything."""
         collectives, cameras = self._collectives, self._planning_context.cameras
         covered = []

@@ -16,7 +16,7 @@ from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import equip, measure
 from sgsst_core.planning.ranks_model import Link
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cached_weights import Precision
@@ -223,7 +223,9 @@ VIEWS = cameras(2, 32, 24)
 def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) -> None:
     scene = ball(60)
     planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
-    found = measure(planning_context, survey(scene, VIEWS, planning_context.rasterizer), Link(float("inf"), 0.0)).raster
+    found = measure(
+        planning_context, survey_views(scene, VIEWS, planning_context.rasterizer), Link(float("inf"), 0.0)
+    ).raster
     planned: dict[Precision, int | None] = {"float32": found.bytes, "half": found.half_bytes}
     for precision, size in planned.items():
         cached = CachedRasterizer(scene, precision=precision, uncached=planning_context.rasterizer)  # type: ignore[arg-type]
