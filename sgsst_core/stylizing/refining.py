@@ -150,10 +150,12 @@ class _Refining:
         fitted = spread_evenly(covered, GRADIENT_VIEWS)
         kept, change = self._as_far_as_the_picture_stays(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
         counts = piece_counts(kept)
-        cut = int((counts > 1).sum())
+        parents = int((counts > 1).sum())
         if change is None:
             return replace(nothing, taken_back=chosen)
-        return Refinement(kept, cut, int(counts.sum()), size, change.psnr, change.lowest, chosen - cut, change.sh_dc)
+        return Refinement(
+            kept, parents, int(counts.sum()), size, change.psnr, change.lowest, chosen - parents, change.sh_dc
+        )
 
     def _may_be_split(self) -> Tensor:
         """Return the mask [N] bool of Gaussians that may be split."""
@@ -228,20 +230,20 @@ class _Refining:
         """Return the effect of pieces [N, 3] on the unstylized image of some views, with colors fitted to others."""
         scene, name = split(self._scene, pieces), self._rasterizer.name
         options = rasterizer_options(name, self._settings, self._planning_context.machine.memory)
-        cut = make_rasterizer(name, scene, **options)
-        scene = self._fit(scene, cut, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
+        rasterizer = make_rasterizer(name, scene, **options)
+        scene = self._fit(scene, rasterizer, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
         squared = torch.zeros(len(self._scene), dtype=torch.float64)
         errors: dict[int, float] = {}
         for index in self._own(views):
             camera = self._planning_context.cameras[index]
             before = render(self._scene, self._rasterizer, camera).clamp(0, 1)
-            change = (render(scene, cut, camera).clamp(0, 1) - before).square()
+            change = (render(scene, rasterizer, camera).clamp(0, 1) - before).square()
             errors[index] = float(change.mean(dtype=torch.float64))
             squared += self._rasterizer.color_gradient(change, camera).double().sum(dim=1).cpu()
         every = [error for part in self._collectives.all_gather(errors) for error in part.values()]
         return _Change(psnr(sum(every) / len(every)), psnr(max(every)), scene.sh_dc, self._sum(squared))
 
-    def _fit(self, scene: Scene, cut: Rasterizer, children: Tensor, views: Sequence[int]) -> Scene:
+    def _fit(self, scene: Scene, rasterizer: Rasterizer, children: Tensor, views: Sequence[int]) -> Scene:
         """Fit the colors of children [M] bool in a split scene so that views look as before.
 
         Images are linear in colors. Each step adds to every child the mean error of its pixels, weighted by blend
@@ -253,9 +255,9 @@ class _Refining:
             lacks = torch.zeros((len(scene), 4), dtype=torch.float64, device=self._rasterizer.device)
             for index in self._own(views):
                 camera = self._planning_context.cameras[index]
-                missing = render(self._scene, self._rasterizer, camera) - render(scene, cut, camera)
-                lacks[:, :3] += cut.color_gradient(missing, camera)
-                lacks[:, 3] += cut.survey(camera)[1]
+                missing = render(self._scene, self._rasterizer, camera) - render(scene, rasterizer, camera)
+                lacks[:, :3] += rasterizer.color_gradient(missing, camera)
+                lacks[:, 3] += rasterizer.survey(camera)[1]
             lacks = self._collectives.all_reduce(lacks)
             step = lacks[:, :3] / lacks[:, 3:].clamp_min(1.0) / SH_C0
             more = torch.where(children[:, None], step, 0.0).to("cpu", torch.float32)
@@ -264,11 +266,11 @@ class _Refining:
 
     def _without_the_worst(self, pieces: Tensor, change: _Change) -> Tensor:
         """Restore the Gaussians under which the image changes most, up to a fraction of the total change."""
-        cut = (piece_counts(pieces) > 1).nonzero()[:, 0]
-        density = change.squared[cut] / self._footprints.weights[cut].clamp_min(1.0)
+        parents = (piece_counts(pieces) > 1).nonzero()[:, 0]
+        density = change.squared[parents] / self._footprints.weights[parents].clamp_min(1.0)
         order = torch.argsort(density, descending=True, stable=True)
-        summed = change.squared[cut][order].cumsum(0)
-        worst = cut[order[: int((summed < _TAKEN_BACK * summed[-1]).sum()) + 1]]
+        summed = change.squared[parents][order].cumsum(0)
+        worst = parents[order[: int((summed < _TAKEN_BACK * summed[-1]).sum()) + 1]]
         fewer = pieces.clone()
         fewer[worst] = 1
         return fewer
