@@ -30,7 +30,7 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 
 def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camera: Camera, scale: int) -> None:
@@ -43,7 +43,7 @@ def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camer
 
 def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str, Any]:
     """Return the fastest seconds of each method, the cost of the operator, and the ratios, on one view."""
-    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
+    colors = scene_colors(scene, camera)
     gradient = torch.randn(camera.height >> scale, camera.width >> scale, 3, generator=torch.Generator().manual_seed(1))
     cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
     coarse = CoarseRasterizer(cpu, scale)
@@ -73,11 +73,11 @@ def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str,
         "scale": scale,
         "seconds": {name: round(value, 5) for name, value in fastest.items()},
         "seconds_build": round(min(builds), 5),
-        "bytes_kept": {"cached": cached.kept_bytes, "coarse": coarse.kept_bytes},
+        "bytes_kept": {"cached": cached.cached_bytes, "coarse": coarse.cached_bytes},
         "ratio_cpu_to_coarse": round(fastest["cpu"] / fastest["coarse"], 2),
         "ratio_cached_to_coarse": round(fastest["cached"] / fastest["coarse"], 2),
         "ratio_build_to_cpu": round(min(builds) / fastest["cpu"], 2),
-        "ratio_bytes_cached_to_coarse": round(cached.kept_bytes / coarse.kept_bytes, 2),
+        "ratio_bytes_cached_to_coarse": round(cached.cached_bytes / coarse.cached_bytes, 2),
     }
 
 

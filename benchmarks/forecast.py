@@ -19,7 +19,7 @@ import torch
 
 from benchmarks.machine import write_result
 from benchmarks.work import Counted, Work, meta
-from sgsst_core.budget import GPU_SHARE, MEMORY_SHARES
+from sgsst_core.budget import GPU_SHARE, memory_for
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.features.fused_statistics import SPAN_VALUES, TILE, matrix_precision
 from sgsst_core.features.network_sources import BLOCKS
@@ -159,7 +159,7 @@ def make_loss(precision: str) -> SosLoss:
     """Return the loss of VGG19 with the memory budget of a job on the device."""
     dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
     network = FeatureNetwork(shapes_of("vgg19"), dtype=dtype, device="meta", tf32=precision == "tf32")
-    return SosLoss(network, memory=int(memory_limit() * MEMORY_SHARES["activations"]))
+    return SosLoss(network, memory=memory_for("activations", int(memory_limit())))
 
 
 def memory_limit() -> float:
@@ -345,14 +345,14 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
 
 def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     """Return the fractions of views whose content features, intersections and frozen colors fit the caches."""
-    views = memory_limit() * MEMORY_SHARES["views"]
+    views = memory_for("views", int(memory_limit()))
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
     count = loss.scale_count(*job.size)
     size = (job.size[0] >> count - 1, job.size[1] >> count - 1) if coarse else job.size
     of_a_view = {
         "content": (views / 2, content_bytes([size], loss.tiling, cell)),
         "lists": (
-            rasterizer_options("triton", make_settings(), int(memory_limit()))["max_list_bytes"],
+            rasterizer_options("triton", make_settings(), int(memory_limit()))["max_intersection_bytes"],
             LIST_BYTES[0] * job.visible + LIST_BYTES[1] * job.pairs,
         ),
         "colors": (views / 4, 12.0 * job.gaussians),

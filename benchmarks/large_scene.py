@@ -32,7 +32,7 @@ from sgsst_core.planning.pictures import soft_picture
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
-from sgsst_core.rasterizer.raster_lists import build_raster_lists, lists_of_subset
+from sgsst_core.rasterizer.tile_intersections import build_tile_intersections, intersections_of_subset
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
@@ -96,19 +96,20 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     CpuRasterizer(scene.subset(torch.arange(100))).survey(cameras[0])  # compiles
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    alone = middle(lambda camera: build_raster_lists(scene, camera), cameras)
+    alone = middle(lambda camera: build_tile_intersections(scene, camera), cameras)
     torch.set_num_threads(threads)
-    lists = middle(lambda camera: build_raster_lists(scene, camera), cameras)
-    rasterizer = CpuRasterizer(scene, max_list_bytes=0)  # caches the last view only
+    isects = middle(lambda camera: build_tile_intersections(scene, camera), cameras)
+    rasterizer = CpuRasterizer(scene, max_intersection_bytes=0)  # caches the last view only
     places = torch.arange(len(scene), dtype=torch.int32)
     places[::8] = -1  # about as many as views do not see
     places[places >= 0] = torch.arange(int((places >= 0).sum()), dtype=torch.int32)
-    lists_of_subset(build_raster_lists(scene.subset(torch.arange(1)), cameras[0]), places[1:2].numpy())  # compiles
+    one = build_tile_intersections(scene.subset(torch.arange(1)), cameras[0])
+    intersections_of_subset(one, places[1:2].numpy())  # compiles
     found: dict[str, list[float]] = {"handed": [], "render": [], "gradient": [], "plain": [], "survey": []}
     colors = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(2))
     for camera in cameras:
-        whole = rasterizer.lists(camera)
-        found["handed"].append(timed(lambda whole=whole: lists_of_subset(whole, places.numpy())))  # type: ignore[misc]
+        whole = rasterizer.intersections(camera)
+        found["handed"].append(timed(lambda whole=whole: intersections_of_subset(whole, places.numpy())))  # type: ignore[misc]
         image = rasterizer.render(colors, camera)
         found["render"].append(timed(lambda camera=camera: rasterizer.render(colors, camera)))  # type: ignore[misc]
         gradient = timed(lambda image=image, camera=camera: rasterizer.color_gradient(image, camera))  # type: ignore[misc]
@@ -117,18 +118,18 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
         found["survey"].append(timed(lambda camera=camera: rasterizer.survey(camera)))  # type: ignore[misc]
     seconds = {f"{name}_seconds": statistics.median(values) for name, values in found.items()}
     return {
-        "lists_seconds": lists,
-        "ratio_lists_one_thread_to_all": alone / lists,
-        "ratio_lists_to_handed": lists / seconds["handed_seconds"],
+        "lists_seconds": isects,
+        "ratio_lists_one_thread_to_all": alone / isects,
+        "ratio_lists_to_handed": isects / seconds["handed_seconds"],
         **seconds,
         "ratio_plain_to_survey": seconds["plain_seconds"] / seconds["survey_seconds"],
-        "ratio_plain_view_to_surveyed": (alone + seconds["plain_seconds"]) / (lists + seconds["survey_seconds"]),
+        "ratio_plain_view_to_surveyed": (alone + seconds["plain_seconds"]) / (isects + seconds["survey_seconds"]),
     }
 
 
 def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """Time the neighbor search for unseen Gaussians, against one on a single core in file order."""
-    rasterizer = CpuRasterizer(scene, max_list_bytes=0)
+    rasterizer = CpuRasterizer(scene, max_intersection_bytes=0)
     weights = torch.zeros(len(scene), dtype=torch.float64)
     for camera in cameras:
         weights += rasterizer.survey(camera)[1].double()

@@ -30,7 +30,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.orbit import orbit
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 WIDTH, HEIGHT = 1280, 720
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scenes"
@@ -84,12 +84,12 @@ def both(rasterizer: Rasterizer, colors: Tensor, image_gradient: Tensor, camera:
 
 def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     """Return the fastest seconds of each rasterizer and the ratios between them, in turn on one view."""
-    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
+    colors = scene_colors(scene, camera)
     image_gradient = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
     threads = sorted({1, torch.get_num_threads()})
     cpu = CpuRasterizer(scene)
-    CpuRasterizer(scene).lists(camera)  # compilation
-    prepare = timed(lambda: cpu.lists(camera))
+    CpuRasterizer(scene).intersections(camera)  # compilation
+    prepare = timed(lambda: cpu.intersections(camera))
     caches = {p: CachedRasterizer(scene, precision=p) for p in ("float32", "half")}
     for cache in caches.values():
         cache.render(colors, camera)
@@ -113,12 +113,12 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     best = {name: min(runs.values()) for name, runs in fastest.items()}
     return {
         "gaussians": len(scene),
-        "intersections": len(cpu.lists(camera).ranks),
+        "intersections": len(cpu.intersections(camera).ranks),
         "seconds": {name: round(value, 5) for name, value in best.items()},
         "seconds_by_threads": {name: {n: round(v, 5) for n, v in runs.items()} for name, runs in fastest.items()},
         "seconds_prepare": round(prepare, 5),
         "seconds_keep_weights": round(keep, 5),
-        "bytes_kept": {name: cache.kept_bytes for name, cache in caches.items()},
+        "bytes_kept": {name: cache.cached_bytes for name, cache in caches.items()},
         "ratio_reference_to_cpu": round(best["reference"] / best["cpu"], 1),
         "ratio_cpu_to_cached_float32": round(best["cpu"] / best["cached float32"], 2),
         "ratio_cpu_to_cached_half": round(best["cpu"] / best["cached half"], 2),

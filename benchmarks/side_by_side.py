@@ -16,7 +16,7 @@ from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 _LABEL = 22
 
@@ -50,7 +50,7 @@ def _column(label: str, scene: Scene, cameras: list[Camera]) -> Image.Image:
     column = Image.new("RGB", (width, _LABEL + height * len(cameras)), "white")
     ImageDraw.Draw(column).text((4, 2), label, "black", ImageFont.load_default(size=_LABEL - 6))
     for row, camera in enumerate(cameras):
-        colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
+        colors = scene_colors(scene, camera)
         values = (rasterizer.render(colors, camera).clamp(0, 1) * 255).round().to(torch.uint8)
         column.paste(Image.fromarray(values.numpy()), (0, _LABEL + row * height))
     return column

@@ -28,7 +28,7 @@ from sgsst_core.planning.decide import decide
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.planning.probe import Probe, equip, measure
 from sgsst_core.planning.ranks_model import probe_link
-from sgsst_core.planning.survey import Survey, survey
+from sgsst_core.planning.survey import Survey, survey_views
 from sgsst_core.scene.camera import fit_cameras
 from sgsst_core.settings import Settings, make_settings
 
@@ -44,8 +44,8 @@ def measured(settings: Settings) -> Probe:
         scene, cameras = read_scene(files.ply).scene, read_cameras(files.cameras)
     fitted = fit_cameras(cameras, settings)
     planning_context = equip(scene, fitted, settings, load_network_weights("auto"), ALONE)
-    looked = survey(planning_context.scene, fitted, planning_context.rasterizer, ALONE)
-    return measure(planning_context, looked, probe_link(ALONE, planning_context.network.device))
+    survey = survey_views(planning_context.scene, fitted, planning_context.rasterizer, ALONE)
+    return measure(planning_context, survey, probe_link(ALONE, planning_context.network.device))
 
 
 def changed(probe: Probe, gaussians: int, width: int, views: int) -> Probe:
@@ -78,7 +78,7 @@ def _raster(cost: RasterCost, pixels: float, gaussians: float, views: float) -> 
         half_bytes=None if cost.half_bytes is None else int(cost.half_bytes * pixels * views),
         keeping_seconds=None if cost.keeping_seconds is None else cost.keeping_seconds * seconds,
         first_seconds=cost.first_seconds * seconds,
-        lists_bytes=int(cost.lists_bytes * seconds),
+        intersection_bytes=int(cost.intersection_bytes * seconds),
     )
 
 

@@ -25,7 +25,7 @@ from sgsst_core.files.ply import read_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, between, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 QUALITIES = (85, 75, 65, 55, 45, 35, 25)
 _LINE = 2  # width in pixels
@@ -63,8 +63,7 @@ def _painter(scene: Scene, gray: float) -> Callable[[Camera], torch.Tensor]:
     rasterizer = make_rasterizer("cpu", scene, background=(gray,) * 3)
 
     def picture(camera: Camera) -> torch.Tensor:
-        rest = rest_colors(scene.sh_rest, scene.means, camera)
-        return (rasterizer.render(view_colors(scene.sh_dc, rest), camera).clamp(0, 1) * 255).round().to(torch.uint8)
+        return (rasterizer.render(scene_colors(scene, camera), camera).clamp(0, 1) * 255).round().to(torch.uint8)
 
     return picture
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Hashable
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import psutil
 import torch
@@ -17,12 +18,27 @@ V = TypeVar("V")
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
 #: Fraction of the total memory of a GPU, which a job has to itself.
 GPU_SHARE = 0.7
-#: Fractions of the memory limit: activations of one iteration, view targets and colors, and the rasterizer's tile
-#: intersections or cached weights.
-MEMORY_SHARES = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
-#: If blend weights are cached, this divisor of the memory limit gives the budget for tile intersections. It is taken
-#: from the fraction of the views. Views whose weights do not fit are rendered from tile intersections.
-LISTS_BESIDE_WEIGHTS = 16
+#: Fractions of the memory limit by use: see `memory_for`.
+_FRACTIONS = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
+
+
+def memory_for(use: Literal["activations", "views", "rasterizer"], memory: int) -> int:
+    """Return the part of a rank's memory limit in bytes that one use may take.
+
+    Args:
+        use: Activations of one iteration; view targets and colors; or the rasterizer's tile intersections and cached
+            weights.
+        memory: Memory limit of the rank in bytes.
+    """
+    return int(memory * _FRACTIONS[use])
+
+
+def least_intersection_memory(memory: int) -> int:
+    """Return the size in bytes, as part of a rank's memory limit, left for tile intersections next to cached weights.
+
+    Views whose weights do not fit are rendered from them. The memory is taken from that for views.
+    """
+    return memory // 16
 
 
 def measuring_memory(memory: int) -> int:
@@ -56,21 +72,27 @@ def device_peak(device: torch.device | str) -> int | None:
     return torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
 
 
-class Shelf(Generic[K, V]):
+class Cache(Generic[K, V]):
     """Cache of values by key within a number of bytes; what does not fit is recomputed at each use.
 
     Nothing is ever evicted: views are visited in rounds, so evicting one would only trade it for another.
 
     Args:
-        capacity: Memory budget in bytes.
-        size: Function that returns the size of a value in bytes; None if every call of `get` passes the size.
+        capacity: Memory budget in bytes; None for no limit.
+        size: Function that returns the size of a value in bytes; None if every call passes the size.
+
+    Attributes:
+        values: Cached values by key, oldest first.
+        used: Size of all cached values in bytes.
     """
 
-    def __init__(self, capacity: int, size: Callable[[V], int] | None = None) -> None:
+    def __init__(self, capacity: int | None, size: Callable[[V], int] | None = None) -> None:
         self.used = 0
         self._capacity = capacity
         self._size = size
-        self._kept: dict[K, V] = {}
+        self.values: dict[K, V] = {}
+        self._decided: set[K] = set()
+        self._lock = threading.Lock()
 
     def get(self, key: K, make: Callable[[], V], size: int | None = None) -> V:
         """Return the value of a key, from the cache or computed, and cache it if it fits.
@@ -80,26 +102,45 @@ class Shelf(Generic[K, V]):
             make: Function that computes the value.
             size: Size of the value in bytes; None to use the cache's own `size` function.
         """
-        if key in self._kept:
-            return self._kept[key]
+        if key in self.values:
+            return self.values[key]
         value = make()
         if size is None:
             assert self._size is not None
             size = self._size(value)
-        if self.used + size <= self._capacity:
-            self._kept[key] = value
+        if self._fits(size):
+            self.values[key] = value
             self.used += size
         return value
 
+    def add(self, key: K, count: Callable[[], tuple[int, Callable[[], V]]]) -> None:
+        """Compute and cache the value of a key if it fits, which is decided at the first call for this key.
+
+        Args:
+            key: Key of the value.
+            count: Function that returns the size of the value in bytes and the function that computes it.
+        """
+        with self._lock:
+            if key not in self._decided:
+                size, make = count()
+                if self._fits(size):
+                    self.values[key] = make()
+                    self.used += size
+                self._decided.add(key)
+
     def __contains__(self, key: K) -> bool:
         """Return whether the value of a key is cached."""
-        return key in self._kept
+        return key in self.values
 
     def holds(self, key: K, size: int) -> bool:
         """Return whether the value of a key is cached, or would be because it has at most as many bytes as are free."""
-        return key in self._kept or self.used + size <= self._capacity
+        return key in self.values or self._fits(size)
 
     def clear(self) -> None:
         """Remove all values."""
-        self._kept.clear()
+        self.values.clear()
+        self._decided.clear()
         self.used = 0
+
+    def _fits(self, size: int) -> bool:
+        return self._capacity is None or self.used + size <= self._capacity

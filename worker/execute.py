@@ -209,8 +209,8 @@ def _write_reports(
     try:
         if job.request.colors and _only_colors_change(job):
             write_colors(outputs.colors, stylizer.stylized())
-        near, looked = stylizer.settings.near, stylizer.plan.survey
-        findings = findings_of(job.scene_file, stylizer.views.cameras, stylizer.style, near=near, looked=looked)
+        near, survey = stylizer.settings.near, stylizer.plan.survey
+        findings = findings_of(job.scene_file, stylizer.views.cameras, stylizer.style, near=near, survey=survey)
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
         sent = sent_json(stylizer.history)

@@ -101,7 +101,7 @@ def prepare(
             settings,
             weights=inputs.weights,
             collectives=collectives,
-            looked=resumed.plan.survey if resumed else None,
+            survey=resumed.plan.survey if resumed else None,
             measured=True,
             show=show_planning,
             timer=timer,

@@ -12,7 +12,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 #: Relative distance from a cutoff within which float32 may decide otherwise, and bounds for images and for gradients.
 #: gsplat projects in float32 and computes exponentials with the fast intrinsic.
@@ -46,7 +46,7 @@ def compare(
     alpha_max = getattr(fast, "alpha_max", None)
     options = {} if alpha_max is None else {"alpha_max": alpha_max}
     reference = ReferenceRasterizer(scene, background=BACKGROUND, **options)
-    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
+    colors = scene_colors(scene, camera)
     pixels = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     band = reference.near_cutoff(camera, close)
     pixels[band] = 0

@@ -8,7 +8,7 @@ from torch import Tensor
 from benchmarks.gpu.clock import forget_peak, peak_bytes, seconds, waited_seconds
 from benchmarks.gpu.inputs import surface_scene, views
 from benchmarks.gpu.part import Findings, Sizes, device
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
@@ -35,16 +35,16 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 def _anew(scene: Scene, cameras: list[Camera], place: str, repeats: int, found: Findings) -> None:
     """Measure survey, intersections, forward and backward pass without cached weights."""
-    rasterizer = TritonRasterizer(scene, device=device(), max_list_bytes=0)  # caches the last view only
-    survey(scene, cameras, rasterizer)  # compilation
-    looked = waited_seconds(lambda: survey(scene, cameras, rasterizer), device())
-    found.add(f"{place}/survey_seconds_a_view", looked / len(cameras))
-    both = seconds(lambda: [rasterizer.lists(camera) for camera in cameras], device(), repeats)
-    lists = rasterizer.lists(cameras[0])
+    rasterizer = TritonRasterizer(scene, device=device(), max_intersection_bytes=0)  # caches the last view only
+    survey_views(scene, cameras, rasterizer)  # compilation
+    surveying = waited_seconds(lambda: survey_views(scene, cameras, rasterizer), device())
+    found.add(f"{place}/survey_seconds_a_view", surveying / len(cameras))
+    both = seconds(lambda: [rasterizer.intersections(camera) for camera in cameras], device(), repeats)
+    isects = rasterizer.intersections(cameras[0])
     found.add(f"{place}/lists_seconds", both / len(cameras))
-    found.add(f"{place}/lists_bytes", lists.nbytes)
-    found.add(f"{place}/visible", len(lists.gaussians))
-    found.add(f"{place}/pairs", len(lists.ranks))
+    found.add(f"{place}/lists_bytes", isects.nbytes)
+    found.add(f"{place}/visible", len(isects.gaussians))
+    found.add(f"{place}/pairs", len(isects.ranks))
     _passes(rasterizer, cameras[0], place, repeats, found)
 
 
@@ -78,6 +78,6 @@ def _kept(scene: Scene, camera: Camera, place: str, repeats: int, found: Finding
     colors, _ = _operands(rasterizer, camera)
     first = waited_seconds(lambda: rasterizer.render(colors, camera), device())
     found.add(f"{place}/first_render_seconds", first)
-    found.add(f"{place}/bytes", rasterizer.kept_bytes)  # type: ignore[attr-defined]  # `cached` counts them
+    found.add(f"{place}/bytes", rasterizer.cached_bytes)  # type: ignore[attr-defined]  # `cached` counts them
     _passes(rasterizer, camera, place, repeats, found)
     found.add(f"{place}/device_peak_bytes", peak_bytes(device()))

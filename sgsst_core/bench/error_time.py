@@ -1,7 +1,7 @@
 """Error against run time: variants of one job with the same time budget, measured by the same exact loss.
 
 Every variant gets the same seconds of optimization. At the same moments its colors are evaluated on all views by the
-float32 loss of all scales (`exact.ExactTwin`), which is the paper's loss, whatever the variant itself optimizes.
+float32 loss of all scales (`exact.Float32Reference`), which is the paper's loss, whatever the variant itself optimizes.
 Evaluation does not count as run time. Neither does preparing each view once, which would dominate a short budget; its
 time is reported separately. All variants are in memory at the same time. A variant on the Pareto front reaches its
 error sooner than every other one.
@@ -24,7 +24,7 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.report.charts import RELATIVE_LOSS, STYLE, draw_legend, draw_points, scale_name, set_log_x, set_log_y
 from sgsst_core.report.history import X_MARGIN, Floats, column, joined, log_limits
 from sgsst_core.report.palette import INK, color_of
@@ -206,7 +206,7 @@ def error_time(
     base = make_settings("standard", **settings)
     share = (base.memory_limit or default_memory_limit()) // (len(variants) + 1)
     base = base.model_copy(update={"memory_limit": share})
-    exact = ExactTwin(Stylizer.planned(scene, cameras, style, base, weights=weights), style_loss="sos")
+    exact = Float32Reference(Stylizer.planned(scene, cameras, style, base, weights=weights), style_loss="sos")
     views = exact.views.covered
     start = exact.evaluate(views, scene.sh_dc)
     running = [_begin(variant, seconds, (scene, cameras, style), base, weights) for variant in variants]

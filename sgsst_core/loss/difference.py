@@ -33,3 +33,11 @@ class Difference:
             float(error / length) if length > 0 else float(error > 0),
             product / lengths if lengths > 0 else float(not error > 0),
         )
+
+
+def psnr(error: float) -> float:
+    """Return the PSNR in dB for a mean squared error of values in 0..1.
+
+    Errors are at least 1e-14, the float32 resolution.
+    """
+    return -10 * math.log10(max(error, 1e-14))

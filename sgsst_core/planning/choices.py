@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import memory_for
 from sgsst_core.errors import SettingsError
 from sgsst_core.loss.style_losses import has_statistics
 from sgsst_core.planning.plan import Device
@@ -29,24 +29,24 @@ SCAN_SHARE = 0.2
 SCAN_BACKGROUND: PlannedBackground = "palette"
 
 
-def optimized_gaussians(looked: Survey, settings: Settings) -> Tensor:
+def optimized_gaussians(survey: Survey, settings: Settings) -> Tensor:
     """Return the mask [N] bool of Gaussians whose colors are determined by the views.
 
     Raises:
         SettingsError: If pruning would leave none.
     """
-    optimized = looked.total_blend_weights > settings.prune_weight
+    optimized = survey.total_blend_weights > settings.prune_weight
     if not optimized.any():
         raise SettingsError(
             f"--prune-weight {settings.prune_weight:g} would leave out every Gaussian: the largest total blend weight "
-            f"is {float(looked.total_blend_weights.max()):.3g}. Give a smaller one."
+            f"is {float(survey.total_blend_weights.max()):.3g}. Give a smaller one."
         )
     return optimized
 
 
-def is_scan(looked: Survey, *, weighted: bool) -> bool:
+def is_scan(survey: Survey, *, weighted: bool) -> bool:
     """Return whether views show an object without background, whose statistics exclude the background."""
-    return weighted and looked.uncovered_share > SCAN_SHARE
+    return weighted and survey.uncovered_share > SCAN_SHARE
 
 
 def starts_warm(settings: Settings, *, scan: bool) -> bool:
@@ -82,9 +82,9 @@ def rendered_gaussians(optimized: Tensor, settings: Settings) -> Tensor:
     return torch.ones_like(optimized) if everything else optimized
 
 
-def pruned_gaussians(looked: Survey, seen: Tensor) -> Tensor:
+def pruned_gaussians(survey: Survey, seen: Tensor) -> Tensor:
     """Return the mask [N] bool of Gaussians that are visible in a view but not rendered."""
-    return ~seen & (looked.total_blend_weights > 0)
+    return ~seen & (survey.total_blend_weights > 0)
 
 
 def precision_of(asked: Precision, ratio: float | None) -> Precision:
@@ -118,7 +118,7 @@ def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, 
     """
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
     if name in ("cpu", "triton"):
-        options["max_list_bytes"] = int(memory * MEMORY_SHARES["rasterizer"]) // (2 if name == "triton" else 1)
+        options["max_intersection_bytes"] = memory_for("rasterizer", memory) // (2 if name == "triton" else 1)
     return options
 
 

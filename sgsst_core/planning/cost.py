@@ -58,7 +58,7 @@ class RasterCost:
         half_bytes: Size in bytes of the same in half precision.
         keeping_seconds: Time in seconds to compute a view's cached weights; None if not measured, on the CPU.
         first_seconds: Additional time in seconds of a view's first render, which computes its tile intersections.
-        lists_bytes: Mean size in bytes of a view's tile intersections; 0 if unknown.
+        intersection_bytes: Mean size in bytes of a view's tile intersections; 0 if unknown.
         colors_seconds: Time in seconds for the contribution of spherical harmonics to the colors of a view.
     """
 
@@ -68,7 +68,7 @@ class RasterCost:
     half_bytes: int | None = None
     keeping_seconds: float | None = None
     first_seconds: float = 0.0
-    lists_bytes: int = 0
+    intersection_bytes: int = 0
     colors_seconds: float = 0.0
 
     @property

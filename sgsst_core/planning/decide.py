@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import memory_for
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.tiling import Tiling
@@ -71,8 +71,8 @@ class _Deciding:
         self.measured = measured
         memory = probe.machine.memory
         network = probe.network
-        self.activations = int(memory * MEMORY_SHARES["activations"])
-        self.budget = int(memory * MEMORY_SHARES["rasterizer"])
+        self.activations = memory_for("activations", memory)
+        self.budget = memory_for("rasterizer", memory)
         self.tiling = Tiling(
             network.halo,
             self.activations / network.held_bytes,
@@ -125,19 +125,19 @@ class _Deciding:
 
     def _without_decisions(self) -> Plan:
         probe, settings = self.probe, self.settings
-        looked = probe.survey
-        decided = optimized_gaussians(looked, settings)
+        survey = probe.survey
+        decided = optimized_gaussians(survey, settings)
         optimized = decided if probe.kept is None else decided & ~probe.kept
         weighted = settings.position_weights == "on" or (
-            settings.position_weights == "auto" and looked.uncovered_share > UNCOVERED_SHARE
+            settings.position_weights == "auto" and survey.uncovered_share > UNCOVERED_SHARE
         )
-        scan = is_scan(looked, weighted=weighted)
+        scan = is_scan(survey, weighted=weighted)
         several = any(len(self.tiling.scales(size)) > 1 for size in probe.sizes)
         steps_coarse = settings.steps_coarse if several or settings.preset == "paper" else 0
         views = len(probe.distinct)
         form = self._kept_form((steps_coarse + settings.steps_sos) * settings.views_per_step / views)
         return Plan(
-            survey=looked,
+            survey=survey,
             optimized=optimized,
             seen=rendered_gaussians(decided, settings),
             covered=probe.distinct,

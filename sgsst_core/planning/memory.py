@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, measuring_memory
+from sgsst_core.budget import least_intersection_memory, measuring_memory, memory_for
 from sgsst_core.planning.cost import OPTIMIZER_BYTES, STEP_BYTES, gaussian_bytes, image_bytes
 from sgsst_core.planning.measuring import LEVELS, RENDERED
 from sgsst_core.planning.plan import Plan
@@ -64,10 +64,12 @@ class PeakMemory:
             return probe.process_bytes + measuring, probe.device_bytes + computing + gaussians * OPTIMIZER_BYTES
         everything = probe.scene.gaussians
         building = everything * BUILDING_BYTES
-        kept = self._scene() + self._lists_and_weights() + self._content() + self._colors() + self._novel_views()
+        kept = (
+            self._scene() + self._intersections_and_weights() + self._content() + self._colors() + self._novel_views()
+        )
         kept += gaussians * OPTIMIZER_BYTES + measuring
         searching = everything * SEARCH_BYTES if self._unseen_are_searched() else 0
-        rastering = gaussians * STEP_BYTES + int(SLOTS_SHARE * probe.raster.lists_bytes)
+        rastering = gaussians * STEP_BYTES + int(SLOTS_SHARE * probe.raster.intersection_bytes)
         passing = max(passing + self._exact_activations() + gaussians * COLOR_BYTES, rastering, searching)
         return probe.process_bytes + max(building, kept + passing), None
 
@@ -77,8 +79,8 @@ class PeakMemory:
 
     def _visited(self, steps: int) -> float:
         """Return the fraction of views visited by this many steps and by the loss before and after."""
-        looked_at = self.loss_views if self.level is not None else 0
-        return min((steps * self.settings.views_per_step + looked_at) / len(self.plan.covered), 1.0)
+        evaluated = self.loss_views if self.level is not None else 0
+        return min((steps * self.settings.views_per_step + evaluated) / len(self.plan.covered), 1.0)
 
     @property
     def _all_visited(self) -> float:
@@ -105,25 +107,25 @@ class PeakMemory:
         colors = self.visits.colors
         return int(min(self._all_visited * colors.bytes, colors.room))
 
-    def _lists_and_weights(self) -> int:
+    def _intersections_and_weights(self) -> int:
         """Return the size in bytes of weights and tile intersections, which share a budget.
 
         What the survey has already cached is not included.
         """
         memory, weights, visits = self.probe.machine.memory, self._weights(), self.visits
-        room = int(memory * MEMORY_SHARES["rasterizer"]) - weights
-        lists = visits.lists.bytes + self._other_lists()
+        room = memory_for("rasterizer", memory) - weights
+        intersections = visits.intersections.bytes + self._other_intersections()
         if visits.weights is not None:  # the tile intersections of a view are dropped once its weights are cached
-            room = max(room, memory // LISTS_BESIDE_WEIGHTS)
-            lists -= visits.weights.kept * self._all_visited * visits.lists.bytes
-        return max(int(min(lists, room)) + weights - visits.surveyed.kept_bytes, 0)
+            room = max(room, least_intersection_memory(memory))
+            intersections -= visits.weights.kept * self._all_visited * visits.intersections.bytes
+        return max(int(min(intersections, room)) + weights - visits.surveyed.cached_bytes, 0)
 
-    def _other_lists(self) -> int:
+    def _other_intersections(self) -> int:
         """Return the size in bytes of tile intersections for novel views, and for a reference with its own scene."""
         views = RENDERED * LEVELS[self.level].views if self.level is not None else 0
         if self.level is not None and self._pruned():
             views += self.loss_views
-        return views * self.probe.raster.lists_bytes
+        return views * self.probe.raster.intersection_bytes
 
     def _scene(self) -> int:
         """Return the size in bytes of partial copies of the scene, and of shapes for computing tile intersections."""
@@ -132,7 +134,7 @@ class PeakMemory:
         copies = 0
         if gaussians < everything:
             copies = gaussians * each - everything * SHAPE_BYTES
-            if self.visits.lists.kept < 1 or self.visits.weights is not None:
+            if self.visits.intersections.kept < 1 or self.visits.weights is not None:
                 copies += gaussians * SHAPE_BYTES
         if self.level is not None and self._pruned():
             copies += int((self.plan.survey.total_blend_weights > 0).sum()) * (each + SHAPE_BYTES)
@@ -160,7 +162,7 @@ class PeakMemory:
         """Return by how many bytes the reference's activations exceed the job's."""
         if self.level is None or not self._approximated():
             return 0
-        budget = int(self.probe.machine.memory * MEMORY_SHARES["activations"])
+        budget = memory_for("activations", self.probe.machine.memory)
         return max(min(int(self.activations * self._exact_size()), budget) - self.activations, 0)
 
     def _exact_size(self) -> float:

@@ -126,13 +126,13 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
     )
 
 
-def orbit_decisions(made: Orbit, cameras: Sequence[Camera], looked: Survey) -> list[Decision]:
+def orbit_decisions(made: Orbit, cameras: Sequence[Camera], survey: Survey) -> list[Decision]:
     """Return the plan's lines about an orbit.
 
     Args:
         made: The orbit.
         cameras: Its cameras at the sizes used for stylization.
-        looked: Survey of their views.
+        survey: Survey of their views.
     """
     decisions = [Decision("up", made.up.name, made.up.reason)]
     angles = _listed([f"{angle:g}" for angle in made.elevations])
@@ -149,8 +149,8 @@ def orbit_decisions(made: Orbit, cameras: Sequence[Camera], looked: Survey) -> l
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     shapes = f"{sizes[0][0]}x{sizes[0][1]}"
     shapes += f" to {sizes[-1][0]}x{sizes[-1][1]}, {len(sizes)} shapes" if len(sizes) > 1 else ""
-    if looked.uncovered is not None:
-        covered = [1 - share for share in looked.uncovered]
+    if survey.uncovered is not None:
+        covered = [1 - share for share in survey.uncovered]
         shown = f"the scene covers {sum(covered) / len(covered):.0%} of their pixels (at least {min(covered):.0%})"
         decisions.append(Decision("frames", shapes, f"fitted to the subject's shape; {shown}"))
     return decisions + _doubts(made)

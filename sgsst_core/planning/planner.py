@@ -20,7 +20,7 @@ from sgsst_core.planning.probe import PlanningContext, Probe, equip, measure
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.planning.ranks_model import probe_link
 from sgsst_core.planning.refine import refine_decision
-from sgsst_core.planning.survey import Survey, survey
+from sgsst_core.planning.survey import Survey, survey_views
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.split import Refinement
@@ -36,7 +36,7 @@ def make_plan(
     weights: BackboneWeights | None = None,
     rasterizer: str | None = None,
     collectives: Collectives = ALONE,
-    looked: Survey | None = None,
+    survey: Survey | None = None,
     measured: bool = False,
     show: ShowPlanning | None = None,
     timer: Timer | None = None,
@@ -54,7 +54,7 @@ def make_plan(
         weights: Weights of the feature network; None for VGG19, or VGG16 if only that is installed.
         rasterizer: Rasterizer that computes blend weights: "cpu", "triton", "cuda" or "reference". None to choose one.
         collectives: Ranks of the job.
-        looked: Survey from an earlier plan of the same job; None to survey the views.
+        survey: Survey from an earlier plan of the same job; None to survey the views.
         measured: Whether the job will be measured between its steps; see `decide`.
         show: Callback for the progress of the survey.
         timer: Timer for `survey`, and for all else as `planning`.
@@ -81,20 +81,20 @@ def make_plan(
         weights = weights_for(weights or load_network_weights("auto"), settings)
         planning_context = equip(scene, fitted, settings, weights, collectives, rasterizer)
         scene = planning_context.scene
-        if looked is None:
+        if survey is None:
             with timer("survey"):
-                looked = survey(scene, fitted, planning_context.rasterizer, collectives, show)
-        resolved = regions and regions.resolved(looked.total_blend_weights)
+                survey = survey_views(scene, fitted, planning_context.rasterizer, collectives, show)
+        resolved = regions and regions.resolved(survey.total_blend_weights)
         maps = len(resolved.active) if resolved is not None and resolved.mapped else 0
         link = probe_link(collectives, planning_context.network.device)
         # Timings differ between ranks, so one rank decides for all.
         plan = collectives.broadcast(
-            lambda: _decide(measure(planning_context, looked, link, maps), settings, measured, style, resolved)
+            lambda: _decide(measure(planning_context, survey, link, maps), settings, measured, style, resolved)
         )
         if regions is not None and resolved is not None:
             plan = replace(plan, decisions=(*of_regions(regions, resolved, plan, fitted), *plan.decisions))
         if orbit is not None:
-            plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, looked), *plan.decisions))
+            plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, survey), *plan.decisions))
         if refinement is not None:
             decisions = (refine_decision(refinement, settings), *plan.decisions)
             plan = replace(plan, refinement=refinement, decisions=decisions)

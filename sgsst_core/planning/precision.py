@@ -18,7 +18,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Precision, StyleLossName
 from sgsst_core.timing import Timer
 
@@ -107,7 +107,7 @@ def gradient_error(
     """
     if network.precision == "float32":
         return None
-    colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
+    colors = scene_colors(scene, camera)
     image = rasterizer.render(colors.to(rasterizer.device), camera).to(network.device)
     longer, shorter = max(image.shape[:2]), min(image.shape[:2])
     image = downscale(image, min(max(0, math.ceil(math.log2(longer / side))), shorter.bit_length() - 1))

@@ -16,7 +16,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES, default_memory_limit
+from sgsst_core.budget import default_memory_limit, memory_for
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork, use_whole_float32
 from sgsst_core.loss.difference import Difference
@@ -49,10 +49,10 @@ from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cached_weights import Precision as WeightPrecision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.projection import Shapes
-from sgsst_core.rasterizer.raster_lists import build_raster_lists
+from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
@@ -287,14 +287,14 @@ def make_network(weights: BackboneWeights, settings: Settings, precision: Precis
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
 
-def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps: int = 0) -> Probe:
+def measure(planning_context: PlanningContext, survey: Survey, link: Link, maps: int = 0) -> Probe:
     """Measure everything that decisions depend on.
 
     One rank does this for all, because timings differ between ranks.
 
     Args:
         workshop: Planning context.
-        looked: Survey of the views.
+        survey: Survey of the views.
         link: Connection between ranks.
         maps: Number of regions whose maps are rendered in each view.
 
@@ -302,20 +302,20 @@ def measure(planning_context: PlanningContext, looked: Survey, link: Link, maps:
         SettingsError: If pruning would leave no Gaussian.
     """
     scene, cameras, settings = planning_context.scene, planning_context.cameras, planning_context.settings
-    seen = rendered_gaussians(optimized_gaussians(looked, settings), settings)
-    distinct = distinct_views(scene, cameras, looked.covered, looked.total_blend_weights, settings.similar_views)
+    seen = rendered_gaussians(optimized_gaussians(survey, settings), settings)
+    distinct = distinct_views(scene, cameras, survey.covered, survey.total_blend_weights, settings.similar_views)
     network = _network_facts(planning_context, cameras[distinct[0]], maps)
     launches = _launch_cost(planning_context, [cameras[index] for index in distinct])
-    budget = int(planning_context.machine.memory * MEMORY_SHARES["rasterizer"])
+    budget = memory_for("rasterizer", planning_context.machine.memory)
     raster = _raster_cost(planning_context, [cameras[index] for index in distinct], budget)
-    pruned = pruned_gaussians(looked, seen)
+    pruned = pruned_gaussians(survey, seen)
     error = pruned_image_error(~seen, cameras, distinct, planning_context.rasterizer) if pruned.any() else None
     used_degree = scene.used_degree(seen)
     held_degree = 0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree
     return Probe(
         SceneFacts(len(scene), planning_context.sh_degree, used_degree, held_degree),
         tuple((camera.height, camera.width) for camera in cameras),
-        looked,
+        survey,
         tuple(distinct),
         network,
         planning_context.rasterizer.name,
@@ -375,7 +375,7 @@ def _loss(planning_context: PlanningContext, scales: ScaleWeights = EVEN) -> Sos
         planning_context.network,
         content_weight=settings.content_weight,
         style_loss=settings.style_loss,
-        memory=int(planning_context.machine.memory * MEMORY_SHARES["activations"]),
+        memory=memory_for("activations", planning_context.machine.memory),
         coarsest=settings.coarsest_side,
         scales=scales,
         keep_activations="activations" not in settings.keep,
@@ -454,25 +454,24 @@ def _search_seconds(units: Tensor) -> float:
 def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], budget: int) -> RasterCost:
     """Count and time blend weights on a few evenly spread views. `budget` is the memory for cached weights in bytes."""
     scene, rasterizer = planning_context.scene, planning_context.rasterizer
-    count = min(SAMPLED_VIEWS, len(cameras))
-    sample = [cameras[(2 * part + 1) * len(cameras) // (2 * count)] for part in range(count)]
-    middle = count // 2
+    sample = spread(cameras, SAMPLED_VIEWS)
+    count, middle = len(sample), len(sample) // 2
     if isinstance(rasterizer, CpuRasterizer):
         _raster_seconds(CpuRasterizer(scene.subset(torch.arange(1))), 1, sample[0])  # compiles
         seconds = []
         for camera in sample:
-            rasterizer.lists(camera)  # the survey's, if it could cache them
+            rasterizer.intersections(camera)  # the survey's, if it could cache them
             seconds += _raster_seconds(rasterizer, len(scene), camera)
-        more, lists_bytes = _lists_cost(scene, sample, planning_context.settings.near)
+        more, intersection_bytes = _intersections_cost(scene, sample, planning_context.settings.near)
     else:
         timed = [_raster_seconds(rasterizer, len(scene), camera, visits=2) for camera in sample]
         seconds = [later for _, later in timed]
         # Minimum, because one of them may include compilation or waiting for memory.
-        more, lists_bytes = max(min(first - later for first, later in timed), 0.0), 0
+        more, intersection_bytes = max(min(first - later for first, later in timed), 0.0), 0
     mean = sum(seconds) / count
     known: dict[str, Any] = {
         "first_seconds": more,
-        "lists_bytes": lists_bytes,
+        "intersection_bytes": intersection_bytes,
         "colors_seconds": _colors_seconds(scene, sample[middle], rasterizer.device),
     }
     if rasterizer.name == "cuda":
@@ -504,12 +503,12 @@ def _comes_too_seldom(settings: Settings, views: int) -> bool:
     return settings.cached_weights == "auto" and visits < LEAST_VISITS
 
 
-def _lists_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
+def _intersections_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
     """Return the time in seconds and the size in bytes of recomputed tile intersections, mean over some views."""
     seconds, size, shapes = 0.0, 0, Shapes.of(scene)
     for camera in cameras:
         started = time.perf_counter()
-        size += build_raster_lists(scene, camera, near=near, shapes=shapes).nbytes
+        size += build_tile_intersections(scene, camera, near=near, shapes=shapes).nbytes
         seconds += time.perf_counter() - started
     return seconds / len(cameras), size // len(cameras)
 

@@ -13,8 +13,8 @@ from sgsst_core.planning.plan import Decision
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rotations import rotations
 from sgsst_core.scene.split import MOST_PIECES, Refinement, piece_counts, pieces_to
-from sgsst_core.scene.subject import rotations
 from sgsst_core.settings import Settings
 
 #: Minimum PSNR of the unstylized image in dB, in each measured view.

@@ -60,7 +60,7 @@ class Survey:
 
 
 @dataclass(frozen=True)
-class _Look:
+class _ViewSurvey:
     """Survey of one view."""
 
     region: Rectangle
@@ -70,7 +70,7 @@ class _Look:
     shown: int  # Gaussians
 
 
-def survey(
+def survey_views(
     scene: Scene,
     cameras: Sequence[Camera],
     rasterizer: Rasterizer,
@@ -90,30 +90,30 @@ def survey(
         CameraError: If no camera sees a Gaussian.
     """
     weights = torch.zeros(len(scene), dtype=torch.float64)
-    looks: dict[int, _Look] = {}
+    views: dict[int, _ViewSurvey] = {}
     own = range(collectives.rank, len(cameras), collectives.size)
     started = time.perf_counter()
     for done, index in enumerate(own):
         if show:
             show(progress_of(done, len(cameras), collectives.size, time.perf_counter() - started))
-        looks[index] = _look(cameras[index], rasterizer, weights)
+        views[index] = _survey_view(cameras[index], rasterizer, weights)
     if show:
         show(progress_of(len(own), len(cameras), collectives.size, time.perf_counter() - started))
-    for part in collectives.all_gather(looks):
-        looks |= part
-    covered = [index for index in range(len(cameras)) if looks[index].covered]
+    for part in collectives.all_gather(views):
+        views |= part
+    covered = [index for index in range(len(cameras)) if views[index].covered]
     if not covered:
         raise nothing_seen(len(cameras))
     weights = collectives.all_reduce(weights.to(rasterizer.device)).cpu()
-    uncovered_share = sum(looks[index].uncovered for index in covered) / sum(looks[index].pixels for index in covered)
-    regions = [looks[index].region for index in range(len(cameras))]
-    shown = sum(looks[index].shown for index in covered) / len(covered)
-    ordered = [looks[index] for index in range(len(cameras))]
-    uncovered = [look.uncovered / look.pixels if look.covered else 1.0 for look in ordered]
+    uncovered_share = sum(views[index].uncovered for index in covered) / sum(views[index].pixels for index in covered)
+    regions = [views[index].region for index in range(len(cameras))]
+    shown = sum(views[index].shown for index in covered) / len(covered)
+    ordered = [views[index] for index in range(len(cameras))]
+    uncovered = [view.uncovered / view.pixels if view.covered else 1.0 for view in ordered]
     return Survey(weights, covered, regions, uncovered_share, shown, uncovered)
 
 
-def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:
+def _survey_view(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _ViewSurvey:
     """Survey a view, and add its blend weights to weights [N] float64."""
     coverage, summed = rasterizer.survey(camera)
     seen = sees_something(coverage)
@@ -123,4 +123,4 @@ def _look(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Look:
         own = summed.cpu()
         weights += own.double()
         shown = int((own > 0).sum())
-    return _Look(covered_region(coverage), uncovered, coverage.numel(), seen, shown)
+    return _ViewSurvey(covered_region(coverage), uncovered, coverage.numel(), seen, shown)

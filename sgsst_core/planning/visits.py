@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES
+from sgsst_core.budget import least_intersection_memory, memory_for
 from sgsst_core.planning.cost import Work
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Probe
@@ -64,7 +64,7 @@ class Made:
         return (1 - self.kept) * self.seconds
 
     @property
-    def kept_bytes(self) -> int:
+    def cached_bytes(self) -> int:
         """Final memory use in bytes."""
         return int(self.fitting())
 
@@ -81,7 +81,7 @@ class Visits:
     """All data that are computed for the views of a job.
 
     Attributes:
-        lists: Tile intersections of the rasterizer that computes weights.
+        intersections: Tile intersections of the rasterizer that computes weights.
         surveyed: Tile intersections cached by the survey, of all views.
         handed: Fraction of the time for cached tile intersections that the survey's save.
         colors: SH colors.
@@ -96,7 +96,7 @@ class Visits:
         coarse_weights: Whether phase 1 computes weights of its own.
     """
 
-    lists: Made
+    intersections: Made
     surveyed: Made
     handed: float
     colors: Made
@@ -123,11 +123,11 @@ class Visits:
             content: Size in bytes of the content features of all views.
         """
         raster, memory, views = probe.raster, probe.machine.memory, len(plan.covered)
-        room = memory * MEMORY_SHARES["views"]
-        weighed = memory * MEMORY_SHARES["rasterizer"]
-        surveyed = Made(0.0, len(probe.sizes) * raster.lists_bytes, weighed)
-        room_of_lists = weighed if plan.cached_weights == "none" else memory / LISTS_BESIDE_WEIGHTS
-        lists = Made(raster.first_seconds, views * raster.lists_bytes, room_of_lists)
+        room = memory_for("views", memory)
+        weighed = memory_for("rasterizer", memory)
+        surveyed = Made(0.0, len(probe.sizes) * raster.intersection_bytes, weighed)
+        room_of_intersections = weighed if plan.cached_weights == "none" else least_intersection_memory(memory)
+        intersections = Made(raster.first_seconds, views * raster.intersection_bytes, room_of_intersections)
         colors = views * int(plan.seen.sum()) * COLOR_BYTES if probe.scene.used_degree else 0
         weights = None
         if plan.cached_weights != "none":
@@ -147,9 +147,9 @@ class Visits:
             images, rendered = Made(rendered, _IMAGE_BYTES * pixels, room_of_images), 0.0
         return Visits(
             maps=_maps(plan, probe, room / 4),
-            lists=lists,
+            intersections=intersections,
             surveyed=surveyed,
-            handed=min(surveyed.kept / lists.kept, 1.0) * (1 if plan.seen.all() else 1 - _CUT),
+            handed=min(surveyed.kept / intersections.kept, 1.0) * (1 if plan.seen.all() else 1 - _CUT),
             colors=Made(raster.colors_seconds, colors, room / 4),
             weights=weights,
             content=Made(rendered + work.pixels * forward, content, room_of_content),
@@ -163,7 +163,7 @@ class Visits:
 
     def rasterized(self) -> float:
         """Return the time in seconds of a render and its gradient at a later visit, mean over views."""
-        uncached = self.raster + self.lists.always
+        uncached = self.raster + self.intersections.always
         if self.weights is not None:
             uncached = self.weights.kept * self.raster_kept + (1 - self.weights.kept) * uncached
         return uncached + self.colors.always
@@ -175,12 +175,12 @@ class Visits:
     def first(self, *, coarse: bool) -> float:
         """Return the additional time in seconds of a view's first visit in a phase."""
         content = (self.content_coarse if coarse else self.content).once + self.images.once
-        lists = (1 - self.handed) * self.lists.once + self.colors.once + self.maps.once
+        intersections = (1 - self.handed) * self.intersections.once + self.colors.once + self.maps.once
         keeping = self.weights.once if self.weights else 0.0
         if coarse:
-            return content + lists + (0.0 if self.coarse_weights else keeping)
+            return content + intersections + (0.0 if self.coarse_weights else keeping)
         if not self.in_coarse:
-            return content + lists + keeping
+            return content + intersections + keeping
         return content + (keeping if self.coarse_weights else 0.0)
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from sgsst_core.errors import SettingsError
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 
 #: Distance of a pair's two views in the list of views.
@@ -134,7 +134,7 @@ def consistency(
     # Pairs are visited chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...). Each pair shares a view with the one
     # before it, so every view is rendered once and only two are in memory, whatever the gap.
     for i, j in sorted(view_pairs(len(cameras), gap, at_most), key=lambda pair: (pair[0] % gap, pair[0])):
-        views = {k: views.get(k) or _look(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
+        views = {k: views.get(k) or _image_and_depth(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
         (image, depth), (other, other_depth) = views[i], views[j]
         warped, valid = warp(other, other_depth, cameras[j], depth, cameras[i])
         results.append(compare(i, j, image, warped, valid, lpips))
@@ -149,10 +149,8 @@ def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[i
     """
     if gap < 1 or (at_most is not None and at_most < 1):
         raise SettingsError(f"Pairs of views {gap} apart, at most {at_most}: both numbers must be at least 1.")
-    total = max(count - gap, 0)
-    parts = total if at_most is None else min(at_most, total)
-    firsts = [(2 * part + 1) * total // (2 * parts) for part in range(parts)]  # middle of each of `parts` equal parts
-    return [(i, i + gap) for i in firsts]
+    firsts = range(max(count - gap, 0))
+    return [(i, i + gap) for i in (firsts if at_most is None else spread(firsts, at_most))]
 
 
 def expected_depth(scene: Scene, camera: Camera, rasterizer: Rasterizer) -> DepthMap:
@@ -347,7 +345,7 @@ def compare(
     return PairConsistency(first, second, compared, rmse, distance)
 
 
-def _look(image: Tensor, camera: Camera, rasterizer: Rasterizer, scene: Scene) -> tuple[Tensor, DepthMap]:
+def _image_and_depth(image: Tensor, camera: Camera, rasterizer: Rasterizer, scene: Scene) -> tuple[Tensor, DepthMap]:
     """Return the image and the depth map of a view."""
     return shown(image, camera, rasterizer.device), expected_depth(scene, camera, rasterizer)
 

@@ -115,7 +115,7 @@ class ExactLoss:
         return self._style_targets[size]
 
 
-class ExactTwin(ExactLoss):
+class Float32Reference(ExactLoss):
     """Exact loss and gradient of a job's colors.
 
     Args:

@@ -84,7 +84,7 @@ def findings_of(
     style: Tensor | StyleMixture | None,
     *,
     near: float,
-    looked: Survey | None = None,
+    survey: Survey | None = None,
 ) -> list[Finding]:
     """Return the findings about a scene read with `drop_invalid`, its views, and its style if given.
 
@@ -93,10 +93,10 @@ def findings_of(
         cameras: Cameras of the views.
         style: Style image [H, W, 3] or mixture; None skips the style.
         near: Distance of the near plane in world units.
-        looked: Survey of the cameras, if there is one already; None renders them.
+        survey: Survey of the cameras, if there is one already; None renders them.
     """
     rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: builds nothing yet
-    found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, looked=looked)]
+    found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, survey=survey)]
     pictures = () if style is None else StyleMixture.of(style).pictures
     return [*found, *(finding for picture in pictures for finding in style_findings(picture, cameras))]
 
@@ -268,7 +268,7 @@ def scene_extent(scene: Scene) -> tuple[Tensor, float]:
 
 
 def view_findings(
-    file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float, looked: Survey | None = None
+    file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float, survey: Survey | None = None
 ) -> list[Finding]:
     """Return the findings about the views, and about the Gaussians that no view shows.
 
@@ -277,10 +277,10 @@ def view_findings(
         cameras: Cameras of the views.
         rasterizer: Rasterizer of the scene.
         near: Distance of the near plane in world units.
-        looked: Survey of the cameras; None renders each of them, forward and backward.
+        survey: Survey of the cameras; None renders each of them, forward and backward.
     """
-    if looked is not None and looked.uncovered is not None:
-        shown = [*_uncovered(looked.uncovered, cameras), *_seldom_seen(file, looked.total_blend_weights)]
+    if survey is not None and survey.uncovered is not None:
+        shown = [*_uncovered(survey.uncovered, cameras), *_seldom_seen(file, survey.total_blend_weights)]
     else:
         shown = _shown(file, cameras, rasterizer)
     return [*_lenses(cameras), *_near(file.scene, cameras, near), *shown]

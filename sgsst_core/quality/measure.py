@@ -20,7 +20,7 @@ from sgsst_core.planning.measuring import (
     choose_level,
     novel_view_seconds,
 )
-from sgsst_core.quality.exact import ExactLoss, ExactTwin, approximations, rasterizer_beside
+from sgsst_core.quality.exact import ExactLoss, Float32Reference, approximations, rasterizer_beside
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViews
@@ -48,15 +48,15 @@ class Measurements:
     def __init__(self, stylizer: Stylizer) -> None:
         self._stylizer = stylizer
         self.approximated = approximations(stylizer)
-        self._exact: ExactTwin | None = None
+        self._exact: Float32Reference | None = None
         self._novel_views: NovelViews | None = None
         self._seen_by: tuple[Scene, Rasterizer] | None = None
 
     @property
-    def exact(self) -> ExactTwin:
+    def exact(self) -> Float32Reference:
         """Exact loss and gradient of the job."""
         if self._exact is None:
-            self._exact = ExactTwin(self._stylizer, measuring_memory(self._stylizer.memory))
+            self._exact = Float32Reference(self._stylizer, measuring_memory(self._stylizer.memory))
         return self._exact
 
     @property

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Shelf
+from sgsst_core.budget import Cache
 from sgsst_core.loss.sos import ScaleTarget, SosLoss
 from sgsst_core.planning.survey import sees_something
 from sgsst_core.quality.consistency import (
@@ -203,9 +203,9 @@ class NovelViews:
         )
         self._sh_rest = scene.sh_rest.to(rasterizer.device)
         self._means = scene.means.to(rasterizer.device)
-        self._rest: Shelf[int, Tensor] = Shelf(memory // 8, _tensor_bytes)
-        self._coverage: Shelf[int, Tensor] = Shelf(memory // 8, _tensor_bytes)
-        self._warps: Shelf[tuple[int, int], Warp] = Shelf(memory // 2, lambda warp: warp.nbytes)
+        self._rest: Cache[int, Tensor] = Cache(memory // 8, _tensor_bytes)
+        self._coverage: Cache[int, Tensor] = Cache(memory // 8, _tensor_bytes)
+        self._warps: Cache[tuple[int, int], Warp] = Cache(memory // 2, lambda warp: warp.nbytes)
         self._picture_memory = memory // 4
         parents = neighbors([cameras[index] for index in covered])
         self.cameras = [between(*pair) for pair in parents]
@@ -257,7 +257,7 @@ class NovelViews:
         Raises:
             ValueError: If an image contains NaN or infinity.
         """
-        pictures: Shelf[int, Tensor] = Shelf(self._picture_memory, _tensor_bytes)
+        pictures: Cache[int, Tensor] = Cache(self._picture_memory, _tensor_bytes)
         sh_dc = sh_dc.detach().to(self.rasterizer.device)
 
         def picture(index: int) -> Tensor:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from sgsst_core.files.ply import read_scene
+from sgsst_core.loss.difference import psnr
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 #: Number of compared views, and their longer side in pixels.
 _VIEWS, _SIDE = 3, 256
@@ -74,12 +74,10 @@ def measure_packed(
     squares = values = 0.0
     for camera in chosen:
         first, second = (
-            rasterizer.render(view_colors(each.sh_dc, rest_colors(each.sh_rest, each.means, camera)), camera).clamp(
-                0, 1
-            )
+            rasterizer.render(scene_colors(each, camera), camera).clamp(0, 1)
             for rasterizer, each in zip(pairs, (scene, back.scene), strict=True)
         )
         squares += float((first.double() - second.double()).square().sum())
         values += first.numel()
-    psnr = -10 * math.log10(squares / values) if squares else None
-    return PackedLoss(path.name, back.form, path.stat().st_size, [camera.name for camera in chosen], psnr)
+    loss = psnr(squares / values) if squares else None
+    return PackedLoss(path.name, back.form, path.stat().st_size, [camera.name for camera in chosen], loss)

@@ -2,19 +2,20 @@
 
 Geometry is frozen, so a view's W never changes: an image is W c + T_final background, its gradient W^T dL/dimage, and
 rasterizing reduces to reading W from memory. Weights are stored on the device that applies them, in a layout made for
-it: `strips` on the CPU, `triton_kept` on GPUs.
+it: `strips` on the CPU, `triton_cached` on GPUs.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from sgsst_core.budget import Cache
 from sgsst_core.constants import ALPHA_MAX, NEAR
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.arguments import (
@@ -29,13 +30,13 @@ from sgsst_core.rasterizer.cached_weights import CachedWeights, CountedWeights, 
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.strips import CountedStrips
 from sgsst_core.rasterizer.triton import TritonRasterizer
-from sgsst_core.rasterizer.triton_kept import CountedPieces
+from sgsst_core.rasterizer.triton_cached import CountedPieces
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _CachedBand:
     """Cached weights, and the band that they cover."""
 
     band: Rows
@@ -61,7 +62,7 @@ class CachedRasterizer:
             per weight.
         max_bytes: Memory budget for weights; None for no limit. On the CPU they share it with the tile intersections of
             `uncached`, which get what the weights leave, and which are dropped for a view once its weights are cached.
-        least_list_bytes: Minimum budget for these tile intersections, however much the weights take.
+        least_intersection_bytes: Minimum budget for these tile intersections, however much the weights take.
         at_first_use: Whether to cache weights at first use; if False, only by `keep`. Then rendering any number of
             other views in between does not change later results by a single bit.
         device: Device that stores and applies the weights and holds the results.
@@ -86,7 +87,7 @@ class CachedRasterizer:
         alpha_max: float = ALPHA_MAX,
         precision: Precision = "float32",
         max_bytes: int | None = None,
-        least_list_bytes: int = 0,
+        least_intersection_bytes: int = 0,
         at_first_use: bool = True,
         device: torch.device | str = "cpu",
         uncached: CpuRasterizer | TritonRasterizer | None = None,
@@ -94,8 +95,7 @@ class CachedRasterizer:
         self.scene = scene
         self.precision: Precision = precision
         self.max_bytes = max_bytes
-        self.least_list_bytes = least_list_bytes
-        self.kept_bytes = 0
+        self.least_intersection_bytes = least_intersection_bytes
         self._at_first_use = at_first_use
         if uncached is None and torch.device(device).type == "cpu":
             uncached = CpuRasterizer(scene, background=background, near=near, alpha_max=alpha_max)
@@ -103,9 +103,14 @@ class CachedRasterizer:
             uncached = TritonRasterizer(scene, background=background, near=near, alpha_max=alpha_max, device=device)
         self.uncached = uncached
         self.device = uncached.device
-        self._kept: dict[tuple[CameraKey, Rows], _Kept | None] = {}
-        self._lent: dict[tuple[CameraKey, Rows], _Kept] = {}
+        self._cached: Cache[tuple[CameraKey, Rows], _CachedBand] = Cache(max_bytes)
+        self._lent: dict[tuple[CameraKey, Rows], _CachedBand] = {}
         self._lock = threading.Lock()
+
+    @property
+    def cached_bytes(self) -> int:
+        """Size of all cached weights in bytes."""
+        return self._cached.used
 
     def count(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
         """Count a band's weights without caching them; takes about as long as one render."""
@@ -125,8 +130,8 @@ class CachedRasterizer:
         """
         key, band = camera_key(camera), check_rows(camera, rows)
         with self._lock:
-            if self._serving(key, band, camera) is None and (key, band) not in self._kept:
-                self._kept[key, band] = self._keep(camera, band)
+            if self._serving(key, band, camera) is None:
+                self._cached.add((key, band), lambda: self._counted(camera, band))
             return self._serving(key, band, camera) is not None
 
     @contextmanager
@@ -139,13 +144,13 @@ class CachedRasterizer:
         key, band = camera_key(camera), check_rows(camera, rows)
         counted = None if self._serving(key, band, camera) else self.count(camera, band)
         if counted is not None and (self.max_bytes is None or counted.nbytes(self.precision) <= self.max_bytes):
-            self._lent[key, band] = _Kept(band, counted.keep(self.precision))
+            self._lent[key, band] = _CachedBand(band, counted.keep(self.precision))
         try:
             yield
         finally:
             self._lent.pop((key, band), None)
 
-    def is_kept(self, camera: Camera, rows: Rows | None = None) -> bool:
+    def is_cached(self, camera: Camera, rows: Rows | None = None) -> bool:
         """Return whether the band has cached weights."""
         return self._serving(camera_key(camera), check_rows(camera, rows), camera) is not None
 
@@ -153,31 +158,31 @@ class CachedRasterizer:
         """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
         band = check_rows(camera, rows)
         values = check_colors(colors, len(self.scene), torch.float32, self.device)
-        kept = self._kept_for(camera, band)
-        if kept is None:
+        cached = self._cached_for(camera, band)
+        if cached is None:
             return self.uncached.render(values, camera, band)
-        return kept.weights.render(values)[band[0] - kept.band[0] : band[1] - kept.band[0]]
+        return cached.weights.render(values)[band[0] - cached.band[0] : band[1] - cached.band[0]]
 
     def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Return 1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
         band = check_rows(camera, rows)
-        kept = self._kept_for(camera, band)
-        if kept is None:
+        cached = self._cached_for(camera, band)
+        if cached is None:
             return self.uncached.coverage(camera, band)
-        return 1 - kept.weights.transmittance[band[0] - kept.band[0] : band[1] - kept.band[0]]
+        return 1 - cached.weights.transmittance[band[0] - cached.band[0] : band[1] - cached.band[0]]
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows."""
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
-        kept = self._kept_for(camera, band)
-        if kept is None:
+        cached = self._cached_for(camera, band)
+        if cached is None:
             return self.uncached.color_gradient(pixels, camera, band)
-        if kept.band != band:  # weights of the whole view: zero gradient in the other rows
+        if cached.band != band:  # weights of the whole view: zero gradient in the other rows
             whole = pixels.new_zeros((camera.height, camera.width, 3))
             whole[band[0] : band[1]] = pixels
             pixels = whole
-        return kept.weights.color_gradient(pixels)
+        return cached.weights.color_gradient(pixels)
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N].
@@ -186,27 +191,29 @@ class CachedRasterizer:
         """
         return self.uncached.survey(camera)
 
-    def _kept_for(self, camera: Camera, band: Rows) -> _Kept | None:
+    def _cached_for(self, camera: Camera, band: Rows) -> _CachedBand | None:
         """Return the cached weights for a band, or None. With `at_first_use` they are computed first, if they fit."""
         if self._at_first_use:
             self.keep(camera, band)
         return self._serving(camera_key(camera), band, camera)
 
-    def _serving(self, key: CameraKey, band: Rows, camera: Camera) -> _Kept | None:
+    def _serving(self, key: CameraKey, band: Rows, camera: Camera) -> _CachedBand | None:
         """Return the present cached weights for a band: those of the whole view, else its own, else temporary ones."""
-        whole = self._kept.get((key, (0, camera.height)))
-        return whole or self._kept.get((key, band)) or self._lent.get((key, band))
+        whole = self._cached.values.get((key, (0, camera.height)))
+        return whole or self._cached.values.get((key, band)) or self._lent.get((key, band))
 
-    def _keep(self, camera: Camera, band: Rows) -> _Kept | None:
+    def _counted(self, camera: Camera, band: Rows) -> tuple[int, Callable[[], _CachedBand]]:
+        """Return the size in bytes of a band's weights, and a function that computes them."""
         counted = self.count(camera, band)
-        size = counted.nbytes(self.precision)
-        if self.max_bytes is not None and self.kept_bytes + size > self.max_bytes:
-            return None
-        weights = counted.keep(self.precision)
-        self.kept_bytes += weights.nbytes
-        if self.max_bytes is not None and isinstance(self.uncached, CpuRasterizer):
-            self.uncached.let_go_of_lists(camera, max(self.max_bytes - self.kept_bytes, self.least_list_bytes))
-        return _Kept(band, weights)
+
+        def make() -> _CachedBand:
+            weights = counted.keep(self.precision)
+            if self.max_bytes is not None and isinstance(self.uncached, CpuRasterizer):
+                left = self.max_bytes - self.cached_bytes - weights.nbytes
+                self.uncached.drop_intersections(camera, max(left, self.least_intersection_bytes))
+            return _CachedBand(band, weights)
+
+        return counted.nbytes(self.precision), make
 
 
 def repeatable(rasterizer: Rasterizer) -> Rasterizer:

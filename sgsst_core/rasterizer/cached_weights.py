@@ -1,4 +1,4 @@
-"""Interface between `cached` and the layouts of cached blend weights: `strips` on the CPU, `triton_kept` on GPUs."""
+"""Interface between `cached` and the layouts of cached blend weights: `strips` on the CPU, `triton_cached` on GPUs."""
 
 from __future__ import annotations
 

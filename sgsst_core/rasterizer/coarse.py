@@ -7,7 +7,7 @@ smaller than W and correspondingly faster to apply.
 
 from __future__ import annotations
 
-import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,13 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sgsst_core.budget import Cache
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import coarse_kernels, kernels
 from sgsst_core.rasterizer.arguments import CameraKey, Rows, camera_key, check_colors
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
-from sgsst_core.rasterizer.raster_lists import RasterLists, tile_grid
+from sgsst_core.rasterizer.tile_intersections import TileIntersections, run_starts, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 
@@ -69,42 +70,38 @@ class _Counts:
     def pieces(self) -> int:
         return int(self.tile_pieces.sum())
 
-    def nbytes(self, lists: RasterLists, grid: _Grid) -> int:
+    def nbytes(self, isects: TileIntersections, grid: _Grid) -> int:
         """Return the size in bytes of all arrays of a `CoarseOperator`."""
         height, width = grid.shape(grid.piece_scale)
-        offsets = 8 * (len(self.tile_pieces) + 1) + lists.first_slots.nbytes + lists.projection.gaussians.nbytes
+        offsets = 8 * (len(self.tile_pieces) + 1) + isects.first_slots.nbytes + isects.projection.gaussians.nbytes
         return offsets + 4 * height * width + self.pieces * (8 + 4 * (RASTER_TILE >> grid.piece_scale) ** 2)
 
 
-def _count(lists: RasterLists, grid: _Grid, alpha_max: float) -> _Counts:
+def _count(isects: TileIntersections, grid: _Grid, alpha_max: float) -> _Counts:
     """Count the sizes of a view's operator; takes about as long as one render."""
-    counts = _Counts(np.zeros(len(lists.starts) - 1, dtype=np.int64), np.zeros(len(lists.ranks), dtype=np.bool_))
-    tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values)
+    counts = _Counts(np.zeros(len(isects.starts) - 1, dtype=np.int64), np.zeros(len(isects.ranks), dtype=np.bool_))
+    tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values)
     with kernel_threads():
         coarse_kernels.count_pieces(*tiles, grid.size, grid.across, alpha_max, counts.tile_pieces, counts.slot_used)
     return counts
 
 
-def _offsets(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
-    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
-
-
 class CoarseOperator:
     """D W of one view, at most at the scale where a raster tile is a pixel. See `coarse_kernels` for the layout."""
 
-    def __init__(self, lists: RasterLists, counts: _Counts, grid: _Grid, alpha_max: float) -> None:
+    def __init__(self, isects: TileIntersections, counts: _Counts, grid: _Grid, alpha_max: float) -> None:
         self.scale, self.across = grid.piece_scale, grid.across
-        self.gaussians = lists.projection.gaussians
-        slot_starts = _offsets(counts.slot_used)
-        self.first_slots = slot_starts[lists.first_slots]
+        self.gaussians = isects.projection.gaussians
+        slot_starts = run_starts(counts.slot_used)
+        self.first_slots = slot_starts[isects.first_slots]
         self.pieces = coarse_kernels.Pieces(
-            starts=_offsets(counts.tile_pieces),
+            starts=run_starts(counts.tile_pieces),
             gaussians=np.empty(counts.pieces, dtype=np.int32),
             slots=np.empty(counts.pieces, dtype=np.int32),
             weights=np.empty(counts.pieces * (RASTER_TILE >> self.scale) ** 2, dtype=np.float32),
         )
         self.transmittance = np.empty(grid.shape(self.scale), dtype=np.float32)
-        tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values, self.gaussians)
+        tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values, self.gaussians)
         place = (grid.size, grid.across, self.scale)
         with kernel_threads():
             coarse_kernels.keep_pieces(*tiles, *place, alpha_max, slot_starts, self.pieces, self.transmittance)
@@ -131,41 +128,6 @@ class CoarseOperator:
             coarse_kernels.apply_transposed_pieces(self.pieces, image_gradient, self.across, self.scale, slot_gradients)
             kernels.add_slots(slot_gradients, self.first_slots, self.gaussians, gradient)
         return gradient
-
-
-class _Operators:
-    """Cache of operators at coarse scales, filled until the next one would exceed `max_bytes`."""
-
-    def __init__(self, cpu: CpuRasterizer, max_bytes: int | None, at_first_use: bool) -> None:
-        self.max_bytes = max_bytes
-        self.at_first_use = at_first_use
-        self.kept_bytes = 0
-        self.kept: dict[tuple[CameraKey, int], CoarseOperator | None] = {}
-        self._cpu = cpu
-        self._lock = threading.Lock()
-
-    def get(self, camera: Camera, scale: int, grid: _Grid) -> CoarseOperator | None:
-        """Return the view's cached operator, or None. With `at_first_use` it is built first, if it fits."""
-        if self.at_first_use:
-            self.keep(camera, scale, grid)
-        return self.kept.get((camera_key(camera), scale))
-
-    def keep(self, camera: Camera, scale: int, grid: _Grid) -> None:
-        """Build and cache the view's operator if it is new and fits."""
-        key = (camera_key(camera), scale)
-        with self._lock:
-            if key not in self.kept:
-                self.kept[key] = self._build(camera, grid)
-
-    def _build(self, camera: Camera, grid: _Grid) -> CoarseOperator | None:
-        lists = self._cpu.lists(camera)
-        counts = _count(lists, grid, self._cpu.alpha_max)
-        size = counts.nbytes(lists, grid)
-        if self.max_bytes is not None and self.kept_bytes + size > self.max_bytes:
-            return None
-        operator = CoarseOperator(lists, counts, grid, self._cpu.alpha_max)
-        self.kept_bytes += size
-        return operator
 
 
 class CoarseRasterizer:
@@ -201,43 +163,41 @@ class CoarseRasterizer:
         self.scene = cpu.scene
         self.scale = scale
         self._cpu = cpu
-        self._operators = _Operators(cpu, max_bytes, at_first_use)
+        self._at_first_use = at_first_use
+        self._operators: Cache[tuple[CameraKey, int], CoarseOperator] = Cache(max_bytes)
 
     def at(self, scale: int) -> CoarseRasterizer:
         """Return the same rasterizer at another scale; both share the cache and its budget."""
-        other = CoarseRasterizer(self._cpu, scale)
+        other = CoarseRasterizer(self._cpu, scale, at_first_use=self._at_first_use)
         other._operators = self._operators
         return other
 
     @property
-    def kept_bytes(self) -> int:
+    def cached_bytes(self) -> int:
         """Size in bytes of all cached operators, at all scales."""
-        return self._operators.kept_bytes
+        return self._operators.used
 
     def operator_bytes(self, camera: Camera) -> int:
         """Return the size in bytes of a view's operator without caching it; takes about as long as one render."""
-        grid = _Grid.of(camera, self.scale)
-        lists = self._cpu.lists(camera)
-        return _count(lists, grid, self._cpu.alpha_max).nbytes(lists, grid)
+        return self._counted(camera, _Grid.of(camera, self.scale))[0]
 
     def keep(self, camera: Camera) -> bool:
         """Cache a view's operator if it fits, and return whether it is cached.
 
         Whether it fits is decided the first time that the view is named.
         """
-        self._operators.keep(camera, self.scale, _Grid.of(camera, self.scale))
-        return self.is_kept(camera)
+        return self._operator(camera, _Grid.of(camera, self.scale), add=True) is not None
 
-    def is_kept(self, camera: Camera) -> bool:
+    def is_cached(self, camera: Camera) -> bool:
         """Return whether the view has a cached operator."""
-        return self._operators.kept.get((camera_key(camera), self.scale)) is not None
+        return (camera_key(camera), self.scale) in self._operators
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Return the float32 image [h, W >> scale, 3] of colors [N, 3] over the background, for rows at the scale."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
         values = check_colors(colors, len(self.scene), torch.float32, _CPU)
-        operator = self._operators.get(camera, self.scale, grid)
+        operator = self._operator(camera, grid)
         if operator is None:
             return downscale(self._cpu.render(values, camera, self._full_size(band)), self.scale)
         image = torch.from_numpy(operator.render(values.numpy(), self._cpu.background))
@@ -247,7 +207,7 @@ class CoarseRasterizer:
         """Return 1 - T_final, [h, W >> scale] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
-        operator = self._operators.get(camera, self.scale, grid)
+        operator = self._operator(camera, grid)
         if operator is None:
             return downscale(self._cpu.coverage(camera, self._full_size(band)), self.scale)
         return 1 - downscale(torch.from_numpy(operator.transmittance), self.scale - operator.scale)[slice(*band)]
@@ -257,7 +217,7 @@ class CoarseRasterizer:
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
         pixels = self._whole(self._checked(image_gradient, camera, band), grid, band)
-        operator = self._operators.get(camera, self.scale, grid)
+        operator = self._operator(camera, grid)
         if operator is None:
             whole = torch.zeros((camera.height, camera.width, 3))
             add_upscaled_(whole, pixels, self.scale)
@@ -271,6 +231,19 @@ class CoarseRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [h, W >> scale], and each Gaussian's blend weight summed over all pixels [N]."""
         return plain_survey(self, camera)
+
+    def _operator(self, camera: Camera, grid: _Grid, *, add: bool = False) -> CoarseOperator | None:
+        """Return the view's cached operator, or None. With `add` or `at_first_use` it is built first, if it fits."""
+        key = (camera_key(camera), self.scale)
+        if add or self._at_first_use:
+            self._operators.add(key, lambda: self._counted(camera, grid))
+        return self._operators.values.get(key)
+
+    def _counted(self, camera: Camera, grid: _Grid) -> tuple[int, Callable[[], CoarseOperator]]:
+        """Return the size in bytes of a view's operator, and a function that builds it."""
+        isects, alpha_max = self._cpu.intersections(camera), self._cpu.alpha_max
+        counts = _count(isects, grid, alpha_max)
+        return counts.nbytes(isects, grid), lambda: CoarseOperator(isects, counts, grid, alpha_max)
 
     def _band(self, camera: Camera, rows: Rows | None) -> Rows:
         """Return the band of rows at the scale as (start, stop); None is the whole view."""

@@ -16,14 +16,18 @@ from sgsst_core.rasterizer.arguments import (
     check_image_gradient,
     check_rows,
 )
-from sgsst_core.rasterizer.kept_lists import KeptLists
 from sgsst_core.rasterizer.projection import Shapes
-from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists, lists_of_subset
+from sgsst_core.rasterizer.tile_intersections import (
+    TileIntersections,
+    build_tile_intersections,
+    intersections_of_subset,
+)
+from sgsst_core.rasterizer.view_cache import ViewCache
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
 #: Tile intersections take some 15 to 20 bytes per pair of Gaussian and tile: a few megabytes per view at 1280x720.
-DEFAULT_LIST_BYTES = 1 << 30
+DEFAULT_INTERSECTION_BYTES = 1 << 30
 _CPU = torch.device("cpu")
 
 
@@ -31,16 +35,16 @@ class CpuRasterizer:
     """Implementation of `sgsst_core.rasterizer.Rasterizer` in compiled float32 code.
 
     The order of summation is fixed. Results are therefore bit-identical for any number of threads, and bands of rows
-    put together are bit-identical to the whole view. Tile intersections are cached within a budget (`KeptLists`).
+    put together are bit-identical to the whole view. Tile intersections are cached within a budget (`ViewCache`).
 
     Args:
         scene: Scene, whose geometry must not change during this object's lifetime.
         background: RGB color behind pixels that Gaussians leave uncovered.
         near: Near plane in world units.
         alpha_max: Upper limit of alpha.
-        max_list_bytes: Memory budget for tile intersections in bytes.
+        max_intersection_bytes: Memory budget for tile intersections in bytes.
         beside: Rasterizer whose budget for tile intersections this one shares, with lower priority, instead of
-            `max_list_bytes`; None for a budget of its own.
+            `max_intersection_bytes`; None for a budget of its own.
     """
 
     name = "cpu"
@@ -55,7 +59,7 @@ class CpuRasterizer:
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         near: float = NEAR,
         alpha_max: float = ALPHA_MAX,
-        max_list_bytes: int = DEFAULT_LIST_BYTES,
+        max_intersection_bytes: int = DEFAULT_INTERSECTION_BYTES,
         beside: CpuRasterizer | None = None,
     ) -> None:
         self.scene = scene
@@ -63,10 +67,12 @@ class CpuRasterizer:
         self.alpha_max = alpha_max
         self.background: NDArray[np.float32] = np.asarray(background, dtype=np.float32)
         self._shapes: Shapes | None = None
-        host = None if beside is None else beside._lists
-        self._lists: KeptLists[RasterLists] = KeptLists(self._build, max_list_bytes, host=host)
+        host = None if beside is None else beside._intersections
+        self._intersections: ViewCache[TileIntersections] = ViewCache(self._build, max_intersection_bytes, host=host)
 
-    def of_subset(self, scene: Scene, rows: Tensor, *, max_list_bytes: int = DEFAULT_LIST_BYTES) -> CpuRasterizer:
+    def of_subset(
+        self, scene: Scene, rows: Tensor, *, max_intersection_bytes: int = DEFAULT_INTERSECTION_BYTES
+    ) -> CpuRasterizer:
         """Return a rasterizer of a subset of the Gaussians.
 
         Cached tile intersections are handed over to it. They are restricted to the subset when their view is first
@@ -75,38 +81,45 @@ class CpuRasterizer:
         Args:
             scene: Scene of the subset, with unchanged geometry.
             rows: [N] bool, mask of the subset.
-            max_list_bytes: Memory budget of the new rasterizer for tile intersections, in bytes.
+            max_intersection_bytes: Memory budget of the new rasterizer for tile intersections, in bytes.
         """
         if len(scene) != int(rows.sum()) or len(rows) != len(self.scene):
             raise ValueError(f"{len(scene)} Gaussians are not the {int(rows.sum())} chosen ones of {len(self.scene)}")
-        part = CpuRasterizer(scene, near=self.near, alpha_max=self.alpha_max, max_list_bytes=max_list_bytes)
+        part = CpuRasterizer(
+            scene, near=self.near, alpha_max=self.alpha_max, max_intersection_bytes=max_intersection_bytes
+        )
         part.background = self.background
         places = torch.where(rows, rows.cumsum(0, dtype=torch.int32) - 1, -1).to(torch.int32).numpy()
-        part._lists = KeptLists(part._build, max_list_bytes, self._lists, lambda lists: lists_of_subset(lists, places))
+        part._intersections = ViewCache(
+            part._build,
+            max_intersection_bytes,
+            self._intersections,
+            lambda isects: intersections_of_subset(isects, places),
+        )
         self._shapes = None
         return part
 
-    def _build(self, camera: Camera) -> RasterLists:
+    def _build(self, camera: Camera) -> TileIntersections:
         if self._shapes is None:
             self._shapes = Shapes.of(self.scene)
-        return build_raster_lists(self.scene, camera, near=self.near, shapes=self._shapes)
+        return build_tile_intersections(self.scene, camera, near=self.near, shapes=self._shapes)
 
-    def lists(self, camera: Camera) -> RasterLists:
+    def intersections(self, camera: Camera) -> TileIntersections:
         """Return the tile intersections of a view, cached or newly built.
 
         Raises:
-            TooManyIntersectionsError: See `build_raster_lists`.
+            TooManyIntersectionsError: See `build_tile_intersections`.
         """
-        return self._lists.of(camera)
+        return self._intersections.of(camera)
 
-    def has_lists(self, camera: Camera) -> bool:
+    def has_intersections(self, camera: Camera) -> bool:
         """Return whether the view's tile intersections are cached, so it needs no projection and no sorting."""
-        return self._lists.holds(camera)
+        return self._intersections.holds(camera)
 
-    def let_go_of_lists(self, camera: Camera, left: int) -> None:
+    def drop_intersections(self, camera: Camera, left: int) -> None:
         """Drop the view's tile intersections, and reduce the budget for all others to `left` bytes."""
-        self._lists.take(camera)
-        self._lists.limit(left)
+        self._intersections.take(camera)
+        self._intersections.limit(left)
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
@@ -122,22 +135,22 @@ class CpuRasterizer:
         """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows."""
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, _CPU).numpy()
-        lists = self.lists(camera)
-        projection = lists.projection
-        slot_gradients = np.empty((len(lists.ranks), 3), dtype=np.float32)
+        isects = self.intersections(camera)
+        projection = isects.projection
+        slot_gradients = np.empty((len(isects.ranks), 3), dtype=np.float32)
         gradient = np.zeros((len(self.scene), 3), dtype=np.float32)
         with kernel_threads():
             kernels.color_gradient(
-                lists.ranks,
-                lists.slots,
-                lists.starts,
+                isects.ranks,
+                isects.slots,
+                isects.starts,
                 projection.values,
                 pixels,
                 band[0],
                 self.alpha_max,
                 slot_gradients,
             )
-            kernels.add_slots(slot_gradients, lists.first_slots, projection.gaussians, gradient)
+            kernels.add_slots(slot_gradients, isects.first_slots, projection.gaussians, gradient)
         return torch.from_numpy(gradient)
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -145,28 +158,30 @@ class CpuRasterizer:
 
         Bit-identical to `coverage`, and to a column of `color_gradient` of ones.
         """
-        lists = self.lists(camera)
-        slot_weights = np.empty(len(lists.ranks), dtype=np.float32)
+        isects = self.intersections(camera)
+        slot_weights = np.empty(len(isects.ranks), dtype=np.float32)
         weights = np.zeros(len(self.scene), dtype=np.float32)
         transmittance = np.empty((camera.height, camera.width), dtype=np.float32)
-        values = lists.projection.values
+        values = isects.projection.values
         with kernel_threads():
-            kernels.survey(lists.ranks, lists.slots, lists.starts, values, self.alpha_max, slot_weights, transmittance)
-            kernels.add_slot_weights(slot_weights, lists.first_slots, lists.projection.gaussians, weights)
+            kernels.survey(
+                isects.ranks, isects.slots, isects.starts, values, self.alpha_max, slot_weights, transmittance
+            )
+            kernels.add_slot_weights(slot_weights, isects.first_slots, isects.projection.gaussians, weights)
         return 1 - torch.from_numpy(transmittance), torch.from_numpy(weights)
 
     def _render(self, colors: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Return the image and the final transmittance of a band."""
-        lists = self.lists(camera)
+        isects = self.intersections(camera)
         height = band[1] - band[0]
         image = np.empty((height, camera.width, 3), dtype=np.float32)
         transmittance = np.empty((height, camera.width), dtype=np.float32)
         with kernel_threads():
             kernels.render(
-                lists.ranks,
-                lists.starts,
-                lists.projection.values,
-                lists.projection.gaussians,
+                isects.ranks,
+                isects.starts,
+                isects.projection.values,
+                isects.projection.gaussians,
                 colors,
                 self.background,
                 band[0],

@@ -25,6 +25,7 @@ from sgsst_core.rasterizer.arguments import (
 from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rotations import unit_rotations
 
 #: Number of (pixel, Gaussian) pairs per batch; a batch holds about ten tensors of this size.
 _BATCH_PAIRS = 1 << 20
@@ -49,17 +50,6 @@ class Splats:
     extent_y: Tensor
 
 
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Return the rotation matrices [N, 3, 3] of wxyz quaternions [N, 4] of any non-zero norm."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
 def perspective_derivative(centers: Tensor, camera: Camera) -> Tensor:
     """Return the Jacobian [N, 2, 3] of the projection at camera-space centers [N, 3].
 
@@ -82,7 +72,9 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
     centers = scene.means.double() @ pose[:3, :3].T + pose[:3, 3]
     index = torch.nonzero(centers[:, 2] >= near)[:, 0]
     centers = centers[index]
-    factor = perspective_derivative(centers, camera) @ pose[:3, :3] @ rotation_matrices(scene.quats[index].double())
+    quats = scene.quats[index].double()
+    rotations = unit_rotations(quats / quats.norm(dim=-1, keepdim=True))
+    factor = perspective_derivative(centers, camera) @ pose[:3, :3] @ rotations
     factor = factor * scene.scales[index].double().exp()[:, None, :]  # covariance without blur is factor factor^T
     m0, m1 = factor[:, 0], factor[:, 1]
     p, q, r = (m0 * m0).sum(-1) + EPS2D, (m0 * m1).sum(-1), (m1 * m1).sum(-1) + EPS2D
@@ -215,7 +207,7 @@ class ReferenceRasterizer:
 
     def _batches(self, camera: Camera, band: Rows) -> Iterator[tuple[Tensor, Splats]]:
         """Yield the pixels [b, n] of b raster tiles with the splats [b, k] to blend, padded with empty splats."""
-        splats, ranks, counts = self._lists(camera)
+        splats, ranks, counts = self._intersections(camera)
         starts = counts.cumsum(0) - counts
         first_row = torch.arange(len(counts)) // -(-camera.width // RASTER_TILE) * RASTER_TILE
         inside = (counts > 0) & (first_row < band[1]) & (first_row + RASTER_TILE > band[0])
@@ -231,7 +223,7 @@ class ReferenceRasterizer:
             for pixels in tile_pixels(tiles, camera, band).split(at_once, dim=1):
                 yield pixels, batch
 
-    def _lists(self, camera: Camera) -> tuple[Splats, Tensor, Tensor]:
+    def _intersections(self, camera: Camera) -> tuple[Splats, Tensor, Tensor]:
         """Return the tile intersections of a camera.
 
         Returns:
@@ -241,7 +233,7 @@ class ReferenceRasterizer:
         key = camera_key(camera)
         if self._prepared is None or self._prepared[0] != key:
             splats = splat(self.scene, camera, near=self.near)
-            ranks, counts = tile_lists(splats, camera)
+            ranks, counts = tile_intersections(splats, camera)
             empty = len(splats.gaussians)
             ranks = torch.cat([ranks, torch.tensor([empty])])
             fields = (getattr(splats, field) for field in Splats.__dataclass_fields__)
@@ -251,7 +243,7 @@ class ReferenceRasterizer:
         return self._prepared[1:]
 
 
-def tile_lists(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
+def tile_intersections(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return the ranks of the splats in each raster tile, and their number per tile [tiles].
 
     Extents are enlarged by one pixel.

@@ -17,14 +17,11 @@ from sgsst_core.rasterizer import kernels
 from sgsst_core.rasterizer.arguments import Rows
 from sgsst_core.rasterizer.cached_weights import Precision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.tile_intersections import run_starts
 from sgsst_core.scene.camera import Camera
 
 _ITEM_BYTES = 20  # Gaussian index, slot, gradient
 _PIECE_BYTES = 4  # item index
-
-
-def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
 
 
 class CountedStrips:
@@ -38,11 +35,11 @@ class CountedStrips:
 
     def __init__(self, rasterizer: CpuRasterizer, camera: Camera, band: Rows) -> None:
         self.rasterizer, self.camera, self.band = rasterizer, camera, band
-        self.lists = lists = rasterizer.lists(camera)
-        strips = (len(lists.starts) - 1) * (RASTER_TILE // kernels.STRIP)
-        sizes = (strips, strips * kernels.BLOCKS, len(lists.ranks))
+        self.intersections = isects = rasterizer.intersections(camera)
+        strips = (len(isects.starts) - 1) * (RASTER_TILE // kernels.STRIP)
+        sizes = (strips, strips * kernels.BLOCKS, len(isects.ranks))
         self.items, self.pieces, self.slot_items = (np.zeros(size, dtype=np.int64) for size in sizes)
-        tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values)
+        tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values)
         counts = (self.items, self.pieces, self.slot_items)
         with kernel_threads():
             kernels.count_weights(*tiles, band, camera.width, rasterizer.alpha_max, *counts)
@@ -67,14 +64,14 @@ class WeightStrips:
     """
 
     def __init__(self, counted: CountedStrips, precision: Precision) -> None:
-        rasterizer, lists, band = counted.rasterizer, counted.lists, counted.band
+        rasterizer, isects, band = counted.rasterizer, counted.intersections, counted.band
         self.first_row = band[0]
         self.background = rasterizer.background
-        self.gaussians = lists.projection.gaussians
+        self.gaussians = isects.projection.gaussians
         self.nbytes = counted.nbytes(precision)
         self._total = len(rasterizer.scene)
-        slot_starts = _offsets(counted.slot_items)
-        self.first_slots = slot_starts[lists.first_slots]
+        slot_starts = run_starts(counted.slot_items)
+        self.first_slots = slot_starts[isects.first_slots]
         items, pieces = int(counted.items.sum()), int(counted.pieces.sum())
         weights: NDArray[np.float32] | NDArray[np.uint16]
         if precision == "float32":
@@ -82,8 +79,8 @@ class WeightStrips:
         else:
             weights = np.empty(pieces * kernels.PIECE, dtype=np.uint16)
         self.strips = kernels.Strips(
-            item_starts=_offsets(counted.items),
-            piece_starts=_offsets(counted.pieces),
+            item_starts=run_starts(counted.items),
+            piece_starts=run_starts(counted.pieces),
             gaussians=np.empty(items, dtype=np.int32),
             slots=np.empty(items, dtype=np.int32),
             items=np.empty(pieces, dtype=np.int32),
@@ -93,7 +90,7 @@ class WeightStrips:
         self.transmittance = torch.from_numpy(transmittance)
         # Used by one thread at a time: see `kernel_threads`.
         self._slot_gradients = np.empty((items, 3), dtype=np.float32)
-        tiles = (lists.ranks, lists.slots, lists.starts, lists.projection.values, self.gaussians)
+        tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values, self.gaussians)
         with kernel_threads():
             kernels.keep_weights(*tiles, band, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
 

@@ -24,8 +24,8 @@ from sgsst_core.rasterizer.arguments import (
     check_image_gradient,
     check_rows,
 )
-from sgsst_core.rasterizer.kept_lists import KeptLists
-from sgsst_core.rasterizer.raster_lists import check_intersections, tile_grid
+from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
+from sgsst_core.rasterizer.view_cache import ViewCache
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -33,12 +33,12 @@ from sgsst_core.scene.gaussians import Scene
 _TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
 _SUPPORT_BITS = -math.log2(ALPHA_MIN)
 #: Default budget for tile intersections in bytes; they take some 80 per visible Gaussian and 8 per Gaussian-tile pair.
-DEFAULT_LIST_BYTES = 4 << 30
+DEFAULT_INTERSECTION_BYTES = 4 << 30
 
 
 @dataclass(frozen=True)
-class DeviceLists:
-    """`raster_lists.RasterLists` on the device, with V visible Gaussians and E pairs of Gaussian and raster tile.
+class DeviceIntersections:
+    """Tile intersections on the device, with V visible Gaussians and E pairs of Gaussian and raster tile.
 
     Attributes:
         gaussians: [V] int64, indices into the scene, front to back.
@@ -70,7 +70,7 @@ class TritonRasterizer:
 
     Color gradients are reproducible bit for bit on one machine: every pair of Gaussian and tile has a slot of its own,
     and slots are added in a fixed order. Bands of rows put together are bit-identical to the whole view. Tile
-    intersections are cached within a budget (`KeptLists`).
+    intersections are cached within a budget (`ViewCache`).
 
     Args:
         scene: Scene, whose geometry must not change during this object's lifetime.
@@ -78,9 +78,9 @@ class TritonRasterizer:
         near: Near plane in world units.
         device: GPU, or the CPU if Triton's interpreter is on (TRITON_INTERPRET=1). None for the GPU if there is one.
         alpha_max: Upper limit of alpha.
-        max_list_bytes: Memory budget for tile intersections in bytes.
+        max_intersection_bytes: Memory budget for tile intersections in bytes.
         beside: Rasterizer whose budget for tile intersections this one shares, with lower priority, instead of
-            `max_list_bytes`; None for a budget of its own.
+            `max_intersection_bytes`; None for a budget of its own.
 
     Raises:
         SettingsError: If Triton is missing or cannot run on the device.
@@ -98,7 +98,7 @@ class TritonRasterizer:
         near: float = NEAR,
         device: torch.device | str | None = None,
         alpha_max: float = ALPHA_MAX,
-        max_list_bytes: int = DEFAULT_LIST_BYTES,
+        max_intersection_bytes: int = DEFAULT_INTERSECTION_BYTES,
         beside: TritonRasterizer | None = None,
     ) -> None:
         if not near > 0:
@@ -112,16 +112,16 @@ class TritonRasterizer:
             tensor.to(self.device).float().contiguous()
             for tensor in (scene.means, scene.quats, scene.scales, scene.opacities)
         ]
-        host = None if beside is None else beside._lists
-        self._lists: KeptLists[DeviceLists] = KeptLists(self._build, max_list_bytes, host=host)
+        host = None if beside is None else beside._intersections
+        self._intersections: ViewCache[DeviceIntersections] = ViewCache(self._build, max_intersection_bytes, host=host)
 
-    def lists(self, camera: Camera) -> DeviceLists:
+    def intersections(self, camera: Camera) -> DeviceIntersections:
         """Return the tile intersections of a view, cached or newly built.
 
         Raises:
             TooManyIntersectionsError: If there are more pairs of Gaussian and tile than 32-bit positions can address.
         """
-        return self._lists.of(camera)
+        return self._intersections.of(camera)
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
@@ -140,17 +140,17 @@ class TritonRasterizer:
         band = check_rows(camera, rows)
         pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
         gradient = torch.zeros((len(self.scene), 3), device=self.device)
-        lists = self.lists(camera)
-        visible = len(lists.gaussians)
+        isects = self.intersections(camera)
+        visible = len(isects.gaussians)
         if not visible:
             return gradient
-        slots = torch.zeros((len(lists.ranks), 3), device=self.device)
+        slots = torch.zeros((len(isects.ranks), 3), device=self.device)
         across, tiles = tiles_of(camera, band)
         kernels.slot_gradients[(tiles,)](
-            lists.ranks, lists.slots, lists.starts, lists.values, pixels, slots, camera.width, *band, across,
+            isects.ranks, isects.slots, isects.starts, isects.values, pixels, slots, camera.width, *band, across,
             **self.cuts(),
         )  # fmt: skip
-        add_slots_(gradient, slots, lists.first_slots, lists.gaussians)
+        add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
         return gradient
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -160,20 +160,20 @@ class TritonRasterizer:
         """
         from sgsst_core.rasterizer import triton_kernels as kernels
 
-        lists = self.lists(camera)
+        isects = self.intersections(camera)
         weights = torch.zeros(len(self.scene), device=self.device)
-        slots = torch.zeros(len(lists.ranks), device=self.device)
+        slots = torch.zeros(len(isects.ranks), device=self.device)
         transmittance = torch.empty((camera.height, camera.width), device=self.device)
         across, tiles = tiles_of(camera, (0, camera.height))
         kernels.survey[(tiles,)](
-            lists.ranks, lists.slots, lists.starts, lists.values, slots, transmittance,
+            isects.ranks, isects.slots, isects.starts, isects.values, slots, transmittance,
             camera.width, camera.height, across,
             **self.cuts(),
         )  # fmt: skip
-        visible, block = len(lists.gaussians), kernels.ADDED.value
+        visible, block = len(isects.gaussians), kernels.ADDED.value
         if visible:
             kernels.add_slot_weights[(-(-visible // block),)](
-                slots, lists.first_slots, lists.gaussians, weights, visible, BLOCK=block, SLOTS=kernels.SLOTS.value
+                slots, isects.first_slots, isects.gaussians, weights, visible, BLOCK=block, SLOTS=kernels.SLOTS.value
             )
         return 1 - transmittance, weights
 
@@ -181,13 +181,13 @@ class TritonRasterizer:
         """Return the image and the final transmittance of a band."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
-        lists = self.lists(camera)
+        isects = self.intersections(camera)
         height = band[1] - band[0]
         image = torch.empty((height, camera.width, 3), device=self.device)
         transmittance = torch.empty((height, camera.width), device=self.device)
         across, tiles = tiles_of(camera, band)
         kernels.render[(tiles,)](
-            lists.ranks, lists.starts, lists.gaussians, lists.values, colors, self.background, image, transmittance,
+            isects.ranks, isects.starts, isects.gaussians, isects.values, colors, self.background, image, transmittance,
             camera.width, *band, across,
             **self.cuts(),
         )  # fmt: skip
@@ -205,7 +205,7 @@ class TritonRasterizer:
             "num_warps": 8,
         }
 
-    def _build(self, camera: Camera) -> DeviceLists:
+    def _build(self, camera: Camera) -> DeviceIntersections:
         """Project, sort by depth and compute tile intersections; synchronizes with the device once."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
@@ -235,7 +235,7 @@ class TritonRasterizer:
         across, down = tile_grid(camera)
         edges = torch.arange(across * down + 1, dtype=torch.int32, device=self.device)
         starts = torch.searchsorted(tiles, edges)
-        return DeviceLists(order, values[order], starts, ranks[slots], slots.to(torch.int32), first_slots)
+        return DeviceIntersections(order, values[order], starts, ranks[slots], slots.to(torch.int32), first_slots)
 
 
 def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: Tensor) -> None:

@@ -48,7 +48,7 @@ def _tile_rows(value_y, extent_y, height):
 def _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, first, last, width):
     """Return the tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last.
 
-    See `raster_lists._tile_span`.
+    See `tile_intersections._tile_span`.
     """
     top, bottom = first.to(tl.float64) + 0.5 - y, last.to(tl.float64) + 0.5 - y
     safe = tl.where(extent_x > 0, extent_x, 1.0)

@@ -16,7 +16,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.palette import INK, PAPER
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene, sampled
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Sizes in pixels: height of an image, maximum width of an image, gaps, and the text of labels.
@@ -78,7 +78,7 @@ def write_views(
     pictures = []
     for camera in spread(cameras, _MOST_VIEWS):
         small = resized(camera, min(camera.side, _VIEW_SIDE))
-        colors = view_colors(part.sh_dc, rest_colors(part.sh_rest, part.means, small))
+        colors = scene_colors(part, small)
         pictures.append((camera.name, _picture(rasterizer.render(colors, small))))
     width = max(picture.width for _, picture in pictures) + _GAP
     height = max(picture.height for _, picture in pictures) + _GAP + _LABEL

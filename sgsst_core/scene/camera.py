@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from sgsst_core.errors import CameraError, SettingsError
 
 if TYPE_CHECKING:
     from sgsst_core.settings import Settings
+
+V = TypeVar("V")
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,8 @@ def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
     return [resized(camera, limit) if limit and camera.side > limit else camera for camera in cameras]
 
 
-def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """Return `count` cameras, evenly spread over the list and in its order, or all if there are no more.
+def spread(views: Sequence[V], count: int) -> list[V]:
+    """Return `count` views, evenly spread over the sequence and in its order, or all if there are no more.
 
     Each is the middle one of `count` equal parts, so neither the ends of a path nor the seam of a ring are preferred.
 
@@ -99,10 +101,8 @@ def spread(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """
     if count < 1:
         raise SettingsError(f"The number of views is {count}; give at least 1.")
-    total = len(cameras)
-    if count >= total:
-        return list(cameras)
-    return [cameras[(2 * part + 1) * total // (2 * count)] for part in range(count)]
+    total, parts = len(views), min(count, len(views))
+    return [views[(2 * part + 1) * total // (2 * parts)] for part in range(parts)]
 
 
 def between(first: Camera, second: Camera) -> Camera:

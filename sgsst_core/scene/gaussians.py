@@ -91,15 +91,22 @@ def attenuation_factor(attenuation: float) -> float:
 def sampled(scene: Scene, count: int) -> Scene:
     """Return a random sample of at most `count` Gaussians, enlarged to cover about the same area together.
 
-    One Gaussian is drawn, with a fixed seed, from each run of equal length, because a file may be ordered with a
-    period. The area of a Gaussian grows with the square of its size, so sizes are multiplied by the square root of the
-    run length.
+    The area of a Gaussian grows with the square of its size, so sizes are multiplied by the square root of the number
+    of Gaussians that each one represents.
     """
-    step = -(-len(scene) // count)
-    first = torch.arange(0, len(scene), step)
-    chosen = first + torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
-    part = scene.subset(chosen.clamp_max(len(scene) - 1))
-    return replace(part, scales=part.scales + math.log(step) / 2)
+    part = scene.subset(sampled_rows(len(scene), count))
+    return replace(part, scales=part.scales + math.log(-(-len(scene) // count)) / 2)
+
+
+def sampled_rows(total: int, count: int) -> Tensor:
+    """Return a random row from each run of equal length, at most `count` of `total` rows, with a fixed seed.
+
+    Regular sampling could coincide with a period in the order of the file.
+    """
+    step = -(-total // count)
+    first = torch.arange(0, total, step)
+    chance = torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
+    return (first + chance).clamp_max(total - 1)
 
 
 def _used_coefficients(sh_rest: Tensor, rows: Tensor | None = None) -> int:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
 #: Gaussians per chunk: limits the basis [chunk, 15] and the float64 copies to some tens of megabytes.
@@ -201,6 +202,12 @@ def view_colors(
 ) -> Tensor:
     """Return the colors [N, 3] of one view, clamped at zero: `max(0, 0.5 + SH_C0 * sh_dc + rest)`."""
     return torch.add(rest + COLOR_OFFSET, sh_dc, alpha=SH_C0).clamp_min(0)
+
+
+def scene_colors(scene: Scene, camera: Camera, device: torch.device | str = "cpu") -> Tensor:
+    """Return the colors [N, 3] of a scene's Gaussians in one view, computed on a device."""
+    rest = rest_colors(scene.sh_rest.to(device), scene.means.to(device), camera)
+    return view_colors(scene.sh_dc.to(device), rest)
 
 
 def view_colors_gradient(

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.subject import rotations
+from sgsst_core.scene.rotations import rotations
 
 #: Maximum along one axis. A Gaussian that is as thick as it is long is split into at most a third as many per axis.
 MOST_PIECES = 32
@@ -46,7 +46,7 @@ _FARTHEST = 1e30
 
 
 @dataclass(frozen=True)
-class Cut:
+class AxisSplit:
     """Division of one axis into pieces, for a deviation of 1.
 
     Attributes:
@@ -125,19 +125,19 @@ def split(scene: Scene, pieces: Tensor) -> Scene:
     if pieces.shape != (len(scene), 3) or not bool(_is_number_of_pieces(pieces).all()):
         raise ValueError(f"pieces must be [{len(scene)}, 3] of 1, 3 to {MOST_PIECES}")
     counts = piece_counts(pieces)
-    cut = (counts > 1).nonzero()[:, 0]
-    if not len(cut):
+    parents = (counts > 1).nonzero()[:, 0]
+    if not len(parents):
         return scene
-    if not bool(can_be_split(scene)[cut].all()):
-        raise ValueError("Gaussians of extreme size or place cannot be cut")
+    if not bool(can_be_split(scene)[parents].all()):
+        raise ValueError("Gaussians of extreme size or place cannot be split")
     first = counts.cumsum(0) - counts
     found = scene.subset(torch.repeat_interleave(counts))
-    ends = counts[cut].cumsum(0)
+    ends = counts[parents].cumsum(0)
     start = 0
-    while start < len(cut):
+    while start < len(parents):
         before = int(ends[start - 1]) if start else 0
         stop = max(int(torch.searchsorted(ends, before + _CHUNK, right=True)), start + 1)
-        _place_children(scene, pieces, cut[start:stop], counts, first, found)
+        _place_children(scene, pieces, parents[start:stop], counts, first, found)
         start = stop
     return found
 
@@ -161,24 +161,26 @@ def ratio_of(number: int) -> float:
 
 
 @functools.cache
-def cut_into(number: int) -> Cut:
+def split_axis(number: int) -> AxisSplit:
     """Return the division of an axis into 1, or 3 to `MOST_PIECES`, pieces."""
     if number == 1:
-        return Cut(1.0, np.zeros(1), np.ones(1))
+        return AxisSplit(1.0, np.zeros(1), np.ones(1))
     ratio = ratio_of(number)
-    cuts = [cut for distance in _DISTANCES if (cut := _cut_at(number, ratio, distance / ratio)) is not None]
-    return min(cuts, key=mixture_error)
+    divisions = [
+        division for distance in _DISTANCES if (division := _split_axis_at(number, ratio, distance / ratio)) is not None
+    ]
+    return min(divisions, key=mixture_error)
 
 
-def mixture_error(cut: Cut) -> float:
+def mixture_error(division: AxisSplit) -> float:
     """Return the L2 distance of the children's mixture from the normal density, relative to the norm of the latter.
 
     The result is exact, not sampled.
     """
-    own, both = 1 / cut.ratio**2, 1 + 1 / cut.ratio**2
-    apart = cut.offsets[:, None] - cut.offsets
-    mixed = cut.weights @ _normal(apart, 2 * own) @ cut.weights
-    crossed = cut.weights @ _normal(cut.offsets, both)
+    own, both = 1 / division.ratio**2, 1 + 1 / division.ratio**2
+    apart = division.offsets[:, None] - division.offsets
+    mixed = division.weights @ _normal(apart, 2 * own) @ division.weights
+    crossed = division.weights @ _normal(division.offsets, both)
     whole = _normal(np.zeros(1), 2.0)[0]
     return float(np.sqrt(max(mixed - 2 * crossed + whole, 0.0) / whole))
 
@@ -188,7 +190,7 @@ def _normal(offsets: NDArray[np.float64], variance: float) -> NDArray[np.float64
     return density
 
 
-def _cut_at(number: int, ratio: float, distance: float) -> Cut | None:
+def _split_axis_at(number: int, ratio: float, distance: float) -> AxisSplit | None:
     """Return children at a spacing, with Gaussian weights and the right variance; None if there are none."""
     offsets = np.linspace(-1.0, 1.0, number) * ((number - 1) / 2 * distance)
     squares, wanted = offsets**2, 1 - 1 / ratio**2
@@ -201,7 +203,7 @@ def _cut_at(number: int, ratio: float, distance: float) -> Cut | None:
         low, high = (middle, high) if weights @ squares > wanted else (low, middle)
     if abs(weights @ squares - wanted) > 1e-12:  # the solution was outside the bracket
         return None
-    return Cut(ratio, offsets, weights)
+    return AxisSplit(ratio, offsets, weights)
 
 
 def _shares(squares: NDArray[np.float64], slope: float) -> NDArray[np.float64]:
@@ -221,10 +223,10 @@ def _tables() -> tuple[Tensor, Tensor, Tensor]:
     offsets, shares = torch.zeros(2, MOST_PIECES + 1, MOST_PIECES, dtype=torch.float64)
     ratios = torch.zeros(MOST_PIECES + 1, dtype=torch.float64)
     for number in (1, *range(3, MOST_PIECES + 1)):
-        cut = cut_into(number)
-        offsets[number, :number] = torch.from_numpy(cut.offsets)
-        shares[number, :number] = torch.from_numpy(np.log(cut.weights * cut.ratio))
-        ratios[number] = np.log(cut.ratio)
+        division = split_axis(number)
+        offsets[number, :number] = torch.from_numpy(division.offsets)
+        shares[number, :number] = torch.from_numpy(np.log(division.weights * division.ratio))
+        ratios[number] = np.log(division.ratio)
     return offsets, shares, ratios
 
 

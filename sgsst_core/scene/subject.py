@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 import torch
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import Scene, sampled_rows
+from sgsst_core.scene.rotations import rotations
 
 #: Gaussians sampled for computing the extent, accurate to well under a percent, and points stored of them.
 _SAMPLE, _POINTS = 100_000, 20_000
@@ -64,7 +64,7 @@ class Subject:
 
 def find_subject(scene: Scene) -> Subject:
     """Find the subject of a scene with at least one Gaussian."""
-    rows = _sample(len(scene), _SAMPLE)
+    rows = sampled_rows(len(scene), _SAMPLE)
     points = scene.means[rows].double()
     # beyond e^60 a length is practically infinite, and its square still fits
     lengths = scene.scales[rows].double().clamp(-60, 60).exp()
@@ -82,7 +82,7 @@ def find_subject(scene: Scene) -> Subject:
     hull = _hull(points[kept], turned, reach)
     left_out = float(weights[~kept].sum())
     points, weights = points[kept], weights[kept]
-    some = _sample(len(points), _POINTS)
+    some = sampled_rows(len(points), _POINTS)
     return Subject(points[some], weights[some] / weights[some].sum(), hull, left_out)
 
 
@@ -101,25 +101,6 @@ def spread_directions(count: int) -> Tensor:
     angle = place * math.pi * (1 + math.sqrt(5))
     across = (1 - height**2).sqrt()
     return torch.stack([across * angle.cos(), across * angle.sin(), height], dim=1)
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """Return the rotation matrices [P, 3, 3] of wxyz quaternions [P, 4]; the identity for a zero quaternion."""
-    nothing = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    given = torch.where((quats != 0).any(1, keepdim=True), quats, nothing)
-    turned: Tensor = torch.from_numpy(Rotation.from_quat(given.roll(-1, 1).numpy()).as_matrix())
-    return turned
-
-
-def _sample(total: int, count: int) -> Tensor:
-    """Return a random row from each run of equal length, with a fixed seed.
-
-    Regular sampling could coincide with a period in the order of the file.
-    """
-    step = -(-total // count)
-    first = torch.arange(0, total, step)
-    chance = torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
-    return (first + chance).clamp_max(total - 1)
 
 
 def _without_strays(points: Tensor, weights: Tensor) -> Tensor:

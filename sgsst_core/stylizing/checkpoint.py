@@ -315,14 +315,14 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
-    looked = values.pop("survey")
-    regions = [Rectangle(**region) for region in looked.pop("regions")]
+    survey = values.pop("survey")
+    regions = [Rectangle(**region) for region in survey.pop("regions")]
     decisions = tuple(Decision(**decision) for decision in values.pop("decisions"))
     covered = tuple(values.pop("covered"))
     expected = values.pop("prediction")
     refined = values.pop("refinement", None)
     return Plan(
-        survey=Survey(total_blend_weights=tensors["plan.total_weights"], regions=regions, **looked),
+        survey=Survey(total_blend_weights=tensors["plan.total_weights"], regions=regions, **survey),
         optimized=tensors["plan.optimized"],
         seen=tensors["plan.seen"],
         covered=covered,

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.compiled import kernel_threads
+from sgsst_core.scene.rotations import unit_rotations
 from sgsst_core.stylizing import color_transport_kernels
 
 #: Number of rounds, each with its own axes; enough to reduce the remaining distance to that between samples.
@@ -104,17 +105,8 @@ def _turns() -> Iterator[Tensor]:
         part, angle = (number + 0.5) / (ROUNDS - 1), 2 * math.pi * (number + 0.5)
         first, second = angle / math.sqrt(2), angle / _PSI
         low, high = math.sqrt(part), math.sqrt(1 - part)
-        yield _turn(low * math.sin(first), low * math.cos(first), high * math.sin(second), high * math.cos(second))
-
-
-def _turn(w: float, x: float, y: float, z: float) -> Tensor:
-    """Return the rotation matrix [3, 3] of a unit quaternion."""
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.tensor(rows, dtype=torch.float64)
+        quat = (low * math.sin(first), low * math.cos(first), high * math.sin(second), high * math.cos(second))
+        yield unit_rotations(torch.tensor(quat, dtype=torch.float64))
 
 
 def _along(values: Tensor, wanted: Tensor) -> _Map:

@@ -17,12 +17,6 @@ Evaluation = dict[int, LossTerms]
 StyleTargets = dict[int, ScaleTarget]
 
 
-def evaluation_views(covered: Sequence[int], most: int) -> list[int]:
-    """Return at most `most` views, evenly spread; the contact sheet shows the same ones."""
-    count = min(most, len(covered))
-    return [covered[(2 * part + 1) * len(covered) // (2 * count)] for part in range(count)]
-
-
 def evaluate(
     views: Views, style_targets: Callable[[Camera], StyleTargets], indices: Sequence[int], sh_dc: Tensor
 ) -> Evaluation:

@@ -16,9 +16,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import memory_for
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.difference import psnr
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
@@ -33,7 +34,7 @@ from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.scene.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.style_picture import prepared_style
@@ -135,7 +136,7 @@ class _Refining:
 
     def run(self) -> Refinement:
         """Run the refinement."""
-        covered = self._look()
+        covered = self._survey()
         count = len(self._scene)
         nothing = Refinement(torch.ones((count, 3), dtype=torch.uint8), 0, count)
         if not covered:
@@ -149,10 +150,12 @@ class _Refining:
         fitted = spread_evenly(covered, GRADIENT_VIEWS)
         kept, change = self._as_far_as_the_picture_stays(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
         counts = piece_counts(kept)
-        cut = int((counts > 1).sum())
+        parents = int((counts > 1).sum())
         if change is None:
             return replace(nothing, taken_back=chosen)
-        return Refinement(kept, cut, int(counts.sum()), size, change.psnr, change.lowest, chosen - cut, change.sh_dc)
+        return Refinement(
+            kept, parents, int(counts.sum()), size, change.psnr, change.lowest, chosen - parents, change.sh_dc
+        )
 
     def _may_be_split(self) -> Tensor:
         """Return the mask [N] bool of Gaussians that may be split."""
@@ -176,7 +179,7 @@ class _Refining:
             pieces = self._collectives.broadcast(partial(self._without_the_worst, pieces, change))
         return torch.ones_like(pieces), None
 
-    def _look(self) -> list[int]:
+    def _survey(self) -> list[int]:
         """Survey every view, and return those that see anything."""
         collectives, cameras = self._collectives, self._planning_context.cameras
         covered = []
@@ -201,7 +204,7 @@ class _Refining:
             self._planning_context.network,
             content_weight=0.0,
             style_loss=settings.style_loss,
-            memory=int(self._planning_context.machine.memory * MEMORY_SHARES["activations"]),
+            memory=memory_for("activations", self._planning_context.machine.memory),
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,
             scales=ScaleWeights(settings.scales),
@@ -227,20 +230,20 @@ class _Refining:
         """Return the effect of pieces [N, 3] on the unstylized image of some views, with colors fitted to others."""
         scene, name = split(self._scene, pieces), self._rasterizer.name
         options = rasterizer_options(name, self._settings, self._planning_context.machine.memory)
-        cut = make_rasterizer(name, scene, **options)
-        scene = self._fit(scene, cut, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
+        rasterizer = make_rasterizer(name, scene, **options)
+        scene = self._fit(scene, rasterizer, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
         squared = torch.zeros(len(self._scene), dtype=torch.float64)
         errors: dict[int, float] = {}
         for index in self._own(views):
             camera = self._planning_context.cameras[index]
             before = render(self._scene, self._rasterizer, camera).clamp(0, 1)
-            change = (render(scene, cut, camera).clamp(0, 1) - before).square()
+            change = (render(scene, rasterizer, camera).clamp(0, 1) - before).square()
             errors[index] = float(change.mean(dtype=torch.float64))
             squared += self._rasterizer.color_gradient(change, camera).double().sum(dim=1).cpu()
         every = [error for part in self._collectives.all_gather(errors) for error in part.values()]
         return _Change(psnr(sum(every) / len(every)), psnr(max(every)), scene.sh_dc, self._sum(squared))
 
-    def _fit(self, scene: Scene, cut: Rasterizer, children: Tensor, views: Sequence[int]) -> Scene:
+    def _fit(self, scene: Scene, rasterizer: Rasterizer, children: Tensor, views: Sequence[int]) -> Scene:
         """Fit the colors of children [M] bool in a split scene so that views look as before.
 
         Images are linear in colors. Each step adds to every child the mean error of its pixels, weighted by blend
@@ -252,9 +255,9 @@ class _Refining:
             lacks = torch.zeros((len(scene), 4), dtype=torch.float64, device=self._rasterizer.device)
             for index in self._own(views):
                 camera = self._planning_context.cameras[index]
-                missing = render(self._scene, self._rasterizer, camera) - render(scene, cut, camera)
-                lacks[:, :3] += cut.color_gradient(missing, camera)
-                lacks[:, 3] += cut.survey(camera)[1]
+                missing = render(self._scene, self._rasterizer, camera) - render(scene, rasterizer, camera)
+                lacks[:, :3] += rasterizer.color_gradient(missing, camera)
+                lacks[:, 3] += rasterizer.survey(camera)[1]
             lacks = self._collectives.all_reduce(lacks)
             step = lacks[:, :3] / lacks[:, 3:].clamp_min(1.0) / SH_C0
             more = torch.where(children[:, None], step, 0.0).to("cpu", torch.float32)
@@ -263,11 +266,11 @@ class _Refining:
 
     def _without_the_worst(self, pieces: Tensor, change: _Change) -> Tensor:
         """Restore the Gaussians under which the image changes most, up to a fraction of the total change."""
-        cut = (piece_counts(pieces) > 1).nonzero()[:, 0]
-        density = change.squared[cut] / self._footprints.weights[cut].clamp_min(1.0)
+        parents = (piece_counts(pieces) > 1).nonzero()[:, 0]
+        density = change.squared[parents] / self._footprints.weights[parents].clamp_min(1.0)
         order = torch.argsort(density, descending=True, stable=True)
-        summed = change.squared[cut][order].cumsum(0)
-        worst = cut[order[: int((summed < _TAKEN_BACK * summed[-1]).sum()) + 1]]
+        summed = change.squared[parents][order].cumsum(0)
+        worst = parents[order[: int((summed < _TAKEN_BACK * summed[-1]).sum()) + 1]]
         fewer = pieces.clone()
         fewer[worst] = 1
         return fewer
@@ -291,20 +294,10 @@ class _Refining:
 
 def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
     """Return the image [H, W, 3] of a scene, using a rasterizer with its geometry."""
-    device = rasterizer.device
-    rest = rest_colors(scene.sh_rest.to(device), scene.means.to(device), camera)
-    return rasterizer.render(view_colors(scene.sh_dc.to(device), rest), camera)
+    return rasterizer.render(scene_colors(scene, camera, rasterizer.device), camera)
 
 
 def spread_evenly(views: Sequence[int], most: int) -> list[int]:
     """Return at most `most` views, evenly spread and including the first."""
     count = min(most, len(views))
     return [views[place * len(views) // count] for place in range(count)]
-
-
-def psnr(error: float) -> float:
-    """Return the PSNR in dB for a mean squared error of values in 0..1.
-
-    Errors are at least 1e-14, the float32 resolution.
-    """
-    return -10 * math.log10(max(error, 1e-14))

@@ -15,7 +15,7 @@ import psutil
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import LISTS_BESIDE_WEIGHTS, MEMORY_SHARES, device_peak, forget_device_peak
+from sgsst_core.budget import device_peak, forget_device_peak, least_intersection_memory, memory_for
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
@@ -33,7 +33,7 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import repeatable
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.ahead import PhotoLoader
@@ -41,7 +41,6 @@ from sgsst_core.stylizing.evaluation import (
     Evaluation,
     StyleTargets,
     evaluate,
-    evaluation_views,
     mean_evaluation,
     mean_loss,
 )
@@ -261,7 +260,7 @@ class Stylizer:
             self.network,
             content_weight=settings.content_weight,
             style_loss=settings.style_loss,
-            memory=int(self.memory * MEMORY_SHARES["activations"]),
+            memory=memory_for("activations", self.memory),
             coarsest=settings.coarsest_side,
             style_scale=settings.style_scale,
             scales=ScaleWeights(settings.scales),
@@ -282,18 +281,18 @@ class Stylizer:
         if whole is not None and whole.name == name and plan.seen.all():
             uncached = whole
         elif isinstance(whole, CpuRasterizer) and whole.name == name:
-            uncached = whole.of_subset(seen, plan.seen, max_list_bytes=options["max_list_bytes"])
+            uncached = whole.of_subset(seen, plan.seen, max_intersection_bytes=options["max_intersection_bytes"])
         else:  # data that a GPU rasterizer prepared for the whole scene refer to Gaussians by index
             uncached = make_rasterizer(name, seen, **options)
         if plan.rasterizer != "cached":
             return uncached, None
-        budget = int(self.memory * MEMORY_SHARES["rasterizer"])
+        budget = memory_for("rasterizer", self.memory)
         share = budget // 4 if plan.coarse_weights else 0
         cached = make_rasterizer(
             "cached",
             seen,
             max_bytes=budget - share,
-            least_list_bytes=self._least_list_bytes,
+            least_intersection_bytes=self._least_intersection_bytes,
             precision="half" if plan.cached_weights == "half" else "float32",
             at_first_use=False,
             uncached=uncached,
@@ -304,10 +303,10 @@ class Stylizer:
         return cached, coarse
 
     @property
-    def _least_list_bytes(self) -> int:
+    def _least_intersection_bytes(self) -> int:
         """Budget in bytes for tile intersections next to cached weights, taken from the memory for views."""
         on_cpu = self.plan.rasterizer == "cached" and self.plan.uncached == "cpu"
-        return self.memory // LISTS_BESIDE_WEIGHTS if on_cpu else 0
+        return least_intersection_memory(self.memory) if on_cpu else 0
 
     def _views(self, seen: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> Views:
         plan, settings = self.plan, self.settings
@@ -319,7 +318,7 @@ class Stylizer:
             covered=list(plan.covered),
             weighted=plan.weighted,
             photos=self.photos,
-            memory=int(self.memory * MEMORY_SHARES["views"]) - self._least_list_bytes,
+            memory=memory_for("views", self.memory) - self._least_intersection_bytes,
             keep_content="content" not in settings.keep,
             clamp_aware_gradient=settings.clamp_aware_gradient,
             regions=plan.survey.regions if plan.weighted else None,
@@ -365,8 +364,11 @@ class Stylizer:
 
     @property
     def evaluation_views(self) -> list[int]:
-        """Indices of the plan's `loss_views`, evenly spread over the views that see anything."""
-        return evaluation_views(self.views.covered, self.plan.loss_views)
+        """Indices of the plan's `loss_views`, evenly spread over the views that see anything.
+
+        The contact sheet shows the same views.
+        """
+        return spread(self.views.covered, self.plan.loss_views)
 
     def start(self) -> Evaluation:
         """Return the loss of the unstylized scene on the evaluation views; evaluated once, at the first call."""

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Shelf
+from sgsst_core.budget import Cache
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.loss.sos import ContentFeatures, Share, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -92,18 +92,18 @@ class Views:
         self._sh_rest = scene.sh_rest.to(rasterizer.device)
         self._means = scene.means.to(rasterizer.device)
         shown = memory // 16 if collectives.size > 1 else 0
-        self._shown: Shelf[_ShownKey, ShownGaussians] = Shelf(shown)
-        self._rest: Shelf[int, Tensor] = Shelf(memory // 4 - shown, _tensor_bytes)
-        self._coverage: Shelf[int, list[Tensor]] = Shelf(memory // 4, _pyramid_bytes)
+        self._shown: Cache[_ShownKey, ShownGaussians] = Cache(shown)
+        self._rest: Cache[int, Tensor] = Cache(memory // 4 - shown, _tensor_bytes)
+        self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
         #: Budget for content, half of which goes to region maps if there are any.
         content = memory // 2 if maps is None else memory // 4
-        self._region_weights: Shelf[int, list[list[Tensor]]] = Shelf(
+        self._region_weights: Cache[int, list[list[Tensor]]] = Cache(
             0 if maps is None else memory // 4, lambda every: sum(map(_pyramid_bytes, every))
         )
         kept = content if keep_content else 0
         images = kept // 2 if drawn else 0
-        self._images: Shelf[_ImageKey, Tensor] = Shelf(images, _tensor_bytes)
-        self._content: Shelf[_ContentKey, ContentFeatures] = Shelf(kept - images)
+        self._images: Cache[_ImageKey, Tensor] = Cache(images, _tensor_bytes)
+        self._content: Cache[_ContentKey, ContentFeatures] = Cache(kept - images)
         self._shares: dict[tuple[int, tuple[int, ...]], Share] = {}
         self.covered = covered
         self.weighted = weighted

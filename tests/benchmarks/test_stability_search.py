@@ -57,7 +57,7 @@ def test_what_breaks_a_bound_or_ends_in_any_other_way_is_found(monkeypatch: pyte
     job = situations.Situation(situations.crowd(20), style, settings)
     assert outcome(job) == ("within its bounds", None)
     with monkeypatch.context() as patch:
-        patch.setattr(situations, "TWIN_BOUND", 0.0)
+        patch.setattr(situations, "REFERENCE_BOUND", 0.0)
         patch.setattr(situations, "_SAFETY", 0.0)
         how, problem = outcome(job)
         assert how == "broken"

@@ -31,7 +31,7 @@ from sgsst_core.stylizing.optimizer import constrained
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Relative error bound of loss and pixel gradient of the last image against float64.
-TWIN_BOUND = 1e-4
+REFERENCE_BOUND = 1e-4
 #: Adam's longest step in learning rates: after a gradient that was 0 in all steps before.
 LONGEST_STEP = 0.1 / math.sqrt(0.001) + 0.1
 #: Fraction by which the final loss may exceed the initial one.
@@ -160,7 +160,7 @@ def strain(situation: Situation) -> CaseResult:
         }.items()
         if not holds
     ]
-    error, bound, flips = twin_error(job)
+    error, bound, flips = reference_error(job)
     note = "; ".join(broken) or f"loss {before:.3g} to {after:.3g}; {flips} ReLU and pool decisions flipped"
     return CaseResult(math.inf if broken else error, bound, note)
 
@@ -173,7 +173,7 @@ def _moved(job: Stylizer, begun: Tensor) -> float:
     return float(torch.minimum((found - begun).abs(), (found - within).abs()).max())
 
 
-def twin_error(job: Stylizer) -> tuple[float, float, int]:
+def reference_error(job: Stylizer) -> tuple[float, float, int]:
     """Compare loss and pixel gradient of a view's present image with float64.
 
     The allowed error grows with the effect of feature rounding, which no implementation avoids, and if content has
@@ -198,14 +198,14 @@ def twin_error(job: Stylizer) -> tuple[float, float, int]:
     assert found.image_gradient is not None
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
-        return math.inf, TWIN_BOUND, double.flips
+        return math.inf, REFERENCE_BOUND, double.flips
     rounding = job.loss.nearest_weight * _ROUNDING_OF_COSINES
     error = max(abs(found.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
     if not job.loss.nearest_layers:
         off = float((found.image_gradient.double() - exact.image_gradient).norm())
         error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
         uncertain = max(uncertain, _rounding_of_features(job, exact, given, weight))
-    return error, max(TWIN_BOUND, min(uncertain, _MOST_UNCERTAIN)), double.flips
+    return error, max(REFERENCE_BOUND, min(uncertain, _MOST_UNCERTAIN)), double.flips
 
 
 def _rounding_of_features(

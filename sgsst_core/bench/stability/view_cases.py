@@ -21,7 +21,7 @@ from sgsst_core.bench.stability.case import (
     texture,
 )
 from sgsst_core.errors import CameraError, TooManyIntersectionsError
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -109,9 +109,9 @@ def _blind(full: bool) -> CaseResult:
     scene = repeated(5)
     behind = replace(camera(), name="blind", world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1]).double()))
     rasterizer = make_rasterizer("cpu", scene)
-    wrong = len(set(survey(scene, [behind, camera()], rasterizer).covered) ^ {1})
+    wrong = len(set(survey_views(scene, [behind, camera()], rasterizer).covered) ^ {1})
     try:
-        survey(scene, [behind], rasterizer)
+        survey_views(scene, [behind], rasterizer)
         wrong += 1
     except CameraError:
         pass

@@ -21,7 +21,7 @@ from sgsst_core.bench.error_time import (
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.stylizing.evaluation import Evaluation
 from tests.small_scenes import cameras, style, wall
 
@@ -53,13 +53,13 @@ def test_other_style_losses_are_judged_by_the_same_one(
 ) -> None:
     """Variants are evaluated with the paper's loss, even if all of them optimize another one."""
     found: list[Evaluation] = []
-    evaluate = ExactTwin.evaluate
+    evaluate = Float32Reference.evaluate
 
-    def kept(self: ExactTwin, indices: list[int], sh_dc: Tensor) -> Evaluation:
+    def kept(self: Float32Reference, indices: list[int], sh_dc: Tensor) -> Evaluation:
         found.append(evaluate(self, indices, sh_dc))
         return found[-1]
 
-    monkeypatch.setattr(ExactTwin, "evaluate", kept)
+    monkeypatch.setattr(Float32Reference, "evaluate", kept)
     scene, views, variants = wall(), cameras(2, 48, 36), choose_variants(["nnfm", "mixed"])
     for style_loss in ("sos", "nnfm"):
         curves = error_time(scene, views, style(), variants, 1.0, weights=tiny_weights, style_loss=style_loss)

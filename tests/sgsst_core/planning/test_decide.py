@@ -512,7 +512,7 @@ def test_on_a_gpu_without_a_rasterizer_weights_are_kept_on_the_cpu() -> None:
     assert said(once, "rasterizer") == f"on the CPU: {why}"
 
 
-def test_the_reason_for_no_kept_weights_may_be_a_wish() -> None:
+def test_the_reason_for_no_cached_weights_may_be_a_wish() -> None:
     for values in ({"cached_weights": "none"}, {"keep": ("blend-weights",)}):
         assert said(plan_of(probe(), **values), "blend weights").endswith("in every step: requested")
         assert said(plan_of(on_a_gpu(FASTER), **values), "blend weights").endswith("in every step: requested")

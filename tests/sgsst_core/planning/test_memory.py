@@ -30,18 +30,18 @@ def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
     assert expected(HUGE).peak_bytes - plain == 5 * SHAPE_BYTES, "what does not fit is built anew, and not kept"
 
 
-def test_lists_of_held_out_views_take_what_the_jobs_leave() -> None:
+def test_tile_intersections_of_held_out_views_take_what_the_jobs_leave() -> None:
     plain = expected(LARGE).peak_bytes
     for steps in (40, 400, 4000):
         for size in (10**8, 10**9):
-            plan = plan_of_raster(replace(LARGE, lists_bytes=size), measured=True, steps_sos=steps)
+            plan = plan_of_raster(replace(LARGE, intersection_bytes=size), measured=True, steps_sos=steps)
             views = LEVELS[plan.measuring].views
-            lists = min((VIEWS + 4 * views) * size, ROOM) - min(VIEWS * size, ROOM)
+            isects = min((VIEWS + 4 * views) * size, ROOM) - min(VIEWS * size, ROOM)
             gaussians = 6 * (SHAPE_BYTES + 12 * 4 * views) if views else 0
             warps = min(views * HEIGHT * WIDTH * 80, 10 * GIGABYTE // 32)
             built = 5 * SHAPE_BYTES if VIEWS * size > ROOM else 0
             assert plan.prediction is not None
-            assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + lists + gaussians + warps + built
+            assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + isects + gaussians + warps + built
 
 
 def test_views_that_no_step_comes_to_take_nothing() -> None:
@@ -59,13 +59,13 @@ def test_weights_take_the_room_of_the_surveys_lists() -> None:
 
     Intersections of views whose weights do not fit may take another sixteenth of the memory.
     """
-    kept = [RasterCost(0.3, 0.1, size, size, lists_bytes=10**8) for size in (10**9, ROOM, 4 * ROOM)]
+    kept = [RasterCost(0.3, 0.1, size, size, intersection_bytes=10**8) for size in (10**9, ROOM, 4 * ROOM)]
     peaks = [plan_of(probe(raster=raster), cached_weights="float32").prediction for raster in kept]
-    base = plan_of(probe(raster=replace(kept[0], bytes=0, lists_bytes=0)), cached_weights="float32").prediction
+    base = plan_of(probe(raster=replace(kept[0], bytes=0, intersection_bytes=0)), cached_weights="float32").prediction
     assert base is not None
     rises = [found.peak_bytes - base.peak_bytes for found in peaks if found is not None]
-    lists = VIEWS * 10**8
-    assert rises == [10**9 - lists, ROOM - lists, ROOM + 300_000_000 - lists]
+    isects = VIEWS * 10**8
+    assert rises == [10**9 - isects, ROOM - isects, ROOM + 300_000_000 - isects]
 
 
 def test_the_largest_of_what_comes_and_goes_counts() -> None:
@@ -76,7 +76,7 @@ def test_the_largest_of_what_comes_and_goes_counts() -> None:
     assert many.peak_bytes - few.peak_bytes > 10**8 * min(BUILDING_BYTES, SEARCH_BYTES) - 10 * GIGABYTE
 
 
-def test_the_exact_twin_computes_in_float32() -> None:
+def test_the_reference_computes_in_float32() -> None:
     """If the job is not in float32, its activations and view contents are needed a second time."""
     found = probe(precision_ratio=2.0)
     rises = []

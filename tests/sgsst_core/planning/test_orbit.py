@@ -13,7 +13,7 @@ from sgsst_core.files.ply import read_scene
 from sgsst_core.planning.orbit import Orbit, OrbitRequest, make_orbit, orbit_decisions
 from sgsst_core.planning.plan import Decision
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import resized
 from sgsst_core.scene.gaussians import Scene
@@ -34,8 +34,8 @@ def elevations(scene: Scene, made: Orbit) -> list[float]:
 def told(scene: Scene, made: Orbit) -> dict[str, Decision]:
     """Return the decisions of the plan by item."""
     cameras = [resized(camera, 64) for camera in made.cameras]
-    looked = survey(scene, cameras, make_rasterizer("cpu", scene))
-    return {decision.item: decision for decision in orbit_decisions(made, cameras, looked)}
+    survey = survey_views(scene, cameras, make_rasterizer("cpu", scene))
+    return {decision.item: decision for decision in orbit_decisions(made, cameras, survey)}
 
 
 def table() -> Scene:

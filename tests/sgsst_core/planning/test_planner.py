@@ -11,7 +11,7 @@ import torch
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.pruning import distinct_views, pruned_image_error
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
@@ -169,7 +169,7 @@ def test_survey_finds_weights_regions_and_blind_views() -> None:
     views = cameras(2)
     away = replace(views[0], world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64)))
     rasterizer = make_rasterizer("cpu", replace(scene, means=scene.means.clamp_min(0)))
-    found = survey(rasterizer.scene, [*views, away], rasterizer)  # type: ignore[attr-defined]
+    found = survey_views(rasterizer.scene, [*views, away], rasterizer)  # type: ignore[attr-defined]
     assert found.covered == [0, 1]
     expected = sum(rasterizer.coverage(camera).double().sum() for camera in views)
     assert float(found.total_blend_weights.sum()) == pytest.approx(float(expected), rel=1e-5)

@@ -19,10 +19,10 @@ from sgsst_core.planning.probe import PlanningContext, _side, equip, measure, me
 from sgsst_core.planning.progress import PlanningProgress, progress_of
 from sgsst_core.planning.pruning import pruned_image_error
 from sgsst_core.planning.ranks_model import Link
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.raster_lists import build_raster_lists
+from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -41,7 +41,7 @@ def equipped(weights: BackboneWeights, scene: Scene, **values: Any) -> PlanningC
 def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     scene = replace(wall(), sh_rest=torch.zeros(len(wall()), 15, 3))
     planning_context = equipped(tiny_weights, scene, memory_limit=10**9)
-    probe = measure(planning_context, survey(scene, planning_context.cameras, planning_context.rasterizer), FREE)
+    probe = measure(planning_context, survey_views(scene, planning_context.cameras, planning_context.rasterizer), FREE)
     assert (probe.scene.gaussians, probe.scene.sh_degree, probe.scene.used_degree) == (len(scene), 3, 0)
     assert probe.sizes == tuple((camera.height, camera.width) for camera in cameras(3))
     assert probe.distinct == (0, 1, 2)
@@ -58,8 +58,8 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     assert probe.raster.half_bytes is not None
     assert 0 < probe.raster.half_bytes < probe.raster.bytes
     assert probe.raster.seconds > 0
-    sizes = [build_raster_lists(scene, camera).nbytes for camera in cameras(3)]
-    assert probe.raster.lists_bytes == sum(sizes) // 3
+    sizes = [build_tile_intersections(scene, camera).nbytes for camera in cameras(3)]
+    assert probe.raster.intersection_bytes == sum(sizes) // 3
     assert probe.raster.first_seconds > 0 < probe.raster.colors_seconds
     assert (probe.machine.memory_limit, probe.machine.memory, probe.machine.ranks) == (10**9, 10**9, 1)
     assert probe.process_bytes > 10**7
@@ -67,9 +67,9 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
 
 def test_matching_features_is_measured_apart(tiny_weights: BackboneWeights) -> None:
     scene = wall()
-    looked = survey(scene, cameras(3), make_rasterizer("cpu", scene))
+    survey = survey_views(scene, cameras(3), make_rasterizer("cpu", scene))
     plain, nnfm, mixed = (
-        measure(equipped(tiny_weights, scene, style_loss=style_loss, precision="bfloat16"), looked, FREE).network
+        measure(equipped(tiny_weights, scene, style_loss=style_loss, precision="bfloat16"), survey, FREE).network
         for style_loss in ("sos", "nnfm", "mixed")
     )
     assert (plain.rate.search, plain.vector_channels, plain.deepest) == (0.0, 0, "relu5_1")
@@ -108,10 +108,10 @@ def test_the_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, mo
 
 def test_the_error_of_pruning_is_measured_where_something_is_pruned(tiny_weights: BackboneWeights) -> None:
     scene = wall()
-    looked = survey(scene, cameras(3), make_rasterizer("cpu", scene))
-    threshold = float(looked.total_blend_weights.quantile(0.5))
-    probe = measure(equipped(tiny_weights, scene, prune_weight=threshold), looked, FREE)
-    left_out = looked.total_blend_weights <= threshold
+    survey = survey_views(scene, cameras(3), make_rasterizer("cpu", scene))
+    threshold = float(survey.total_blend_weights.quantile(0.5))
+    probe = measure(equipped(tiny_weights, scene, prune_weight=threshold), survey, FREE)
+    left_out = survey.total_blend_weights <= threshold
     assert probe.pruned_error == pruned_image_error(left_out, cameras(3), [0, 1, 2], make_rasterizer("cpu", scene))
 
 
@@ -120,13 +120,13 @@ def test_the_survey_counts_what_a_view_shows() -> None:
     rasterizer = make_rasterizer("reference", scene)
     ones = torch.ones(views[0].height, views[0].width, 3)
     counts = [int((rasterizer.color_gradient(ones, camera)[:, 0] > 0).sum()) for camera in views[:2]]
-    assert survey(scene, views, make_rasterizer("cpu", scene)).shown == sum(counts) / 2
+    assert survey_views(scene, views, make_rasterizer("cpu", scene)).shown == sum(counts) / 2
     assert 0 < sum(counts) < 2 * len(scene)
 
 
 def test_the_survey_tells_how_far_it_is() -> None:
     scene, told = wall(), list[PlanningProgress]()
-    survey(scene, cameras(3), make_rasterizer("cpu", scene), show=told.append)
+    survey_views(scene, cameras(3), make_rasterizer("cpu", scene), show=told.append)
     assert [(progress.done, progress.total) for progress in told] == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert told[0].seconds_left is None
     assert all(progress.seconds_left is not None for progress in told[1:])
@@ -150,7 +150,7 @@ def test_a_plan_needs_cameras_that_see_something(tiny_weights: BackboneWeights) 
 def test_an_earlier_survey_takes_the_place_of_a_look(tiny_weights: BackboneWeights) -> None:
     scene, settings, told = wall(), make_settings(), list[PlanningProgress]()
     first, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
-    second, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights, looked=first.survey, show=told.append)
+    second, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights, survey=first.survey, show=told.append)
     assert not told
     assert second.survey is first.survey
     assert torch.equal(second.seen, first.seen)

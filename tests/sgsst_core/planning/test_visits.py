@@ -16,9 +16,9 @@ from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import GIGABYTE, probe
 
 #: Intersections take 5 s and fit the cache; colors take 0.5 s.
-LARGE = RasterCost(2.0, first_seconds=5.0, lists_bytes=10**8, colors_seconds=0.5)
+LARGE = RasterCost(2.0, first_seconds=5.0, intersection_bytes=10**8, colors_seconds=0.5)
 #: Of four views, the intersections of one fit a quarter of 10 GB.
-HUGE = replace(LARGE, lists_bytes=10 * GIGABYTE // 4)
+HUGE = replace(LARGE, intersection_bytes=10 * GIGABYTE // 4)
 
 
 def plan_of(raster: RasterCost, *, measured: bool = False, **values: Any) -> Plan:
@@ -34,18 +34,18 @@ def expected(*arguments: Any, **values: Any) -> Prediction:
 
 def test_what_fits_is_made_once_and_the_rest_at_every_visit() -> None:
     made = Made(6.0, 400, 100)
-    assert (made.kept, made.once, made.always, made.kept_bytes) == (0.25, 1.5, 4.5, 100)
+    assert (made.kept, made.once, made.always, made.cached_bytes) == (0.25, 1.5, 4.5, 100)
     assert Made(6.0, 400, 500) == replace(made, room=500)
-    assert (Made(6.0, 400, 500).once, Made(6.0, 400, 500).always, Made(6.0, 400, 500).kept_bytes) == (6.0, 0.0, 400)
+    assert (Made(6.0, 400, 500).once, Made(6.0, 400, 500).always, Made(6.0, 400, 500).cached_bytes) == (6.0, 0.0, 400)
     assert (Made(6.0).once, Made(6.0, 400, 0).always) == (6.0, 6.0)
 
 
 def test_views_that_are_kept_whole_leave_a_part_of_the_room() -> None:
     made = Made(6.0, 400, 250, views=4)
-    assert (made.kept, made.once, made.always, made.kept_bytes) == (0.5, 3.0, 3.0, 200)
+    assert (made.kept, made.once, made.always, made.cached_bytes) == (0.5, 3.0, 3.0, 200)
     assert (made.fitting(2), made.fitting(4)) == (200, 100)
     alone = Made(6.0, 400, 250, views=1)
-    assert (alone.kept, alone.always, alone.kept_bytes, alone.fitting(2)) == (0.0, 6.0, 0, 200)
+    assert (alone.kept, alone.always, alone.cached_bytes, alone.fitting(2)) == (0.0, 6.0, 0, 200)
 
 
 def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
@@ -62,21 +62,21 @@ def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
     assert told[1].startswith("0% of the views'")
 
 
-def test_lists_and_colors_come_with_the_first_visit_where_they_fit() -> None:
+def test_tile_intersections_and_colors_come_with_the_first_visit_where_they_fit() -> None:
     """Reducing the survey's intersections to the rendered Gaussians takes a quarter of their cost."""
     small, large = expected(replace(LARGE, first_seconds=0.0, colors_seconds=0.0)), expected(LARGE)
     assert large.first_visit - small.first_visit == pytest.approx(0.25 * 5 + 0.5)
     assert large.seconds == small.seconds
 
 
-def test_lists_that_do_not_fit_are_made_at_every_visit() -> None:
+def test_tile_intersections_that_do_not_fit_are_made_at_every_visit() -> None:
     large, huge = expected(LARGE), expected(HUGE)
     assert huge.seconds - large.seconds == pytest.approx(5.0 * 3 / 4)
     assert large.first_visit - huge.first_visit == pytest.approx(0.25 * 5.0 * 3 / 4)
     assert huge.job > large.job
 
 
-def test_lists_of_the_survey_are_the_jobs_where_every_gaussian_is_rendered() -> None:
+def test_tile_intersections_of_the_survey_are_the_jobs_where_every_gaussian_is_rendered() -> None:
     """If only some Gaussians are rendered, the intersections must be reduced first."""
     cut, handed = expected(LARGE), expected(LARGE, keep=("unseen",))
     assert cut.first_visit - handed.first_visit == pytest.approx(0.25 * 5.0)

@@ -10,7 +10,7 @@ import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.quality.exact import ExactTwin, approximations
+from sgsst_core.quality.exact import Float32Reference, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
@@ -33,23 +33,23 @@ def make(weights: BackboneWeights, scene: object = None, **values: Any) -> Styli
     return Stylizer.planned(scene or ball(500), cameras(2), style(), settings, weights=weights)  # type: ignore[arg-type]
 
 
-def test_an_exact_job_agrees_with_its_twin(tiny_weights: BackboneWeights) -> None:
+def test_an_exact_job_agrees_with_its_reference(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, wall(sh_degree=2))
     stylizer.run_step()
-    twin = ExactTwin(stylizer)
-    error = twin.gradient_error()
+    reference = Float32Reference(stylizer)
+    error = reference.gradient_error()
     assert approximations(stylizer) == []
     assert error.relative_error < 1e-5
     assert error.cosine == pytest.approx(1, abs=1e-6)
     expected = mean_loss(stylizer.evaluate([0, 1]))
-    assert mean_loss(twin.evaluate([0, 1], stylizer.stylized())) == pytest.approx(expected, rel=1e-5)
+    assert mean_loss(reference.evaluate([0, 1], stylizer.stylized())) == pytest.approx(expected, rel=1e-5)
 
 
 def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, cached_weights="half")
     run(stylizer)
     assert approximations(stylizer) == ["half-precision blend weights"]
-    error = ExactTwin(stylizer).gradient_error()
+    error = Float32Reference(stylizer).gradient_error()
     assert 1e-6 < error.relative_error < 0.05
     assert error.seconds > 0
     assert error.seconds_exact > 0
@@ -58,12 +58,12 @@ def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights
 def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeights) -> None:
     """After some steps it has the same value as before them, and the colors of the steps are unchanged."""
     stylizer = make(tiny_weights, cached_weights="half")
-    twin = ExactTwin(stylizer)
-    first = twin.gradient_error()
+    reference = Float32Reference(stylizer)
+    first = reference.gradient_error()
     for _ in range(3):
         stylizer.run_step()
     colors = stylizer.sh_dc.clone()
-    late = twin.gradient_error(start=True)
+    late = reference.gradient_error(start=True)
     assert (late.step, late.view, late.relative_error, late.cosine) == (
         0,
         first.view,
@@ -71,7 +71,7 @@ def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeigh
         first.cosine,
     )
     assert torch.equal(stylizer.sh_dc, colors)
-    assert twin.gradient_error().relative_error != first.relative_error
+    assert reference.gradient_error().relative_error != first.relative_error
 
 
 def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: BackboneWeights) -> None:
@@ -81,7 +81,7 @@ def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: Backb
         stylizer = make(tiny_weights, prune_weight=float(weights.quantile(share)))
         stylizer.run_step()
         assert approximations(stylizer) == ["pruned Gaussians"]
-        errors.append(ExactTwin(stylizer).gradient_error().relative_error)
+        errors.append(Float32Reference(stylizer).gradient_error().relative_error)
     assert 0 < errors[0] < errors[1]
 
 
@@ -95,7 +95,7 @@ def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -
     for shop in (None, replace(planning_context, network=rounded)):
         stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=tiny_weights, planning_context=shop)
         assert approximations(stylizer) == ["TF32 convolutions"]
-        errors.append(ExactTwin(stylizer).gradient_error())
+        errors.append(Float32Reference(stylizer).gradient_error())
     assert errors[0].relative_error < 1e-5
     assert 1e-3 < errors[1].relative_error < 0.2
     assert errors[1].cosine > 0.98
@@ -108,6 +108,6 @@ def test_bfloat16_has_an_error_between_rounding_and_nonsense(tiny_weights: Backb
     plan = replace(plan, precision="bfloat16")
     stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=tiny_weights)
     assert approximations(stylizer) == ["bfloat16 features"]
-    error = ExactTwin(stylizer).gradient_error()
+    error = Float32Reference(stylizer).gradient_error()
     assert 1e-3 < error.relative_error < 0.8
     assert error.cosine > 0.6

@@ -12,7 +12,7 @@ import torch
 
 from sgsst_core.constants import NEAR
 from sgsst_core.files.ply import SceneFile, read_scene, write_scene
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.quality import findings
 from sgsst_core.quality.findings import (
     Finding,
@@ -53,9 +53,9 @@ def test_a_survey_takes_the_place_of_another_look(tmp_path: Path, turned: bool) 
         away = views[0].world_to_camera.clone()
         away[[0, 2]] *= -1  # half a turn about the camera's own vertical axis
         views[0] = replace(views[0], world_to_camera=away)
-    looked = survey(file.scene, views, make_rasterizer("cpu", file.scene, near=NEAR))
+    survey = survey_views(file.scene, views, make_rasterizer("cpu", file.scene, near=NEAR))
     reread = findings_of(file, views, style(), near=NEAR)
-    assert findings_of(file, views, style(), near=NEAR, looked=looked) == reread
+    assert findings_of(file, views, style(), near=NEAR, survey=survey) == reread
     assert any("see no Gaussian" in finding.what for finding in reread) == turned
     assert any("in no view" in finding.what for finding in reread)
 

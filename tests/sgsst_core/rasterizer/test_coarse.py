@@ -71,7 +71,7 @@ def test_agrees_with_the_average_of_the_reference(name: str) -> None:
         gradient = coarse.color_gradient(pixels, view)
         assert gradient.dtype == torch.float32
         assert relative_error(gradient, reference.color_gradient(upscaled(pixels.double(), view, scale), view)) < 1e-6
-        assert coarse.is_kept(view)
+        assert coarse.is_cached(view)
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -98,7 +98,7 @@ def test_what_fills_no_square_does_not_count(scale: int) -> None:
     assert image.shape == (2, 3, 3)
     assert not image.any()
     assert not coarse.color_gradient(torch.ones(2, 3, 3), view).any()
-    (operator,) = coarse._operators.kept.values()
+    (operator,) = coarse._operators.values.values()
     assert operator is not None
     assert len(operator.pieces.slots) == 0
 
@@ -137,7 +137,7 @@ def test_arguments_are_checked_before_any_work() -> None:
         ValueError, match=r"gradient of shape \(45, 70, 3\): scale 1 of view 'test' needs \(22, 35, 3\)"
     ):
         coarse.color_gradient(pixels_like(view), view)
-    assert coarse.kept_bytes == 0
+    assert coarse.cached_bytes == 0
 
 
 @pytest.mark.parametrize(
@@ -203,10 +203,10 @@ def test_what_does_not_fit_the_budget_is_recomputed() -> None:
                 for one in (coarse, whole):
                     assert torch.allclose(one.render(colors, view), image, atol=1e-6)
                     assert relative_error(one.color_gradient(pixels, view), gradient) < 1e-6
-        assert [coarse.is_kept(view) for view in views] == [True, True, False]
-        assert coarse.kept_bytes == budget
-        assert sum(o.nbytes for o in coarse._operators.kept.values() if o is not None) == budget
-        assert whole.kept_bytes == sum(sizes)
+        assert [coarse.is_cached(view) for view in views] == [True, True, False]
+        assert coarse.cached_bytes == budget
+        assert sum(operator.nbytes for operator in coarse._operators.values.values()) == budget
+        assert whole.cached_bytes == sum(sizes)
 
 
 def test_operators_are_far_smaller_than_the_weights_at_full_size() -> None:
@@ -216,17 +216,17 @@ def test_operators_are_far_smaller_than_the_weights_at_full_size() -> None:
     assert sizes[1] < 0.6 * sizes[0]
     assert sizes[2] < 0.2 * sizes[0]
     assert sizes == sorted(sizes, reverse=True)
-    assert coarse.kept_bytes == 0
-    assert not coarse.is_kept(view)
+    assert coarse.cached_bytes == 0
+    assert not coarse.is_cached(view)
 
 
 def test_an_operator_belongs_to_a_camera_and_a_scale() -> None:
     scene, view = cloud(seed=14), camera()
     coarse = CoarseRasterizer(CpuRasterizer(scene), 2)
     coarse.render(colors_of(scene), view)
-    assert coarse.is_kept(replace(view, name="another name"))
-    assert not coarse.at(1).is_kept(view)
-    assert not coarse.is_kept(replace(view, fx=view.fx * 1.01))
+    assert coarse.is_cached(replace(view, name="another name"))
+    assert not coarse.at(1).is_cached(view)
+    assert not coarse.is_cached(replace(view, fx=view.fx * 1.01))
 
 
 def test_scales_share_one_budget() -> None:
@@ -235,8 +235,8 @@ def test_scales_share_one_budget() -> None:
     coarse = CoarseRasterizer(cpu, 2, max_bytes=CoarseRasterizer(cpu, 2).operator_bytes(view))
     coarse.render(colors, view)
     coarse.at(3).render(colors, view)
-    assert coarse.at(2).is_kept(view)
-    assert not coarse.at(3).is_kept(view)
+    assert coarse.at(2).is_cached(view)
+    assert not coarse.at(3).is_cached(view)
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -287,4 +287,4 @@ def test_python_threads_can_share_a_rasterizer() -> None:
         gradients = [pool.submit(shared.color_gradient, pixels, view) for _ in range(8)]
     assert all(torch.equal(f.result(), image) for f in images)
     assert all(torch.equal(f.result(), gradient) for f in gradients)
-    assert shared.kept_bytes == alone.kept_bytes
+    assert shared.cached_bytes == alone.cached_bytes

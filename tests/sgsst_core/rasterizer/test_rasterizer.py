@@ -26,8 +26,8 @@ from sgsst_core.rasterizer import Rows, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
-from sgsst_core.rasterizer.raster_lists import MAX_INTERSECTIONS, check_intersections
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
+from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, check_intersections
 from sgsst_core.rasterizer.vectors import as_float
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
@@ -307,16 +307,16 @@ def test_another_clamp_is_followed_everywhere() -> None:
         assert float((image - CpuRasterizer(scene).render(colors, view)).abs().max()) > 1e-3
 
 
-def test_kept_weights_equal_recomputed_ones() -> None:
+def test_cached_weights_equal_recomputed_ones() -> None:
     scene, view = cloud(1500, seed=18), camera(130, 70)
     colors, pixels = colors_of(scene), pixels_like(view)
-    cpu, kept = CpuRasterizer(scene), CachedRasterizer(scene)
-    assert not kept.is_kept(view)
-    assert torch.equal(kept.render(colors, view), cpu.render(colors, view))
-    assert torch.equal(kept.coverage(view), cpu.coverage(view))
-    assert relative_error(kept.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
-    assert kept.is_kept(view)
-    assert kept.is_kept(replace(view, name="another name"))
+    cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
+    assert not cached.is_cached(view)
+    assert torch.equal(cached.render(colors, view), cpu.render(colors, view))
+    assert torch.equal(cached.coverage(view), cpu.coverage(view))
+    assert relative_error(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
+    assert cached.is_cached(view)
+    assert cached.is_cached(replace(view, name="another name"))
 
 
 def test_half_precision_weights_are_rounded_to_float16() -> None:
@@ -327,11 +327,9 @@ def test_half_precision_weights_are_rounded_to_float16() -> None:
     # Each weight has a relative error of at most 2^-11, and all weights are positive.
     assert bool(((half.render(colors, view) - image).abs() <= 2**-11 * image + 1e-6).all())
     assert relative_error(half.color_gradient(pixels, view), full.color_gradient(pixels, view)) < 5e-4
-    assert half.kept_bytes < 0.65 * full.kept_bytes
-    (one,), (two,) = full._kept.values(), half._kept.values()
-    assert one is not None
-    assert two is not None
-    exact, rounded = (as_float(kept.weights.strips.weights) for kept in (one, two))  # type: ignore[attr-defined]
+    assert half.cached_bytes < 0.65 * full.cached_bytes
+    (one,), (two,) = full._cached.values.values(), half._cached.values.values()
+    exact, rounded = (as_float(cached.weights.strips.weights) for cached in (one, two))  # type: ignore[attr-defined]
     assert np.array_equal(rounded, (exact * np.float32(2**14)).astype(np.float16).astype(np.float32) / 2**14)
     assert 0 < float(exact[exact > 0].min()) < 1e-5
 
@@ -342,27 +340,27 @@ def test_what_does_not_fit_the_budget_is_recomputed() -> None:
     colors, pixels = colors_of(scene), pixels_like(views[0])
     sizes = [CachedRasterizer(scene).operator_bytes(view) for view in views]
     budget = sizes[0] + sizes[1]
-    kept, cpu = CachedRasterizer(scene, max_bytes=budget), CpuRasterizer(scene)
+    cached, cpu = CachedRasterizer(scene, max_bytes=budget), CpuRasterizer(scene)
     for _ in range(2):
         for view in views:
-            assert torch.equal(kept.render(colors, view), cpu.render(colors, view))
-            assert relative_error(kept.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
-    assert [kept.is_kept(view) for view in views] == [True, True, False]
-    assert kept.kept_bytes == budget
-    weights = [k.weights for k in kept._kept.values() if k is not None]
+            assert torch.equal(cached.render(colors, view), cpu.render(colors, view))
+            assert relative_error(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
+    assert [cached.is_cached(view) for view in views] == [True, True, False]
+    assert cached.cached_bytes == budget
+    weights = [k.weights for k in cached._cached.values.values()]
     real = sum(array.nbytes for each in weights for array in each.strips)  # type: ignore[attr-defined]
     assert 0.7 * budget < real <= budget
 
 
-def test_lists_beyond_the_budget_are_held_one_at_a_time() -> None:
+def test_tile_intersections_beyond_the_budget_are_held_one_at_a_time() -> None:
     scene = cloud(300, seed=21)
     views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
-    first = CpuRasterizer(scene).lists(views[0])
-    cpu = CpuRasterizer(scene, max_list_bytes=first.nbytes)
-    kept = [cpu.lists(view) for view in views]
-    assert cpu.lists(views[0]) is kept[0]
-    assert cpu.lists(views[2]) is kept[2]
-    assert cpu.lists(views[1]) is not kept[1]
+    first = CpuRasterizer(scene).intersections(views[0])
+    cpu = CpuRasterizer(scene, max_intersection_bytes=first.nbytes)
+    cached = [cpu.intersections(view) for view in views]
+    assert cpu.intersections(views[0]) is cached[0]
+    assert cpu.intersections(views[2]) is cached[2]
+    assert cpu.intersections(views[1]) is not cached[1]
 
 
 def test_weights_and_lists_share_a_budget() -> None:
@@ -370,16 +368,16 @@ def test_weights_and_lists_share_a_budget() -> None:
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
     colors = colors_of(scene)
     weights = [CachedRasterizer(scene).operator_bytes(view) for view in views]
-    lists = [CpuRasterizer(scene).lists(view).nbytes for view in views]
-    cpu = CpuRasterizer(scene, max_list_bytes=sum(weights[:2]) + lists[2])
-    kept = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + lists[2], uncached=cpu)
+    isects = [CpuRasterizer(scene).intersections(view).nbytes for view in views]
+    cpu = CpuRasterizer(scene, max_intersection_bytes=sum(weights[:2]) + isects[2])
+    cached = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + isects[2], uncached=cpu)
     for view in views:
-        cpu.lists(view)
+        cpu.intersections(view)
     for view in views:
-        kept.render(colors, view)
-    assert [kept.is_kept(view) for view in views] == [True, True, False, False]
-    assert [cpu.has_lists(view) for view in views] == [False, False, True, False]
-    assert kept.kept_bytes + cpu._lists.kept_bytes <= sum(weights[:2]) + lists[2]
+        cached.render(colors, view)
+    assert [cached.is_cached(view) for view in views] == [True, True, False, False]
+    assert [cpu.has_intersections(view) for view in views] == [False, False, True, False]
+    assert cached.cached_bytes + cpu._intersections.cached_bytes <= sum(weights[:2]) + isects[2]
 
 
 def test_arguments_are_checked_before_any_work() -> None:

@@ -23,8 +23,8 @@ from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
-from sgsst_core.rasterizer.raster_lists import build_raster_lists
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
@@ -118,15 +118,15 @@ def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera
     assert relative_error(weights, gradient) < 1e-6
 
 
-def test_lists_are_those_of_the_cpu(case: tuple[Scene, Camera]) -> None:
+def test_tile_intersections_are_those_of_the_cpu(case: tuple[Scene, Camera]) -> None:
     scene, view = case
-    lists, expected = on_device(scene).lists(view), build_raster_lists(scene, view)
-    assert np.array_equal(lists.gaussians.cpu().numpy(), expected.projection.gaussians)
-    assert np.array_equal(lists.first_slots.cpu().numpy(), expected.first_slots)
-    assert np.array_equal(lists.starts.cpu().numpy(), expected.starts)
-    assert np.array_equal(lists.ranks.cpu().numpy(), expected.ranks)
-    assert np.array_equal(lists.slots.cpu().numpy(), expected.slots)
-    assert np.allclose(lists.values.cpu().numpy(), expected.projection.values, rtol=1e-9, atol=1e-9)
+    isects, expected = on_device(scene).intersections(view), build_tile_intersections(scene, view)
+    assert np.array_equal(isects.gaussians.cpu().numpy(), expected.projection.gaussians)
+    assert np.array_equal(isects.first_slots.cpu().numpy(), expected.first_slots)
+    assert np.array_equal(isects.starts.cpu().numpy(), expected.starts)
+    assert np.array_equal(isects.ranks.cpu().numpy(), expected.ranks)
+    assert np.array_equal(isects.slots.cpu().numpy(), expected.slots)
+    assert np.allclose(isects.values.cpu().numpy(), expected.projection.values, rtol=1e-9, atol=1e-9)
 
 
 def test_bands_put_together_are_the_same_bits() -> None:
@@ -170,19 +170,19 @@ def test_invalid_gaussians_are_left_out_as_by_the_reference() -> None:
     assert float((on_device(broken).render(colors_of(scene), view).cpu() - expected).abs().max()) < 1e-5
 
 
-def test_lists_beyond_the_budget_are_held_for_the_last_view_only() -> None:
+def test_tile_intersections_beyond_the_budget_are_held_for_the_last_view_only() -> None:
     scene, views = cloud(50), [camera(33, 20), camera(20, 33)]
-    rasterizer = on_device(scene, max_list_bytes=0)
-    first = rasterizer.lists(views[0])
-    assert rasterizer.lists(views[0]) is first
-    rasterizer.lists(views[1])
-    assert rasterizer.lists(views[0]) is not first
+    rasterizer = on_device(scene, max_intersection_bytes=0)
+    first = rasterizer.intersections(views[0])
+    assert rasterizer.intersections(views[0]) is first
+    rasterizer.intersections(views[1])
+    assert rasterizer.intersections(views[0]) is not first
 
 
 def test_too_many_intersections_are_refused_before_they_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sgsst_core.rasterizer.raster_lists.MAX_INTERSECTIONS", 10)
+    monkeypatch.setattr("sgsst_core.rasterizer.tile_intersections.MAX_INTERSECTIONS", 10)
     with pytest.raises(TooManyIntersectionsError, match="raster tiles"):
-        on_device(cloud(200)).lists(camera())
+        on_device(cloud(200)).intersections(camera())
 
 
 def test_a_trial_drawing_tells_whether_it_works(monkeypatch: pytest.MonkeyPatch) -> None:

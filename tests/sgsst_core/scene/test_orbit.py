@@ -188,7 +188,7 @@ def test_an_orbit_without_sense_is_refused(wrong: dict[str, object]) -> None:
 
 def fill(scene: Scene, views: list[Camera]) -> list[float]:
     """Return the fraction of each view's pixels that the scene covers."""
-    rasterizer = make_rasterizer("cpu", scene, max_list_bytes=0)
+    rasterizer = make_rasterizer("cpu", scene, max_intersection_bytes=0)
     return [float(rasterizer.coverage(resized(view, 256)).mean()) for view in views]
 
 

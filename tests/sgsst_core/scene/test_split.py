@@ -14,19 +14,20 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sgsst_core.files.ply import read_scene, write_scene
-from sgsst_core.rasterizer.reference import ReferenceRasterizer, rotation_matrices
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene import split as module
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rotations import unit_rotations
 from sgsst_core.scene.split import (
     MOST_PIECES,
     can_be_split,
-    cut_into,
     mixture_error,
     parents_of,
     piece_counts,
     pieces_to,
     ratio_of,
     split,
+    split_axis,
 )
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.splat_scenes import camera, cloud, single
@@ -36,7 +37,9 @@ NUMBERS = [1, *range(3, MOST_PIECES + 1)]
 
 def covariances(scene: Scene) -> Tensor:
     """Return covariances [N, 3, 3] in float64."""
-    factors = rotation_matrices(scene.quats.double()) * scene.scales.double().exp()[:, None, :]
+    factors = (
+        unit_rotations(torch.nn.functional.normalize(scene.quats.double())) * scene.scales.double().exp()[:, None, :]
+    )
     return factors @ factors.transpose(1, 2)
 
 
@@ -52,20 +55,22 @@ def mixtures(children: Scene, parents: Tensor, count: int) -> tuple[Tensor, Tens
 
 @pytest.mark.parametrize("number", NUMBERS)
 def test_an_axis_in_pieces_has_its_variance_and_nearly_its_density(number: int) -> None:
-    cut = cut_into(number)
-    assert len(cut.offsets) == len(cut.weights) == number
-    assert cut.weights.sum() == pytest.approx(1, abs=1e-14)
-    assert cut.weights @ cut.offsets == pytest.approx(0, abs=1e-12)
-    assert 1 / cut.ratio**2 + cut.weights @ cut.offsets**2 == pytest.approx(1, abs=1e-11)
-    assert cut.ratio == ratio_of(number)
+    division = split_axis(number)
+    assert len(division.offsets) == len(division.weights) == number
+    assert division.weights.sum() == pytest.approx(1, abs=1e-14)
+    assert division.weights @ division.offsets == pytest.approx(0, abs=1e-12)
+    assert 1 / division.ratio**2 + division.weights @ division.offsets**2 == pytest.approx(1, abs=1e-11)
+    assert division.ratio == ratio_of(number)
     x = np.linspace(-9, 9, 20001)
     density = np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
-    parts = np.exp(-(((x[:, None] - cut.offsets) * cut.ratio) ** 2) / 2) * cut.ratio / math.sqrt(2 * math.pi)
-    error = np.sqrt(((parts @ cut.weights - density) ** 2).sum() / (density**2).sum())
-    assert mixture_error(cut) == pytest.approx(error, abs=1e-6)
+    parts = (
+        np.exp(-(((x[:, None] - division.offsets) * division.ratio) ** 2) / 2) * division.ratio / math.sqrt(2 * math.pi)
+    )
+    error = np.sqrt(((parts @ division.weights - density) ** 2).sum() / (density**2).sum())
+    assert mixture_error(division) == pytest.approx(error, abs=1e-6)
     assert error < 0.03
     # Factor on the opacity of a child, which never exceeds the parent's.
-    assert float((cut.weights * cut.ratio).max()) <= 1
+    assert float((division.weights * division.ratio).max()) <= 1
 
 
 @settings(max_examples=40, deadline=None)

@@ -59,9 +59,9 @@ def state() -> StylizerState:
 @pytest.fixture
 def kept(state: StylizerState) -> Checkpoint:
     seen = torch.tensor([True, True, False, True, True])
-    looked = Survey(torch.rand(5, dtype=torch.float64), [0, 2], [Rectangle(0, 1, 2, 3), Rectangle(4, 5, 6, 7)], 1 / 3)
+    survey = Survey(torch.rand(5, dtype=torch.float64), [0, 2], [Rectangle(0, 1, 2, 3), Rectangle(4, 5, 6, 7)], 1 / 3)
     plan = Plan(
-        survey=looked,
+        survey=survey,
         optimized=seen,
         seen=seen,
         covered=(0, 2),

@@ -15,7 +15,7 @@ if torch.cuda.is_available():
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.graphs import FIRST_VISITS
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import Sources, build_report
 from sgsst_core.settings import PlannedBackground, make_settings
@@ -50,13 +50,13 @@ def make(
     """Make a job of two views on two scales, with three steps in each phase by default."""
     scene, views = ball(40) if scan else wall(10, 8), cameras(2, 48, 32)
     settings = make_settings(**{"coarsest_side": 16, "steps_coarse": 3, "steps_sos": 3, **values})
-    looked = survey(scene, views, make_rasterizer("cpu", scene))
-    some = looked.total_blend_weights > 0
+    survey = survey_views(scene, views, make_rasterizer("cpu", scene))
+    some = survey.total_blend_weights > 0
     plan = Plan(
-        survey=looked,
+        survey=survey,
         optimized=some,
         seen=some,
-        covered=tuple(looked.covered),
+        covered=tuple(survey.covered),
         weighted=scan,
         training_background=training_background,
         steps_coarse=settings.steps_coarse,

@@ -16,7 +16,7 @@ from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.scene.gaussians import Scene
@@ -128,10 +128,10 @@ def test_what_is_reported_is_what_is_written(tiny_weights: BackboneWeights, tmp_
     stylizer = in_bfloat16(tiny_weights)
     run(stylizer)
     measure = Measurements(stylizer)
-    written = ExactTwin(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
+    written = Float32Reference(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
     assert measure.approximated
     assert measure.evaluate()[0].total == pytest.approx(written[0].total, rel=1e-6)
-    assert ExactTwin(stylizer).gradient_error().relative_error < 0.5
+    assert Float32Reference(stylizer).gradient_error().relative_error < 0.5
 
     exact = make(tiny_weights)
     run(exact)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.difference import psnr
 from sgsst_core.planning import refine as choice
 from sgsst_core.planning.refine import LEAST_PSNR
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -17,7 +18,7 @@ from sgsst_core.scene.split import Refinement, parents_of, piece_counts
 from sgsst_core.settings import Settings, make_settings
 from sgsst_core.stylizing import refining
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.refining import psnr, refine, refined, render, spread_evenly
+from sgsst_core.stylizing.refining import refine, refined, render, spread_evenly
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights as make_tiny_weights
 from tests.small_scenes import ball, blind_camera, cameras, style, wall

@@ -16,7 +16,7 @@ from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.loss.sos import ViewTarget
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
@@ -223,12 +223,12 @@ def test_the_fingerprint_knows_regions() -> None:
     assert found[0] == fingerprint(scene, views, style(), settings, "w")
 
 
-def test_the_exact_twin_has_the_same_regions(tiny_weights: BackboneWeights) -> None:
+def test_the_reference_has_the_same_regions(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     stylizer = make(tiny_weights, scene, halves(scene), warm_start=False)
-    twin = ExactTwin(stylizer)
+    reference = Float32Reference(stylizer)
     scales = list(range(stylizer.scale_count(0)))
-    own, exact = stylizer.gradient(0, scales)[0], twin.gradient(0, scene.sh_dc, scales)[0]
+    own, exact = stylizer.gradient(0, scales)[0], reference.gradient(0, scene.sh_dc, scales)[0]
     assert relative_error(own, exact[stylizer.plan.seen]) < 1e-6
 
 

@@ -9,7 +9,7 @@ import torch
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
@@ -45,8 +45,8 @@ def test_the_judged_loss_is_that_of_the_scales_that_count(tiny_weights: Backbone
     assert sorted(found) == [0, 2]
     weights = stylizer.loss.weights
     assert mean_loss(found, weights) == pytest.approx((found[0].total + 0.5 * found[2].total) / 1.5)
-    twin = ExactTwin(stylizer).evaluate([0, 1], stylizer.scene.sh_dc)
-    assert mean_loss(twin, weights) == pytest.approx(mean_loss(found, weights), rel=1e-5)
+    reference = Float32Reference(stylizer).evaluate([0, 1], stylizer.scene.sh_dc)
+    assert mean_loss(reference, weights) == pytest.approx(mean_loss(found, weights), rel=1e-5)
     run(stylizer)
     measure = Measurements(stylizer)
     measure.at_the_end()

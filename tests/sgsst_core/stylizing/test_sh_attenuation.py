@@ -11,7 +11,7 @@ import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.ply import read_scene, write_scene, write_stylized
-from sgsst_core.quality.exact import ExactTwin
+from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from sgsst_core.settings import make_settings
@@ -44,7 +44,7 @@ def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeigh
     assert [record.loss for record in stylizer.history] == [record.loss for record in other.history]
     assert stylizer.scene.sh_degree == (0 if attenuation == 1 else 2)
     assert stylizer.sh_degree == 2
-    exact = ExactTwin(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
+    exact = Float32Reference(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
     assert exact.keys() == stylizer.evaluate(stylizer.evaluation_views).keys()
     for scale, terms in stylizer.evaluate(stylizer.evaluation_views).items():
         assert exact[scale].total == pytest.approx(terms.total, rel=1e-6)

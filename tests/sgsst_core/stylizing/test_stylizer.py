@@ -17,7 +17,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists
+from sgsst_core.rasterizer.tile_intersections import TileIntersections, build_tile_intersections
 from sgsst_core.scene.camera import Camera, fit_cameras, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, make_settings
@@ -57,18 +57,18 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
 
 
 @pytest.mark.parametrize("cached_weights", ["none", "float32"])
-def test_raster_lists_of_the_survey_are_not_built_again(
+def test_tile_intersections_of_the_survey_are_not_built_again(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, cached_weights: str
 ) -> None:
     """They are reduced to the Gaussians in view, and bit-identical to recomputed intersections."""
     built: list[int] = []
 
-    def build(scene: Scene, camera: Camera, **options: Any) -> RasterLists:
+    def build(scene: Scene, camera: Camera, **options: Any) -> TileIntersections:
         if len(scene) > 1:  # the plan makes those of one Gaussian to compile the kernels
             built.append(len(scene))
-        return build_raster_lists(scene, camera, **options)
+        return build_tile_intersections(scene, camera, **options)
 
-    monkeypatch.setattr("sgsst_core.rasterizer.cpu.build_raster_lists", build)
+    monkeypatch.setattr("sgsst_core.rasterizer.cpu.build_tile_intersections", build)
     scene, views = ball(), cameras(3)
     scene.means[-10:, 2] *= -1  # behind the cameras
     settings = make_settings(steps_sos=6, cached_weights=cached_weights)

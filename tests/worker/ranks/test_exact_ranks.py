@@ -15,7 +15,7 @@ from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -58,11 +58,11 @@ def gradient(
     )
     loss.speeds = speeds or loss.speeds
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
-    looked = survey(scene, [camera], rasterizer)
-    weighted = looked.uncovered_share > 0.01
+    survey = survey_views(scene, [camera], rasterizer)
+    weighted = survey.uncovered_share > 0.01
     picture_ = StyleMixture.of(picture(90, 110, seed=4, dtype=dtype))
-    regions = regions and regions.resolved(looked.total_blend_weights)
-    styles = JobStyles.prepared(picture_, regions, make_settings(), scene.sh_dc, looked.total_blend_weights)
+    regions = regions and regions.resolved(survey.total_blend_weights)
+    styles = JobStyles.prepared(picture_, regions, make_settings(), scene.sh_dc, survey.total_blend_weights)
     views = Views(
         scene,
         [camera],
@@ -70,7 +70,7 @@ def gradient(
         loss,
         covered=[0],
         weighted=weighted,
-        regions=looked.regions if weighted else None,
+        regions=survey.regions if weighted else None,
         maps=styles.maps(rasterizer),
         collectives=collectives,
     )

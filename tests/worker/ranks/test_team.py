@@ -16,8 +16,8 @@ from tests.worker.ranks.spawn import on_ranks
 
 def plan(ranks: int) -> Plan:
     seen = torch.ones(3, dtype=torch.bool)
-    looked = Survey(torch.ones(3, dtype=torch.float64), [0], [], 0.0)
-    return Plan(looked, seen, seen, (0,), weighted=False, steps_coarse=0, memory_limit=1 << 30, ranks=ranks)
+    survey = Survey(torch.ones(3, dtype=torch.float64), [0], [], 0.0)
+    return Plan(survey, seen, seen, (0,), weighted=False, steps_coarse=0, memory_limit=1 << 30, ranks=ranks)
 
 
 def drift(collectives: Collectives) -> list[str]:

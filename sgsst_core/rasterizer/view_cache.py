@@ -23,7 +23,7 @@ class Sized(Protocol):
 L = TypeVar("L", bound=Sized)
 
 
-class KeptLists(Generic[L]):
+class ViewCache(Generic[L]):
     """Cache of per-view data. Beyond the budget, only the data of the latest view are held.
 
     Nothing is evicted: views are visited in rounds, so evicting the least recently used one would evict each just
@@ -43,51 +43,51 @@ class KeptLists(Generic[L]):
         self,
         build: Callable[[Camera], L],
         max_bytes: int,
-        before: KeptLists[L] | None = None,
-        adapt: Callable[[L], L] = lambda lists: lists,
-        host: KeptLists[Any] | None = None,
+        before: ViewCache[L] | None = None,
+        adapt: Callable[[L], L] = lambda data: data,
+        host: ViewCache[Any] | None = None,
     ) -> None:
         self._build = build
         self._max_bytes = max_bytes
         self._before = before
         self._adapt = adapt
         self._host = host
-        self._guests: WeakSet[KeptLists[Any]] = WeakSet()
+        self._guests: WeakSet[ViewCache[Any]] = WeakSet()
         if host is not None:
             host._guests.add(self)
-        self._kept: dict[CameraKey, L] = {}
+        self._cached: dict[CameraKey, L] = {}
         self._latest: tuple[CameraKey, L] | None = None
-        self._kept_bytes = 0
+        self._cached_bytes = 0
         self._lock = threading.Lock()
 
     @property
-    def kept_bytes(self) -> int:
+    def cached_bytes(self) -> int:
         """Size of the cached data in bytes, except those of the latest view beyond the budget."""
-        return self._kept_bytes + (self._before.kept_bytes if self._before else 0)
+        return self._cached_bytes + (self._before.cached_bytes if self._before else 0)
 
     def of(self, camera: Camera) -> L:
         """Return the data of a view, cached or newly built. Exceptions of `build` propagate."""
         key = camera_key(camera)
         with self._lock:
-            if key in self._kept:
-                return self._kept[key]
+            if key in self._cached:
+                return self._cached[key]
             if self._latest is not None and self._latest[0] == key:
                 return self._latest[1]
             self._latest = None  # free its memory before the next one is built
             given = self._before.take(camera) if self._before else None
-            lists = self._build(camera) if given is None else self._adapt(given)
-            if self.kept_bytes + lists.nbytes <= self._bound():
-                self._kept[key] = lists
-                self._kept_bytes += lists.nbytes
+            data = self._build(camera) if given is None else self._adapt(given)
+            if self.cached_bytes + data.nbytes <= self._bound():
+                self._cached[key] = data
+                self._cached_bytes += data.nbytes
                 self._make_room()
             else:
-                self._latest = (key, lists)
-            return lists
+                self._latest = (key, data)
+            return data
 
     def holds(self, camera: Camera) -> bool:
         """Return whether the data of a view are cached, so they need not be built."""
         key = camera_key(camera)
-        return key in self._kept or (self._before is not None and self._before.holds(camera))
+        return key in self._cached or (self._before is not None and self._before.holds(camera))
 
     def take(self, camera: Camera) -> L | None:
         """Remove the data of a view from the cache and return them; None if they are not cached.
@@ -99,10 +99,10 @@ class KeptLists(Generic[L]):
             key = camera_key(camera)
             if latest is not None and latest[0] == key:
                 return latest[1]
-            lists = self._kept.pop(key, None)
-            if lists is not None:
-                self._kept_bytes -= lists.nbytes
-                return lists
+            data = self._cached.pop(key, None)
+            if data is not None:
+                self._cached_bytes -= data.nbytes
+                return data
             return self._before.take(camera) if self._before else None
 
     def limit(self, max_bytes: int) -> None:
@@ -114,16 +114,16 @@ class KeptLists(Generic[L]):
 
     def _let_go(self, max_bytes: int) -> None:
         if self._before is not None:
-            self._before.limit(max(max_bytes - self._kept_bytes, 0))
-        while self._kept_bytes > max_bytes:
-            self._kept_bytes -= self._kept.popitem()[1].nbytes
+            self._before.limit(max(max_bytes - self._cached_bytes, 0))
+        while self._cached_bytes > max_bytes:
+            self._cached_bytes -= self._cached.popitem()[1].nbytes
 
     def _bound(self) -> int:
         """Return the current budget in bytes: with a host, what the host and its other guests leave."""
         if self._host is None:
             return self._max_bytes
-        others = sum(guest.kept_bytes for guest in self._host._guests if guest is not self)
-        return self._host._max_bytes - self._host.kept_bytes - others
+        others = sum(guest.cached_bytes for guest in self._host._guests if guest is not self)
+        return self._host._max_bytes - self._host.cached_bytes - others
 
     def _make_room(self) -> None:
         """Shrink the guests to the remaining budget."""

@@ -16,7 +16,7 @@ from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import equip, measure
 from sgsst_core.planning.ranks_model import Link
-from sgsst_core.planning.survey import survey
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cached_weights import Precision
@@ -61,7 +61,7 @@ def on_device(scene: Scene) -> TritonRasterizer:
     return TritonRasterizer(scene, background=BACKGROUND, device=DEVICE)
 
 
-def kept_on_device(scene: Scene, **options: Any) -> CachedRasterizer:
+def cached_on_device(scene: Scene, **options: Any) -> CachedRasterizer:
     return CachedRasterizer(scene, uncached=on_device(scene), **options)
 
 
@@ -74,11 +74,11 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera]) -> None:
     image, coverage = reference.render(colors, view), reference.coverage(view)
     gradient = reference.color_gradient(pixels, view)
     for precision, error in ERRORS.items():
-        kept = CachedRasterizer(scene, precision=precision, uncached=uncached)
-        assert_close_outside_band(kept.render(colors, view).cpu(), image, band, tolerance=2 * error + 1e-5)
-        assert_close_outside_band(kept.coverage(view).cpu(), coverage, band, tolerance=1e-5)
-        assert relative_error(kept.color_gradient(pixels, view).cpu(), gradient) < error + 5e-6
-        assert kept.is_kept(view)
+        cached = CachedRasterizer(scene, precision=precision, uncached=uncached)
+        assert_close_outside_band(cached.render(colors, view).cpu(), image, band, tolerance=2 * error + 1e-5)
+        assert_close_outside_band(cached.coverage(view).cpu(), coverage, band, tolerance=1e-5)
+        assert relative_error(cached.color_gradient(pixels, view).cpu(), gradient) < error + 5e-6
+        assert cached.is_cached(view)
 
 
 def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
@@ -97,13 +97,13 @@ def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
 @pytest.mark.parametrize("precision", ERRORS)
 def test_gradient_is_the_transpose_and_repeats_to_the_bit(precision: Precision) -> None:
     scene, view = cloud(120, seed=15), camera(33, 20)
-    kept, colors, pixels = kept_on_device(scene, precision=precision), colors_of(scene), pixels_like(view)
-    gradient = kept.color_gradient(pixels, view)
-    black = kept.render(torch.zeros_like(colors), view).cpu().double()
-    image = kept.render(colors, view).cpu().double() - black
+    cached, colors, pixels = cached_on_device(scene, precision=precision), colors_of(scene), pixels_like(view)
+    gradient = cached.color_gradient(pixels, view)
+    black = cached.render(torch.zeros_like(colors), view).cpu().double()
+    image = cached.render(colors, view).cpu().double() - black
     assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colors).sum()), rel=1e-5)
-    assert torch.equal(kept.color_gradient(pixels, view), gradient)
-    assert torch.equal(kept_on_device(scene, precision=precision).color_gradient(pixels, view), gradient)
+    assert torch.equal(cached.color_gradient(pixels, view), gradient)
+    assert torch.equal(cached_on_device(scene, precision=precision).color_gradient(pixels, view), gradient)
 
 
 def test_bands_put_together_are_the_whole() -> None:
@@ -126,13 +126,13 @@ def test_bands_put_together_are_the_whole() -> None:
 
 @pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
 def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
-    kept, view = kept_on_device(scene), camera(20, 18)
-    assert torch.equal(kept.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
-    assert not kept.coverage(view).any()
-    gradient = kept.color_gradient(pixels_like(view), view)
+    cached, view = cached_on_device(scene), camera(20, 18)
+    assert torch.equal(cached.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
+    assert not cached.coverage(view).any()
+    gradient = cached.color_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()
-    assert kept.kept_bytes == kept.operator_bytes(view)
+    assert cached.cached_bytes == cached.operator_bytes(view)
 
 
 def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() -> None:
@@ -144,24 +144,24 @@ def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() 
             CachedRasterizer(scene, precision=precision, uncached=uncached).operator_bytes(view) for view in views[:2]
         ]
         budget = sum(sizes)
-        kept = CachedRasterizer(scene, precision=precision, uncached=uncached, max_bytes=budget)
+        cached = CachedRasterizer(scene, precision=precision, uncached=uncached, max_bytes=budget)
         for view in views:
-            kept.coverage(view)
-        assert [kept.is_kept(view) for view in views] == [True, True, False]
-        assert kept.kept_bytes == budget
-    assert torch.equal(kept.render(colors, views[2]), uncached.render(colors, views[2]))
-    gradient = kept.color_gradient(pixels_like(views[2]), views[2])
+            cached.coverage(view)
+        assert [cached.is_cached(view) for view in views] == [True, True, False]
+        assert cached.cached_bytes == budget
+    assert torch.equal(cached.render(colors, views[2]), uncached.render(colors, views[2]))
+    gradient = cached.color_gradient(pixels_like(views[2]), views[2])
     assert torch.equal(gradient, uncached.color_gradient(pixels_like(views[2]), views[2]))
     band = (3, 16)
-    assert kept.operator_bytes(views[2], band) < kept.operator_bytes(views[2])
+    assert cached.operator_bytes(views[2], band) < cached.operator_bytes(views[2])
     alone = CachedRasterizer(scene, uncached=uncached)
     alone.color_gradient(pixels[3:16], views[0], band)
-    assert alone.kept_bytes == alone.operator_bytes(views[0], band)
+    assert alone.cached_bytes == alone.operator_bytes(views[0], band)
 
 
 def test_a_piece_holds_a_weight_and_every_slot_is_filled_once() -> None:
     scene, view = cloud(120, seed=21), camera(33, 20)
-    weights: Any = kept_on_device(scene).count(view).keep("float32")
+    weights: Any = cached_on_device(scene).count(view).keep("float32")
     assert bool((weights.weights.view(-1, 16).amax(1) > 0).all())
     pieces = len(weights.piece_slots)
     assert torch.equal(weights.piece_slots.sort().values.cpu(), torch.arange(pieces, dtype=torch.int32))
@@ -193,13 +193,13 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monkeypatch: pytest.MonkeyPatch) -> None:
     """Intersections wait for their length, and weights for the number of pieces."""
     scene, view = cloud(60, seed=22), camera(20, 17)
-    kept, colors, pixels = kept_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
-    kept.uncached.lists(view)
+    cached, colors, pixels = cached_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
+    cached.uncached.intersections(view)
     with waits(monkeypatch) as found:
-        kept.coverage(view)
+        cached.coverage(view)
     assert found == ["__int__"]
     with waits(monkeypatch) as found:
-        kept.color_gradient(kept.render(colors, view) + pixels, view)
+        cached.color_gradient(cached.render(colors, view) + pixels, view)
     assert not found
 
 
@@ -223,13 +223,15 @@ VIEWS = cameras(2, 32, 24)
 def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) -> None:
     scene = ball(60)
     planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
-    found = measure(planning_context, survey(scene, VIEWS, planning_context.rasterizer), Link(float("inf"), 0.0)).raster
+    found = measure(
+        planning_context, survey_views(scene, VIEWS, planning_context.rasterizer), Link(float("inf"), 0.0)
+    ).raster
     planned: dict[Precision, int | None] = {"float32": found.bytes, "half": found.half_bytes}
     for precision, size in planned.items():
-        kept = CachedRasterizer(scene, precision=precision, uncached=planning_context.rasterizer)  # type: ignore[arg-type]
+        cached = CachedRasterizer(scene, precision=precision, uncached=planning_context.rasterizer)  # type: ignore[arg-type]
         for view in VIEWS:
-            kept.coverage(view)
-        assert kept.kept_bytes == size
+            cached.coverage(view)
+        assert cached.cached_bytes == size
     assert found.kept_seconds is not None
     assert found.keeping_seconds is not None
     assert min(found.seconds, found.kept_seconds, found.keeping_seconds) > 0

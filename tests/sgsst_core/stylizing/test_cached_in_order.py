@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from sgsst_core.budget import MEMORY_SHARES
+from sgsst_core.budget import memory_for
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -25,18 +25,17 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
     """Make a job with memory for the blend weights of about half the views."""
     scene = wall()
-    kept = CachedRasterizer(scene, precision="float32" if form == "float32" else "half")
-    size = sum(kept.operator_bytes(camera) for camera in VIEWS) // 2
+    cached = CachedRasterizer(scene, precision="float32" if form == "float32" else "half")
+    size = sum(cached.operator_bytes(camera) for camera in VIEWS) // 2
     settings = {"steps_coarse": 0, "steps_sos": STEPS, "position_weights": "on", "seed": 3, **settings}
-    chosen = make_settings(
-        "preview", cached_weights=form, memory_limit=int(size / MEMORY_SHARES["rasterizer"]), **settings
-    )
+    limit = size * 1024 // memory_for("rasterizer", 1024)
+    chosen = make_settings("preview", cached_weights=form, memory_limit=limit, **settings)
     return Stylizer.planned(scene, VIEWS, style(), chosen, weights=weights)
 
 
-def kept_views(stylizer: Stylizer) -> list[bool]:
+def cached_views(stylizer: Stylizer) -> list[bool]:
     rasterizer: Any = stylizer.views.rasterizer
-    return [rasterizer.is_kept(camera) for camera in stylizer.views.cameras]
+    return [rasterizer.is_cached(camera) for camera in stylizer.views.cameras]
 
 
 def steps(stylizer: Stylizer, count: int) -> Stylizer:
@@ -56,8 +55,8 @@ def test_looks_in_between_change_no_bit(form: str, views_per_step: int, tiny_wei
     for _ in range(STEPS):
         watched.run_step()
         watched.evaluate(everything[::-1])
-    assert 0 < sum(kept_views(alone)) < len(VIEWS)
-    assert kept_views(watched) == kept_views(alone)
+    assert 0 < sum(cached_views(alone)) < len(VIEWS)
+    assert cached_views(watched) == cached_views(alone)
     assert torch.equal(watched.sh_dc, alone.sh_dc)
 
 
@@ -73,7 +72,7 @@ def test_a_resumed_job_keeps_the_same_views(
     rest.load_state(steps(first, before).state())
     assert rest.evaluate([5, 0]) == losses
     assert torch.equal(steps(rest, STEPS - before).sh_dc, whole.sh_dc)
-    assert kept_views(rest) == kept_views(whole)
+    assert cached_views(rest) == cached_views(whole)
 
 
 def test_a_job_that_was_resumed_behind_phase_1_keeps_nothing_of_it(tiny_weights: BackboneWeights) -> None:
@@ -83,8 +82,8 @@ def test_a_job_that_was_resumed_behind_phase_1_keeps_nothing_of_it(tiny_weights:
     rest.load_state(steps(first, 33).state())
     coarse: Any = rest._coarse
     assert torch.equal(steps(rest, 3).sh_dc, whole.sh_dc)
-    assert coarse.kept_bytes == 0
-    assert kept_views(rest) == kept_views(whole)
+    assert coarse.cached_bytes == 0
+    assert cached_views(rest) == cached_views(whole)
 
 
 def test_a_job_that_was_resumed_in_phase_1_keeps_its_operators(tiny_weights: BackboneWeights) -> None:
@@ -93,24 +92,24 @@ def test_a_job_that_was_resumed_in_phase_1_keeps_its_operators(tiny_weights: Bac
     steps(whole, 5)
     rest.load_state(steps(first, 3).state())
     steps(rest, 2)
-    assert list(operators[0]._operators.kept) == list(operators[1]._operators.kept)
-    assert operators[0].kept_bytes == operators[1].kept_bytes
+    assert list(operators[0]._operators.values) == list(operators[1]._operators.values)
+    assert operators[0].cached_bytes == operators[1].cached_bytes
     assert torch.equal(rest.sh_dc, whole.sh_dc)
 
 
 def test_keeping_is_left_to_the_caller() -> None:
     scene, view = wall(), VIEWS[0]
-    kept, cpu = CachedRasterizer(scene, at_first_use=False), CpuRasterizer(scene)
+    cached, cpu = CachedRasterizer(scene, at_first_use=False), CpuRasterizer(scene)
     pixels = torch.ones(view.height, view.width, 3)
-    assert torch.equal(kept.color_gradient(pixels, view), cpu.color_gradient(pixels, view))
-    assert (kept.is_kept(view), kept.kept_bytes) == (False, 0)
-    assert kept.keep(view)
-    assert kept.is_kept(view, (3, 9))
-    assert not kept.is_kept(VIEWS[1])
+    assert torch.equal(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view))
+    assert (cached.is_cached(view), cached.cached_bytes) == (False, 0)
+    assert cached.keep(view)
+    assert cached.is_cached(view, (3, 9))
+    assert not cached.is_cached(VIEWS[1])
     assert not CachedRasterizer(scene, at_first_use=False, max_bytes=10).keep(view)
 
 
-def test_lent_weights_are_those_that_are_kept() -> None:
+def test_lent_weights_are_those_that_are_cached() -> None:
     scene, view = wall(), VIEWS[0]
     lender, keeper = (CachedRasterizer(scene, at_first_use=False, precision="half") for _ in range(2))
     pixels = torch.ones(view.height, view.width, 3)
@@ -119,10 +118,10 @@ def test_lent_weights_are_those_that_are_kept() -> None:
         assert torch.equal(lender.color_gradient(pixels, view), keeper.color_gradient(pixels, view))
     uncached = CpuRasterizer(scene).color_gradient(pixels, view)
     assert torch.equal(lender.color_gradient(pixels, view), uncached)
-    assert lender.kept_bytes == 0
+    assert lender.cached_bytes == 0
     small = CachedRasterizer(scene, at_first_use=False, precision="half", max_bytes=10)
     with small.lending(view):
         assert torch.equal(small.color_gradient(pixels, view), uncached)
     with keeper.lending(view):
         pass
-    assert keeper.is_kept(view)
+    assert keeper.is_cached(view)

@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.depth_order import depth_order
 from sgsst_core.rasterizer.projection import project
-from sgsst_core.rasterizer.raster_lists import RasterLists, build_raster_lists, lists_of_subset
+from sgsst_core.rasterizer.tile_intersections import (
+    TileIntersections,
+    build_tile_intersections,
+    intersections_of_subset,
+)
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
@@ -64,33 +68,33 @@ def listed_in_turn(scene: Scene, view: Camera) -> list[list[int]]:
     gaussians = project(scene, view).gaussians
     tiles: list[list[int]] = [[] for _ in range(-(-view.width // 16) * -(-view.height // 16))]
     for rank, gaussian in enumerate(gaussians):
-        alone = build_raster_lists(scene.subset(torch.tensor([int(gaussian)])), view)
+        alone = build_tile_intersections(scene.subset(torch.tensor([int(gaussian)])), view)
         for tile in np.flatnonzero(np.diff(alone.starts)):
             tiles[tile].append(rank)
     return tiles
 
 
-def check_slots(lists: RasterLists) -> None:
+def check_slots(isects: TileIntersections) -> None:
     """Check that every pair has a slot, and that those of a Gaussian are adjacent and ordered by tile."""
-    order = np.argsort(lists.slots, kind="stable")
-    assert np.array_equal(lists.slots[order], np.arange(len(lists.slots)))
+    order = np.argsort(isects.slots, kind="stable")
+    assert np.array_equal(isects.slots[order], np.arange(len(isects.slots)))
     assert np.array_equal(
-        lists.ranks[order], np.repeat(np.arange(len(lists.first_slots) - 1), np.diff(lists.first_slots))
+        isects.ranks[order], np.repeat(np.arange(len(isects.first_slots) - 1), np.diff(isects.first_slots))
     )
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 150])
-def test_lists_are_those_of_one_gaussian_after_the_other(count: int, threads: None) -> None:
+def test_tile_intersections_are_those_of_one_gaussian_after_the_other(count: int, threads: None) -> None:
     scene, view = cloud(count, seed=32), camera(97, 61)
     scene.scales[:10] += 4  # as large as the view
-    lists = build_raster_lists(scene, view)
+    isects = build_tile_intersections(scene, view)
     expected = listed_in_turn(scene, view)
-    assert np.array_equal(np.diff(lists.starts), [len(tile) for tile in expected])
-    assert lists.ranks.tolist() == [rank for tile in expected for rank in tile]
-    check_slots(lists)
+    assert np.array_equal(np.diff(isects.starts), [len(tile) for tile in expected])
+    assert isects.ranks.tolist() == [rank for tile in expected for rank in tile]
+    check_slots(isects)
 
 
-def check_same(found: RasterLists, expected: RasterLists) -> None:
+def check_same(found: TileIntersections, expected: TileIntersections) -> None:
     """Check that all arrays are bit-identical."""
     for name in ("starts", "ranks", "slots", "first_slots"):
         own, other = getattr(found, name), getattr(expected, name)
@@ -101,69 +105,69 @@ def check_same(found: RasterLists, expected: RasterLists) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.6, 1.0])
-def test_lists_of_some_gaussians_are_those_that_would_be_built(share: float, threads: None) -> None:
+def test_tile_intersections_of_some_gaussians_are_those_that_would_be_built(share: float, threads: None) -> None:
     scene, view = cloud(900, seed=33), camera(97, 61)
     scene.scales[:10] += 4
     chosen = torch.rand(900, generator=torch.Generator().manual_seed(1)) < share
     places = torch.where(chosen, chosen.cumsum(0) - 1, -1).to(torch.int32).numpy()
-    found = lists_of_subset(build_raster_lists(scene, view), places)
-    check_same(found, build_raster_lists(scene.subset(chosen), view))
+    found = intersections_of_subset(build_tile_intersections(scene, view), places)
+    check_same(found, build_tile_intersections(scene.subset(chosen), view))
 
 
-def test_lists_are_handed_on_once_and_stay_within_the_budget() -> None:
+def test_tile_intersections_are_handed_on_once_and_stay_within_the_budget() -> None:
     scene = cloud(600, seed=34)
     views = [camera(97, 61, pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
     chosen = torch.arange(600) % 4 > 0
-    sizes = [build_raster_lists(scene, view).nbytes for view in views]
-    whole = CpuRasterizer(scene, max_list_bytes=sum(sizes[:3]))
+    sizes = [build_tile_intersections(scene, view).nbytes for view in views]
+    whole = CpuRasterizer(scene, max_intersection_bytes=sum(sizes[:3]))
     for view in views:
-        whole.lists(view)
+        whole.intersections(view)
     budget = sum(sizes[:3])
-    part = whole.of_subset(scene.subset(chosen), chosen, max_list_bytes=budget)
-    assert [part.has_lists(view) for view in views] == [True, True, True, False]
+    part = whole.of_subset(scene.subset(chosen), chosen, max_intersection_bytes=budget)
+    assert [part.has_intersections(view) for view in views] == [True, True, True, False]
     for done, view in enumerate(views):
-        check_same(part.lists(view), build_raster_lists(scene.subset(chosen), view))
-        assert part._lists.kept_bytes <= budget
-        assert not whole.has_lists(view)
-        assert [whole.has_lists(other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
-    assert part.lists(views[1]) is part.lists(views[1])
+        check_same(part.intersections(view), build_tile_intersections(scene.subset(chosen), view))
+        assert part._intersections.cached_bytes <= budget
+        assert not whole.has_intersections(view)
+        assert [whole.has_intersections(other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
+    assert part.intersections(views[1]) is part.intersections(views[1])
     with pytest.raises(ValueError, match="450 Gaussians are not the 600 chosen ones of 600"):
         whole.of_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool))
 
 
-def test_lists_beyond_a_new_limit_are_let_go_the_last_ones_first() -> None:
+def test_tile_intersections_beyond_a_new_limit_are_let_go_the_last_ones_first() -> None:
     scene = cloud(300, seed=35)
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
     cpu = CpuRasterizer(scene)
-    sizes = [cpu.lists(view).nbytes for view in views]
-    cpu.let_go_of_lists(views[0], sizes[1])
-    assert [cpu.has_lists(view) for view in views] == [False, True, False]
+    sizes = [cpu.intersections(view).nbytes for view in views]
+    cpu.drop_intersections(views[0], sizes[1])
+    assert [cpu.has_intersections(view) for view in views] == [False, True, False]
 
 
-def test_lists_beside_others_keep_what_these_leave_of_their_bytes() -> None:
+def test_tile_intersections_beside_others_keep_what_these_leave_of_their_bytes() -> None:
     scene = cloud(300, seed=36)
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
-    sizes = [build_raster_lists(scene, view).nbytes for view in views]
-    host = CpuRasterizer(scene, max_list_bytes=sum(sizes))
+    sizes = [build_tile_intersections(scene, view).nbytes for view in views]
+    host = CpuRasterizer(scene, max_intersection_bytes=sum(sizes))
     guests = [CpuRasterizer(scene, beside=host) for _ in range(2)]
 
     def kept() -> list[list[bool]]:
-        return [[one.has_lists(view) for view in views] for one in (host, *guests)]
+        return [[one.has_intersections(view) for view in views] for one in (host, *guests)]
 
-    host.lists(views[0])
-    guests[0].lists(views[1])
-    guests[1].lists(views[2])
-    guests[1].lists(views[0])  # uses up all bytes
+    host.intersections(views[0])
+    guests[0].intersections(views[1])
+    guests[1].intersections(views[2])
+    guests[1].intersections(views[0])  # uses up all bytes
     assert kept() == [[True, False, False], [False, True, False], [False, False, True]]
-    check_same(guests[1].lists(views[0]), host.lists(views[0]))
-    host.lists(views[1])
-    host.lists(views[2])
+    check_same(guests[1].intersections(views[0]), host.intersections(views[0]))
+    host.intersections(views[1])
+    host.intersections(views[2])
     assert kept() == [[True] * 3, [False] * 3, [False] * 3]
-    host.let_go_of_lists(views[0], sum(sizes))
-    guests[0].lists(views[0])
+    host.drop_intersections(views[0], sum(sizes))
+    guests[0].intersections(views[0])
     assert kept()[1] == [True, False, False]
-    host.let_go_of_lists(views[1], sizes[2])
+    host.drop_intersections(views[1], sizes[2])
     assert kept()[:2] == [[False, False, True], [False] * 3]
     del guests[1]
     gc.collect()
-    assert len(host._lists._guests) == 1
+    assert len(host._intersections._guests) == 1

@@ -34,7 +34,7 @@ _SUPPORT_BITS = -math.log2(ALPHA_MIN)
 
 
 @dataclass(frozen=True)
-class RasterLists:
+class TileIntersections:
     """Tile intersections of a view.
 
     A Gaussian intersects a raster tile if its support overlaps a pixel row of the tile within the tile's columns. Every
@@ -73,9 +73,9 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
     return -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
 
 
-def build_raster_lists(
+def build_tile_intersections(
     scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes | None = None
-) -> RasterLists:
+) -> TileIntersections:
     """Project a scene, sort it by depth, and compute the tile intersections.
 
     Args:
@@ -97,49 +97,49 @@ def build_raster_lists(
         parts = np.linspace(0, len(values), threads * _PARTS + 1).astype(np.int64)
         places = np.zeros((len(parts) - 1, across * down), dtype=np.int64)
         _count_tiles(values, *size, parts, threads, counts, places)
-    first_slots = _starts(counts)
+    first_slots = run_starts(counts)
     total = int(first_slots[-1])
     check_intersections(total, len(counts), camera)
     _check_memory(total, len(counts), camera)
-    starts = _starts(places.sum(axis=0))
+    starts = run_starts(places.sum(axis=0))
     # First position that each part writes to in each tile: after the entries of all preceding parts.
     places = starts[:-1] + np.cumsum(places, axis=0) - places
     ranks, slots = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
     with kernel_threads():
         _fill_tiles(values, *size, parts, threads, first_slots, places, ranks, slots)
-    return RasterLists(projection, starts, ranks, slots, first_slots)
+    return TileIntersections(projection, starts, ranks, slots, first_slots)
 
 
-def lists_of_subset(lists: RasterLists, places: NDArray[np.int32]) -> RasterLists:
-    """Restrict tile intersections to a subset of the Gaussians; gives the same arrays as `build_raster_lists`.
+def intersections_of_subset(isects: TileIntersections, places: NDArray[np.int32]) -> TileIntersections:
+    """Restrict tile intersections to a subset of the Gaussians; gives the same arrays as `build_tile_intersections`.
 
     Args:
-        lists: Intersections of the whole scene.
+        isects: Intersections of the whole scene.
         places: [N] int32, each Gaussian's index in the subset, in unchanged order; -1 if it is not in the subset.
     """
-    projection = lists.projection
+    projection = isects.projection
     with kernel_threads():
         gaussians = np.empty(len(projection.gaussians), dtype=np.int32)
         take_places(places, projection.gaussians, gaussians)
         kept = gaussians >= 0
         # For every rank: its new rank (-1 if removed), and the offset by which its slots move.
         ranks = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
-        first_slots = _starts(np.where(kept, np.diff(lists.first_slots), 0))
-        moves = (lists.first_slots - first_slots)[:-1]
-        counts = np.empty(len(lists.starts) - 1, dtype=np.int64)
-        _count_kept(lists.ranks, lists.starts, ranks, counts)
-        starts = _starts(counts)
+        first_slots = run_starts(np.where(kept, np.diff(isects.first_slots), 0))
+        moves = (isects.first_slots - first_slots)[:-1]
+        counts = np.empty(len(isects.starts) - 1, dtype=np.int64)
+        _count_kept(isects.ranks, isects.starts, ranks, counts)
+        starts = run_starts(counts)
         values = np.empty((int(kept.sum()), projection.values.shape[1]))
         take_rows(projection.values, np.flatnonzero(kept), values)
         own_ranks, own_slots = np.empty(starts[-1], dtype=np.int32), np.empty(starts[-1], dtype=np.int32)
-        _take_kept(lists.ranks, lists.slots, lists.starts, ranks, moves, starts, own_ranks, own_slots)
+        _take_kept(isects.ranks, isects.slots, isects.starts, ranks, moves, starts, own_ranks, own_slots)
     own = Projection(gaussians[kept], values, {Outcome.VISIBLE: len(values)})
-    return RasterLists(own, starts, own_ranks, own_slots, np.append(first_slots[:-1][kept], first_slots[-1]))
+    return TileIntersections(own, starts, own_ranks, own_slots, np.append(first_slots[:-1][kept], first_slots[-1]))
 
 
-def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def run_starts(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the start offsets of consecutive runs with these lengths, and the end of the last one."""
-    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts)])
+    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
 
 
 def check_intersections(total: int, gaussians: int, camera: Camera) -> None:

@@ -1,8 +1,8 @@
 """Cached blend weights on a GPU: pieces of 4 x 4 pixels, computed and applied by Triton kernels.
 
-See `triton_kept_kernels` for the layout. A piece takes 40 bytes in half precision and 72 in float32. Including data per
-tile, Gaussian and pixel, that is 3.0 to 3.4 and 5.3 to 6.1 bytes per weight for a scene of large Gaussians, and 7.1 and
-12.2 for one whose Gaussians cover few pixels.
+See `triton_cached_kernels` for the layout. A piece takes 40 bytes in half precision and 72 in float32. Including data
+per tile, Gaussian and pixel, that is 3.0 to 3.4 and 5.3 to 6.1 bytes per weight for a scene of large Gaussians, and 7.1
+and 12.2 for one whose Gaussians cover few pixels.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ class CountedPieces:
     """
 
     def __init__(self, rasterizer: TritonRasterizer, camera: Camera, band: Rows) -> None:
-        from sgsst_core.rasterizer import triton_kept_kernels as kernels
+        from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
         self.rasterizer, self.camera, self.band = rasterizer, camera, band
-        self.lists = lists = rasterizer.lists(camera)
+        self.intersections = isects = rasterizer.intersections(camera)
         device = rasterizer.device
         self.across, self.tiles = tiles_of(camera, band)
-        self.masks = torch.zeros(len(lists.ranks), dtype=torch.int32, device=device)
+        self.masks = torch.zeros(len(isects.ranks), dtype=torch.int32, device=device)
         self.slot_pieces = torch.zeros_like(self.masks)
         self.block_pieces = torch.empty(self.tiles * kernels.BLOCKS.value, dtype=torch.int32, device=device)
         self.ends = torch.empty(self.tiles, dtype=torch.int64, device=device)
         kernels.count_pieces[(self.tiles,)](
-            lists.ranks, lists.slots, lists.starts, lists.values, self.masks, self.slot_pieces, self.block_pieces,
+            isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces, self.block_pieces,
             self.ends, camera.width, *band, self.across,
             **rasterizer.cuts(),
         )  # fmt: skip
@@ -56,9 +56,9 @@ class CountedPieces:
 
     def nbytes(self, precision: Precision) -> int:
         """Return the size of the weights in bytes."""
-        from sgsst_core.rasterizer import triton_kept_kernels as kernels
+        from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
-        index, visible = self.index_type.itemsize, len(self.lists.gaussians)
+        index, visible = self.index_type.itemsize, len(self.intersections.gaussians)
         pixels = (self.band[1] - self.band[0]) * self.camera.width
         piece = 4 + index + kernels.PIECE.value * _DTYPES[precision].itemsize
         starts = len(self.block_pieces) + 1 + visible + 1
@@ -76,22 +76,22 @@ class WeightPieces:
         block_starts: [16 tiles + 1], first piece of each block.
         piece_gaussians: [P] int32, indices into the scene.
         piece_slots: [P], slot of each piece's gradient; the slots of one Gaussian are contiguous.
-        weights: [16 P] float32, or float16 multiplied by `triton_kept_kernels.HALF_SCALE`.
+        weights: [16 P] float32, or float16 multiplied by `triton_cached_kernels.HALF_SCALE`.
         first_slots: [V + 1], first slot of each rank.
         gaussians: [V] int32, index into the scene of each rank.
         transmittance: [h, width] float32, final transmittance.
     """
 
     def __init__(self, counted: CountedPieces, precision: Precision) -> None:
-        from sgsst_core.rasterizer import triton_kept_kernels as kernels
+        from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
-        rasterizer, lists, index_type = counted.rasterizer, counted.lists, counted.index_type
+        rasterizer, isects, index_type = counted.rasterizer, counted.intersections, counted.index_type
         self._rasterizer, self.camera, self.band = rasterizer, counted.camera, counted.band
         self.scale = kernels.HALF_SCALE if precision == "half" else 1.0
         slot_starts = _offsets(counted.slot_pieces, index_type)
         self.block_starts = _offsets(counted.block_pieces, index_type)
-        self.first_slots = slot_starts[lists.first_slots]
-        self.gaussians = lists.gaussians.to(torch.int32)
+        self.first_slots = slot_starts[isects.first_slots]
+        self.gaussians = isects.gaussians.to(torch.int32)
 
         def empty(*shape: int, dtype: torch.dtype) -> Tensor:
             return torch.empty(shape, dtype=dtype, device=rasterizer.device)
@@ -101,7 +101,7 @@ class WeightPieces:
         self.weights = empty(counted.pieces * kernels.PIECE.value, dtype=_DTYPES[precision])
         self.transmittance = empty(self.band[1] - self.band[0], self.camera.width, dtype=torch.float32)
         kernels.keep_pieces[(counted.tiles,)](
-            lists.ranks, lists.slots, lists.starts, lists.values, lists.gaussians, counted.masks, counted.ends,
+            isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
             slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights, self.transmittance,
             self.camera.width, *self.band, counted.across,
             **rasterizer.cuts(), SCALE=self.scale,
@@ -118,7 +118,7 @@ class WeightPieces:
 
     def render(self, colors: Tensor) -> Tensor:
         """Return the image [h, width, 3] of colors [N, 3] over the background."""
-        from sgsst_core.rasterizer import triton_kept_kernels as kernels
+        from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
         image = torch.empty((*self.transmittance.shape, 3), device=colors.device)
         kernels.apply_pieces[self._grid()](
@@ -130,7 +130,7 @@ class WeightPieces:
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
         """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3]."""
-        from sgsst_core.rasterizer import triton_kept_kernels as kernels
+        from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
         gradient = torch.zeros((len(self._rasterizer.scene), 3), device=image_gradient.device)
         if not len(self.piece_slots):
