@@ -358,7 +358,7 @@ class SessionView(BaseModel):
 
     model_config = _with_example(keys_needed=True, signed_in=True)
 
-    keys_needed: bool = Field(description="Whether anything can be done without an API key.")
+    keys_needed: bool = Field(description="Whether an API key is required.")
     signed_in: bool = Field(description="Whether the cookie is that of a session.")
 
 

@@ -300,7 +300,7 @@ def test_stored_jobs_are_shown_as_they_were_stored(
     assert listed["parameters"] == answer.json()["parameters"] == made["parameters"] | told
     assert client.post(f"/v1/jobs/{job.id}/cancel").json()["status"] == "canceled"
     problem = refused(client.post(f"/v1/jobs/{job.id}/retry"), 422, "invalid-settings")
-    assert "stored by a version" in problem["detail"]
+    assert "stored by an earlier version" in problem["detail"]
     assert client.get(f"/v1/jobs/{job.id}").json()["status"] == "canceled"
     assert client.delete(f"/v1/jobs/{job.id}").status_code == 204
     store.close()
@@ -575,7 +575,7 @@ def test_keys_are_needed_where_others_can_reach_the_service(tmp_path: Path) -> N
 
 
 def test_nobody_else_is_let_in_before_there_is_a_key(tmp_path: Path) -> None:
-    with pytest.raises(ServeError, match="there is no API key yet"):
+    with pytest.raises(ServeError, match="there is no API key"):
         serve(ServiceSettings(data=tmp_path / "data", host="0.0.0.0"), print)
 
 
