@@ -120,7 +120,7 @@ def test_a_job_with_parameters_of_an_earlier_version_fails_with_a_sentence(
     assert ended.attempt == 1, "it would fail again"
     assert ended.error is not None
     assert ended.error["code"] == "invalid-settings"
-    assert "stored by a version" in ended.error["message"]
+    assert "stored by an earlier version" in ended.error["message"]
 
 
 def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store: Store) -> None:

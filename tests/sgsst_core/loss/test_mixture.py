@@ -96,7 +96,7 @@ def test_too_many_vectors_are_shared_out_by_weight():
 
 @pytest.mark.parametrize("weights", [[], [1.0, 0.0], [1.0, -1.0], [float("nan")], [float("inf"), 1.0]])
 def test_weights_that_are_no_shares(weights):
-    with pytest.raises(SettingsError, match="style picture"):
+    with pytest.raises(SettingsError, match="style image"):
         normalized(weights)
 
 
