@@ -158,7 +158,7 @@ def at_once(send: Callable[[], httpx.Response]) -> contextlib.ExitStack:
     return stack
 
 
-@pytest.mark.parametrize("kind", ["killed", "stopped"])
+@pytest.mark.parametrize("kind", ["killed", pytest.param("stopped", marks=pytest.mark.slow)])
 def test_every_operation_says_that_the_database_is_away(outage: Outage, files: dict[str, bytes], kind: str) -> None:
     with outage.client() as client, outage.kind(kind), ThreadPoolExecutor(len(operations())) as pool:
         for answer in pool.map(lambda each: request(client, each[0], each[1], outage, files), operations()):
@@ -168,6 +168,7 @@ def test_every_operation_says_that_the_database_is_away(outage: Outage, files: d
     assert "Traceback" not in outage.service.said()
 
 
+@pytest.mark.slow
 def test_health_checks_answer_beside_requests_that_wait(outage: Outage) -> None:
     with outage.client() as client, outage.kind("stopped"), at_once(lambda: client.get("/v1/jobs")):
         for _ in range(3):
@@ -189,7 +190,7 @@ def test_a_stream_goes_on_when_the_database_is_back(outage: Outage, files: dict[
             assert told[-1]["status"] == "canceled"
 
 
-@pytest.mark.parametrize("kind", ["killed", "stopped"])
+@pytest.mark.parametrize("kind", ["killed", pytest.param("stopped", marks=pytest.mark.slow)])
 def test_an_upload_in_the_middle_can_be_resumed(outage: Outage, kind: str) -> None:
     with outage.client() as client, contextlib.ExitStack() as away:
         place = create_upload(client).headers["location"]
@@ -208,6 +209,7 @@ def test_an_upload_in_the_middle_can_be_resumed(outage: Outage, kind: str) -> No
         assert (answer.status_code, answer.headers["upload-offset"]) == (204, "100")
 
 
+@pytest.mark.slow
 def test_a_locked_database_is_busy_and_can_be_read(tmp_path: Path, files: dict[str, bytes]) -> None:
     for service, key, job_id, _ in open_service(tmp_path / "data", None, files):
         with service.client(key) as client, contextlib.closing(sqlite3.connect(service.data / "sgsst.db")) as other:

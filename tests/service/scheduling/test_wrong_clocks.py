@@ -147,6 +147,7 @@ def test_a_dispatcher_a_month_off_deletes_nothing(
     assert store.inputs.blobs([SHA])
 
 
+@pytest.mark.slow
 def test_a_dispatcher_two_minutes_ahead_takes_no_healthy_lease(settings: ServiceSettings, store: Store) -> None:
     held = leased(store, "healthy-00000000-1-1")
     with healthy(store, held) as statuses, wrong_dispatcher(settings, 120.0) as process:

@@ -77,6 +77,6 @@ def test_a_job_measures_where_views_come_often_and_follows_its_plan(
             wall(10, 8), cameras(2, 48, 32), style(), settings, weights=tiny_weights, rasterizer="cpu"
         )
         decision = next(line for line in stylizer.plan.decisions if line.item == "launches")
-        measured = "ms a view" in decision.reason
+        measured = "measured per view" in decision.reason
         assert measured is (steps == LEAST_GRAPH_VISITS and not keep)
         assert (stylizer.graphs is not None) is stylizer.plan.graphs
