@@ -87,7 +87,7 @@ _NUMBER_AT, _ARCHITECTURE_AT, _FIRST_ARGUMENT_AT = 0, 4, 16
 
 
 def missing() -> list[str]:
-    """Return what this kernel lacks to confine a process, as messages for the operator; empty if nothing."""
+    """Return messages for the operator about the confinement features that this kernel lacks."""
     found = []
     if _landlock_version() < 1:
         found.append("Landlock (Linux 5.13): a reader that is taken over can read what this user can read")
@@ -176,9 +176,9 @@ def _allow(libc: ctypes.CDLL, ruleset: int, path: Path, rights: int) -> None:
 
 
 def _has_seccomp() -> bool:
-    """Return whether the kernel supports filters.
+    """Return whether the kernel supports seccomp filters.
 
-    If it does, an attempt with a null filter fails because of the address (EFAULT), not because of the mode.
+    If it does, installing a null filter fails with EFAULT (bad address) rather than EINVAL (unknown mode).
     """
     if not sys.platform.startswith("linux") or platform.machine() not in _ARCHITECTURES:
         return False
