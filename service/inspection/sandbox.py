@@ -195,7 +195,7 @@ def _restrict_calls(libc: ctypes.CDLL) -> None:
 
 
 def seccomp_program(machine: str, process: int) -> bytes:
-    """Assemble the classic BPF filter of a process: every system call is allowed unless it is listed above."""
+    """Assemble the classic BPF filter of a process: all calls are allowed except those listed in this module."""
     column, architecture = _ARCHITECTURES[machine]
     refuse, absent = _ERRNO | errno.EPERM, _ERRNO | errno.ENOSYS
     code = [

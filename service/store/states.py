@@ -34,9 +34,9 @@ class AttemptOutcome(StrEnum):
 class Transition(StrEnum):
     """Transition of a job from one state to another."""
 
-    #: A dispatcher leases the job, for the first time or after a lost one.
+    #: A dispatcher leases the job, for the first time or after its previous lease was lost.
     TAKE = "take"
-    #: The inputs are read and the steps start.
+    #: The inputs have been read and the first step starts.
     BEGIN = "begin"
     SUCCEED = "succeed"
     #: An attempt failed and is not followed by another one.
