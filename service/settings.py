@@ -54,7 +54,7 @@ class ServiceSettings(BaseSettings):
         lease_seconds: Time without heartbeat after which another dispatcher takes over a job.
         max_attempts: Consecutive attempts without progress after which a job fails.
         retry_seconds: Delay before the second attempt; it doubles with each further one.
-        parallel_jobs: Number of concurrent jobs; None for one per GPU, or one without GPUs.
+        parallel_jobs: Maximum number of concurrent jobs; None for one per GPU (one in total if there are no GPUs).
         cluster_gpus: GPUs of the Ray cluster at RAY_ADDRESS that this dispatcher may assign to jobs.
         start_seconds: Time that a starting process waits for a database server that does not respond yet.
         checkpoint_seconds: Interval between checkpoints of a running job.

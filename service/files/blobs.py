@@ -123,8 +123,8 @@ class Blobs(ABC):
         its file is lost or damaged, that file is replaced.
 
         Args:
-            path: File that nobody writes to any more.
-            upload_id: Upload or receipt that holds the blob from now on.
+            path: Complete file that is no longer written to.
+            upload_id: Upload or receipt (`service.store.inputs`) that holds the blob from now on; None for none.
 
         Raises:
             NotFoundError: If the upload or receipt is gone.
@@ -236,8 +236,8 @@ class BlobFolder(Blobs):
         """Move or link a received file to its final path and return its SHA-256.
 
         Args:
-            path: File that nobody writes to any more.
-            upload_id: Upload or receipt that holds the blob from now on.
+            path: Complete file that is no longer written to.
+            upload_id: Upload or receipt (`service.store.inputs`) that holds the blob from now on; None for none.
             leave: Whether to hard-link the file instead of moving it, so that `path` remains.
         """
         path.chmod(0o400)

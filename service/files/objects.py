@@ -1,7 +1,7 @@
 """File store behind an fsspec URL: a local folder, an S3-compatible bucket, or any other file system of fsspec.
 
-Objects are written as a whole, and each name is written once. Failures of a remote store (unreachable, slow, broken)
-are raised as `StoreError`; errors of a local folder are raised unchanged.
+Objects are written as a whole, and overwritten only to repair them. Failures of a remote store (unreachable, slow,
+broken) are raised as `StoreError`; errors of a local folder are raised unchanged.
 """
 
 from __future__ import annotations

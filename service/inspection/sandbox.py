@@ -35,7 +35,7 @@ _SYSTEM = (
     "/sys/kernel/mm/transparent_hugepage",
 )
 
-#: System calls that are refused, by number on x86_64 and aarch64; aarch64 lacks some.
+#: Rejected system calls, with their numbers on x86_64 and aarch64; None if aarch64 lacks the call.
 _REFUSED: dict[str, tuple[int, int | None]] = {
     # network; no network descriptor is inherited either
     "socket": (41, 198), "socketpair": (53, 199), "io_uring_setup": (425, 425),
@@ -69,7 +69,7 @@ _REFUSED: dict[str, tuple[int, int | None]] = {
     "adjtimex": (159, 171), "clock_adjtime": (305, 266), "sethostname": (170, 161), "setdomainname": (171, 162),
     "iopl": (172, None), "ioperm": (173, None),
 }  # fmt: skip
-#: System calls that are refused unless the first argument is the caller's own process id, or 0 if that means the same.
+#: System calls that are rejected unless their first argument is the caller's process id, or 0 where 0 means the caller.
 _OWN_ONLY: dict[str, tuple[int, int, bool]] = {
     "kill": (62, 129, False), "tgkill": (234, 131, False), "prlimit64": (302, 261, True),
     "sched_setaffinity": (203, 122, True), "sched_setscheduler": (144, 119, True), "sched_setparam": (142, 118, True),

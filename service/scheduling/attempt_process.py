@@ -209,7 +209,7 @@ def tell_preview(path: Path) -> None:
 
 
 def summary(result: Result) -> dict[str, Any]:
-    """Return the result for the job's record; the report has the details."""
+    """Return a summary of the result for the job's record; the report has the details."""
     before, after = result.losses
     return {
         "stopped": result.stopped,

@@ -63,7 +63,7 @@ class Room:
 
     Args:
         machine: Total hardware.
-        parallel_jobs: Maximum number of concurrent jobs; None for one per GPU, or one without GPUs.
+        parallel_jobs: Maximum number of concurrent jobs; None for one per GPU (one in total if there are no GPUs).
     """
 
     def __init__(self, machine: Machine, parallel_jobs: int | None) -> None:

@@ -257,7 +257,7 @@ def _ranks_folder(settings: ServiceSettings) -> Path:
 
 
 def _remove_left(above: Path) -> None:
-    """Remove folders that nobody holds a lock on."""
+    """Remove folders whose lock is not held."""
     if not above.is_dir():
         return
     with _locked(above / "all"):

@@ -12,7 +12,7 @@ as fast as its monotonic clock runs:
 
 A dispatcher whose clock disagrees with the heartbeats of another live one neither advances the expiry time nor deletes
 anything (`service.scheduling.clock_watch`), because it is unknown which clock is right. The expiry time never goes
-back, so a clock that was temporarily behind delays nothing later.
+back, so a clock that was temporarily behind does not delay later deletions.
 """
 
 from __future__ import annotations

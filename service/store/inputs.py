@@ -256,7 +256,7 @@ class Inputs:
         """Delete an upload; a blob made from it remains for the jobs that use it.
 
         Returns:
-            Locations of blobs that nothing needs any more, for `Blobs.remove`.
+            Locations of blobs that are no longer used, for `Blobs.remove`.
         """
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
@@ -308,7 +308,7 @@ class Inputs:
         """Delete the receipt of a request that ended without a job.
 
         Returns:
-            Locations of blobs that nothing needs any more, for `Blobs.remove`.
+            Locations of blobs that are no longer used, for `Blobs.remove`.
         """
         with self._database.writing() as session:
             session.execute(delete(UploadRow).where(UploadRow.id == receipt))

@@ -181,7 +181,7 @@ class Jobs:
     def queue_position(self, job: JobRow) -> int | None:
         """Return the number of queued jobs ahead by priority and age, plus one; None if the job is not queued.
 
-        Turns between owners are ignored, because they change with every lease.
+        The turns of owners are ignored, because they change with every lease.
         """
         with self._database.reading_rows() as connection:
             return _queue_position(connection, job)
@@ -236,7 +236,7 @@ class Jobs:
         """Delete an ended job and release its inputs; the caller removes its results afterwards.
 
         Returns:
-            Locations of inputs that nothing needs any more, for `Blobs.remove`.
+            Locations of inputs that are no longer used, for `Blobs.remove`.
 
         Raises:
             ConflictError: If the job has not ended.

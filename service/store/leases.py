@@ -91,10 +91,10 @@ class Leases:
         Jobs with expired leases are candidates like queued ones. If such a job has used up its attempts, it is ended as
         failed, and if it was being canceled, as canceled; then the next job is tried.
 
-        A job that does not fit is reserved: this dispatcher takes no other job of its priority until it fits, so that
-        smaller jobs do not overtake it forever. Another dispatcher takes it if it fits there first, and skips it
-        otherwise, so a large job blocks one dispatcher rather than all. Jobs that may run `before` the reserved one are
-        taken meanwhile, and the reservation remains.
+        If a job does not fit, it is reserved: this dispatcher takes no other job of the same priority until the
+        reserved job fits, so that smaller jobs do not overtake it forever. Other dispatchers take the job if it fits
+        there first and skip it otherwise, so a large job blocks only one dispatcher. Jobs that may run `before` the
+        reserved one are taken meanwhile, and the reservation remains.
 
         Args:
             dispatcher: Name of the dispatcher.
@@ -184,7 +184,7 @@ class Leases:
         return found
 
     def statuses(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
-        """Return the status of leased jobs as `renew` does, without renewing."""
+        """Return what `renew` returns, without renewing the leases."""
         ids = [lease.job_id for lease in leases]
         with self._database.reading() as session:
             rows = {row.id: row for row in session.scalars(select(JobRow).where(JobRow.id.in_(ids)))}
@@ -243,7 +243,7 @@ class Leases:
             session.execute(_FORGET_PROGRESS, {"of_job": lease.job_id})
 
     def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
-        """Publish files, replacing those of the same names; return locations that nothing refers to any more."""
+        """Publish files, replacing those of the same names; return the locations of the replaced files."""
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)

@@ -42,7 +42,7 @@ class Delivery:
 
 
 def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
-    """Return an expression that maps a column's value to its count."""
+    """Return an SQL expression for the count of a column's value; 0 for values without a count."""
     return case(dict(counts), value=column, else_=0) if counts else literal(0)
 
 

@@ -63,7 +63,7 @@ def _count(condition: ColumnElement[bool]) -> Select[int]:
 
 # Built once, because building a query takes longer than running it.
 _NOW: BindParameter[float] = bindparam("now", type_=Float)
-#: Queries that count the jobs that may start `now`, and the lost ones, up to `most`.
+#: Queries that count the jobs that may start `now`, and the jobs with expired leases, up to `most`.
 WAITING, LOST = _count(queued_now(_NOW)), _count(expired(_NOW))
 
 
@@ -75,7 +75,7 @@ def mine(dispatcher: str | BindParameter[str]) -> ColumnElement[bool]:
 def next_job(session: Session, dispatcher: str, now: float, passed: Sequence[str] = ()) -> JobRow | None:
     """Return a dispatcher's next job: by priority, then the dispatcher's reservation, then owners' turns, then age.
 
-    The job's row is locked; rows locked by others are skipped.
+    The job's row is locked; rows locked by other transactions are skipped.
 
     Args:
         passed: Ids of jobs to skip.

@@ -1,4 +1,4 @@
-"""Pure decisions about a job whose attempt ended without a result; `leases` carries them out."""
+"""Pure functions that decide about a job whose attempt ended without a result; `service.store.leases` calls them."""
 
 from __future__ import annotations
 
