@@ -1,6 +1,6 @@
-"""`python -m service.ensure_network_weights [NAME...]`: fetch the named networks that are not installed.
+"""`python -m service.ensure_network_weights [NAME...]`: download the named feature networks that are not installed.
 
-Without names, one installed network is enough: VGG16 is fetched only if there is neither VGG19 nor VGG16.
+If no names are given, VGG16 is downloaded, but only if neither VGG19 nor VGG16 is installed.
 """
 
 from __future__ import annotations

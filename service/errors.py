@@ -1,4 +1,4 @@
-"""Exceptions of the service, in one tree: `code` is for programs, the message for people."""
+"""Exceptions of the service; each has a machine-readable `code` and a message for people."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class NotFoundError(ServiceError):
 
 
 class RefusedInputError(ServiceError):
-    """Input that cannot be used; `code` is the core's, `extra["input"]` names the part of the request."""
+    """Unusable input; `code` is that of the core's error, and `extra["input"]` names the part of the request."""
 
     code, status = "invalid-input", 422
 
@@ -68,7 +68,7 @@ class QueueFullError(ServiceError):
 class QuotaError(ServiceError):
     """Exhausted quota of a key; `extra["quota"]` names it.
 
-    It recovers after `extra["retry_after"]` seconds.
+    The quota recovers after `extra["retry_after"]` seconds.
     """
 
     code, status = "quota-exceeded", 429
@@ -81,13 +81,13 @@ class RateLimitError(ServiceError):
 
 
 class NoSpaceError(ServiceError, InfrastructureError):
-    """Data that the service refuses because its disk is too full."""
+    """Request that is rejected because the service's disk is too full."""
 
     code, status = "insufficient-storage", 507
 
 
 class BusyError(ServiceError):
-    """Request that needs something that is in use; repeating it later will succeed."""
+    """Request that needs a resource that is in use; retrying it later will succeed."""
 
     code, status = "busy", 503
 
@@ -112,7 +112,7 @@ class DamagedWeightsError(ServiceError, InfrastructureError):
 
 
 class LostFileError(ServiceError):
-    """File that a row refers to but that is missing from the file store, although the store responds."""
+    """File that a database row refers to but that is missing from the file store, although the store is reachable."""
 
     code, status = "file-lost", 500
 
@@ -157,6 +157,6 @@ class DatabaseBusyError(DatabaseUnavailableError):
 
 
 class LeaseLostError(ServiceError):
-    """Job that another dispatcher has taken over: all further writes of the previous holder are rejected."""
+    """Lost lease: another dispatcher has taken over the job, and writes of the previous holder are rejected."""
 
     code, status = "lease-lost", 409

@@ -1,6 +1,6 @@
 """Compare the files of a service with the rows of its database, and repair what can be repaired.
 
-The service may be running meanwhile.
+This is safe while the service is running.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadPartRow
 
 #: Rows per query, and number of files that are read concurrently.
 _PAGE, _AT_A_TIME = 500, 4
-#: Minimum age of an orphan in seconds: the row of a younger file may not have been written yet. Object stores get a
-#: longer time because their clocks may differ from this machine's.
+#: Minimum age of an orphan in seconds; younger files may not have their database row yet. The limit for remote file
+#: stores is longer, because their clocks may differ from this machine's.
 _ORPHAN_SECONDS, _REMOTE_ORPHAN_SECONDS = 3600.0, 6 * 3600.0
-#: Folder of a store that damaged files are moved to.
+#: Folder of a file store to which damaged files are moved.
 QUARANTINE = "quarantine"
 
 Kind = Literal["missing", "damaged", "orphaned"]
@@ -39,7 +39,7 @@ What = Literal["input", "result", "checkpoint", "upload"]
 
 @dataclass(frozen=True)
 class Finding:
-    """File that does not agree with the database.
+    """File that is inconsistent with the database.
 
     Attributes:
         kind: Kind of the fault.
@@ -86,11 +86,11 @@ class FileCheck:
         self.checked = 0
 
     def findings(self, *, mend: bool = False) -> Iterator[Finding]:
-        """Yield all files that do not agree with the database.
+        """Yield all files that are inconsistent with the database.
 
         Args:
-            mend: Whether to move damaged files to `QUARANTINE`, to delete rows whose files are gone and that nothing
-                needs, and to delete orphans. Orphans are never deleted after a rollback of the database.
+            mend: Whether to repair: move damaged files to `QUARANTINE`, delete unused rows whose files are gone, and
+                delete orphans. Orphans are never deleted after a rollback of the database.
         """
         with ThreadPoolExecutor(_AT_A_TIME) as pool:
             for files in self._pages():
@@ -233,7 +233,7 @@ class FileCheck:
             yield Finding("orphaned", what, name, mended="deleted" if mend else "")
 
     def _unknown(self) -> Iterator[tuple[ObjectStore, What, str]]:
-        """Yield files that no row refers to or will refer to.
+        """Yield files that no database row refers to or will refer to.
 
         Files are listed before rows are read, so that the row of every listed file is already visible.
         """

@@ -1,7 +1,8 @@
 """`python -m service.health api|dispatcher`: check the process of this container; the exit status is 1 on failure.
 
-A dispatcher has no port. It is healthy if the database has received a heartbeat within the duration of a lease. It also
-counts as healthy while the database does not respond, because a restart would only lose the running jobs.
+A dispatcher has no port to probe. It is healthy if the database has received a heartbeat within the duration of a
+lease. It also counts as healthy while the database does not respond, because a restart would only lose the running
+jobs.
 """
 
 from __future__ import annotations

@@ -32,8 +32,8 @@ class JsonFormatter(logging.Formatter):
 class TextFormatter(logging.Formatter):
     """Formatter that writes time, level, message, and the job if there is one.
 
-    Every record starts on a new line, and no other line starts without indentation, whatever request text a record
-    repeats.
+    Every record starts on a new line, and all its further lines are indented. Text from a request therefore cannot
+    forge a record.
     """
 
     def format(self, record: logging.LogRecord) -> str:

@@ -49,7 +49,7 @@ class JobParameters(StylizeOptions):
         """Return the requested regions.
 
         Raises:
-            SettingsError: If they are inconsistent or selected by masks.
+            SettingsError: If the regions are inconsistent, or one is selected by a mask.
         """
         found = region_requests(self.regions or (), exists=lambda path: False)
         for region in found:
@@ -62,7 +62,7 @@ class JobParameters(StylizeOptions):
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
-    """Return the parameters of a stored job, which an earlier version may have written under former names.
+    """Return the parameters of a stored job; an earlier version may have stored them under former names.
 
     Raises:
         SettingsError: If this version does not support them.

@@ -1,4 +1,4 @@
-"""`python -m service.prepare`: create what API and dispatchers share, the database tables and the bucket for files.
+"""`python -m service.prepare`: create the database tables and the file bucket that API and dispatchers share.
 
 Run it once per installation, and before the processes of a new version start. Migrations only add to the schema, so
 processes of the previous version keep working meanwhile (tests/service/store/test_migrations.py). The command waits

@@ -1,4 +1,4 @@
-"""Conversion of a stored job to the request that the worker takes."""
+"""Conversion of a stored job to a request for the worker."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def scene_request(staged: Staged, parameters: JobParameters) -> SceneRequest:
 
 
 def _styles(staged: Staged, parameters: JobParameters) -> tuple[StyleFile, ...]:
-    """Return the images of the job's own style, excluding those of regions; without weights they are mixed equally."""
+    """Return the style images that belong to no region; if the job has no style weights, their weights are equal."""
     taken = region_styles(parameters.region_requests)
     own = [path for path in staged.styles if path.name not in taken]
     weights = parameters.style_weights or [1.0] * len(own)

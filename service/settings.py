@@ -34,7 +34,7 @@ class ServiceSettings(BaseSettings):
         max_request_bytes: Size limit of one request body; multipart uploads may be larger.
         max_upload_bytes: Size limit of one file.
         max_gaussians, max_views, max_pixels: Limits per job; pixels are those of all views together.
-        max_image_pixels: Limit for the style and for each photo.
+        max_image_pixels: Pixel limit of each style image and each photo.
         max_photos: Maximum number of photos per job.
         max_jobs_per_key: Maximum number of unfinished jobs per key.
         max_jobs_a_day_per_key, max_gpu_seconds_a_day_per_key, max_bytes_per_key, max_requests_a_second_per_key: Quotas
@@ -49,19 +49,19 @@ class ServiceSettings(BaseSettings):
         receive_seconds: Time without new bytes after which a request body is abandoned.
         session_days: Lifetime of a browser session that was started with a key.
         upload_hours: Time after which an unfinished upload, or a finished one that no job uses, expires.
-        retention_days: Time after which the results of a finished job expire; the job's record is kept for the same
-            time again.
+        retention_days: Time after which the results of a finished job expire; the job's record is deleted after another
+            such period.
         lease_seconds: Time without heartbeat after which another dispatcher takes over a job.
         max_attempts: Consecutive attempts without progress after which a job fails.
         retry_seconds: Delay before the second attempt; it doubles with each further one.
-        parallel_jobs: Number of concurrent jobs; None for one per GPU, or one without GPUs.
+        parallel_jobs: Maximum number of concurrent jobs; None for one per GPU (one in total if there are no GPUs).
         cluster_gpus: GPUs of the Ray cluster at RAY_ADDRESS that this dispatcher may assign to jobs.
         start_seconds: Time that a starting process waits for a database server that does not respond yet.
         checkpoint_seconds: Interval between checkpoints of a running job.
         preview_seconds: Interval between preview images of a running job; its log is updated as often if it has grown.
         stop_seconds: Time that a job has for stopping before it is killed.
         webhooks: Whether jobs may name a URL that is notified when they end.
-        webhook_private_addresses: Whether such URLs may lead to private networks.
+        webhook_private_addresses: Whether webhook URLs may lead to private networks.
         log_format: "json" or "text".
     """
 
@@ -126,7 +126,7 @@ class ServiceSettings(BaseSettings):
 
     @property
     def artifacts_url(self) -> str:
-        """URL of the results; a folder in `data` by default."""
+        """URL of the file store; a folder in `data` by default."""
         return self.artifacts or f"file://{self.folder / 'artifacts'}"
 
     @property

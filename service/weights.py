@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 
 def check_weights() -> None:
-    """Verify the installed weights, and log each damage once with what the operator has to do.
+    """Verify the installed weights, and log each damaged file once, with instructions for the operator.
 
     Raises:
         DamagedWeightsError: If any weights are damaged.

@@ -1,1 +1,1 @@
-"""Files of jobs: inputs by digest, artifacts, and the folder that a job's inputs are staged in."""
+"""Files of jobs: inputs stored by digest, result files, and the folder in which a job's inputs are staged."""

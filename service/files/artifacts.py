@@ -18,7 +18,7 @@ from service.files.objects import ObjectStore
 from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
 
-#: Error numbers of a failed hard link: the target is on another file system, or its file system has no links.
+#: Error numbers that mean that a hard link is impossible: different file systems, or no support for hard links.
 _NO_LINKS = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK)
 _MEDIA_TYPES = {
     ".ply": "application/octet-stream",
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 class Artifacts:
     """Results in the file store.
 
-    A name is never written twice; the rows of the database refer to the current files.
+    Object names are never reused; database rows refer to the current version of each file.
     """
 
     def __init__(self, url: str) -> None:
@@ -45,11 +45,11 @@ class Artifacts:
     def put(self, job_id: str, epoch: int, name: str, source: Path, *, final: bool = False) -> Published:
         """Store a result file.
 
-        The file is complete and durable when this returns. It becomes visible once its row is in the database.
+        The file is complete and durable when this function returns. Users can see it once it has a database row.
 
         Args:
-            final: Whether nobody writes to the file any more, although another file may replace it. In a folder of the
-                same file system such a file is hard-linked instead of copied.
+            final: Whether the content of `source` no longer changes; the path may still be replaced with another file.
+                A final file is hard-linked instead of copied if the file store is on the same file system.
         """
         location = f"{job_id}/{epoch}/{secrets.token_hex(6)}/{name}"
         if not self.local:
@@ -70,7 +70,7 @@ class Artifacts:
         return self.objects.read(location, start, stop)
 
     def check(self, location: str, sha256: str) -> None:
-        """Compare a result with the SHA-256 of its row, unless that has just been done.
+        """Verify the SHA-256 of a result, unless it was verified recently and has not changed since.
 
         Raises:
             LostFileError, DamagedFileError: If the result is missing or differs.
@@ -103,11 +103,11 @@ class Artifacts:
         self.objects.remove_below(job_id)
 
     def sweep(self, job_id: str, epoch: int, kept: set[str]) -> None:
-        """Remove files of a job that no row refers to, left behind by interrupted attempts.
+        """Remove files that interrupted attempts at a job left behind and that no database row refers to.
 
         Args:
-            epoch: Epoch of the last lease whose files are removed; files of later leases may not have their rows yet.
-            kept: Locations that rows refer to.
+            epoch: Latest lease epoch whose files are removed; files of later leases may not have their rows yet.
+            kept: Locations that database rows refer to; their files are not removed.
         """
         for location in self.objects.below(job_id):
             below = location.partition("/")[2]
@@ -115,7 +115,7 @@ class Artifacts:
                 self.remove(location)
 
     def ping(self) -> None:
-        """Raise OSError or StoreError if the store of the results cannot be reached."""
+        """Raise OSError or StoreError if the file store cannot be reached."""
         self.objects.ping()
 
 
@@ -125,7 +125,7 @@ def media_type(name: str) -> str:
 
 
 def _linked(source: Path, target: Path) -> bool:
-    """Replace `target` with a hard link to a file; return False if the file system does not support that."""
+    """Replace `target` with a hard link to `source`; return False if the file system does not support that."""
     target.unlink()
     try:
         os.link(source, target)
@@ -138,7 +138,7 @@ def _linked(source: Path, target: Path) -> bool:
 
 @contextmanager
 def _held(source: Path) -> Iterator[Path]:
-    """Hold a file by a second hard link, so that replacing it during the transfer does not affect what is sent."""
+    """Provide a second hard link to a file, so that replacing the file during its upload does not affect the upload."""
     held = source.with_name(f".{secrets.token_hex(6)}-{source.name}")
     try:
         os.link(source, held)

@@ -1,4 +1,4 @@
-"""Inputs of jobs, received in constant memory and stored once per SHA-256 of their content.
+"""Inputs of jobs: files that are received in constant memory and deduplicated by SHA-256.
 
 If the file store is a local folder, inputs are files in the data folder (`BlobFolder`). Otherwise they are objects of
 the file store (`service.files.stored_blobs`). Both implement `Blobs`.
@@ -24,16 +24,17 @@ from service.files.objects import ObjectStore
 from service.store.inputs import Inputs, check_offset
 from service.store.tables import BlobRow, UploadRow
 
-#: Age in seconds at which files without a row are removed: the row of a younger file may not have been written yet.
+#: Age in seconds at which files without a database row are removed; younger files may not have their row yet.
 _ORPHAN_SECONDS = 3600.0
-#: Folders of the file store, and of the data folder if the file store is local; all other folders belong to jobs.
+#: Folders of inputs and of unfinished uploads, in the file store (in the data folder if the file store is local). All
+#: other folders of the file store belong to jobs.
 BLOBS, UPLOADS = "blobs", "uploads"
-#: Minimum number of free inodes: a request needs some, and so does the database.
+#: Minimum number of free inodes, since both requests and the database create files.
 _MIN_FREE_INODES = 1000
 
 
 class Receiver:
-    """File that is being received; `Blobs.keep` makes it a blob."""
+    """File that is being received; `Blobs.keep` turns it into a blob."""
 
     def __init__(self, path: Path, limit: int, room: Callable[[int], None]) -> None:
         self.path = path
@@ -70,13 +71,13 @@ class PartWriter(Protocol):
     """Writer of the next bytes of an upload."""
 
     def write(self, data: bytes) -> None:
-        """Append bytes; they are not part of the upload until `save`."""
+        """Append bytes; they become part of the upload with the next `save`."""
 
     def save(self) -> float:
         """Make the bytes durable, record them in the database, and return the upload's new expiry time.
 
         Raises:
-            ConflictError: If another request has saved the same bytes meanwhile.
+            ConflictError: If another request has saved bytes at the same offset meanwhile.
         """
 
     def discard(self) -> None:
@@ -87,11 +88,11 @@ class PartWriter(Protocol):
 
 
 class Blobs(ABC):
-    """All inputs; the rows of the database list them.
+    """Store of all inputs of jobs (blobs); the database has a row for each.
 
     Args:
-        folder: Folder of files that are being received.
-        min_free: Free bytes of its disk below which no data is accepted.
+        folder: Data folder; files that are being received are in its subfolder `incoming`.
+        min_free: Minimum free disk space of `folder` in bytes; data that would leave less is rejected.
         objects: File store that holds the blobs, under `BLOBS`.
     """
 
@@ -116,14 +117,14 @@ class Blobs(ABC):
 
     @abstractmethod
     def keep(self, path: Path, upload_id: str | None = None) -> str:
-        """Turn a received, durable file into a blob and return its SHA-256; the file no longer exists afterwards.
+        """Turn a received, durable file into a blob and return its SHA-256; `path` no longer exists afterwards.
 
-        The digest is computed from the very file that becomes the blob. A lost or damaged blob of the same content is
-        replaced.
+        The digest is computed from the file that becomes the blob. If there is a blob with the same digest already and
+        its file is lost or damaged, that file is replaced.
 
         Args:
-            path: File that nobody writes to any more.
-            upload_id: Upload or receipt that holds the blob from now on.
+            path: Complete file that is no longer written to.
+            upload_id: Upload or receipt (`service.store.inputs`) that holds the blob from now on; None for none.
 
         Raises:
             NotFoundError: If the upload or receipt is gone.
@@ -133,16 +134,16 @@ class Blobs(ABC):
     def remove(self, locations: Iterable[str]) -> None:
         """Remove the files of blobs whose rows have been deleted.
 
-        Files that cannot be removed now are collected later.
+        If a file cannot be removed now, a later call of `collect` removes it.
         """
 
     @abstractmethod
     def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
-        """Return blobs as local files by digest, after verifying each.
+        """Return the local paths of blobs by digest, after verifying each blob.
 
         Args:
-            rows: Blobs by digest.
-            folder: Folder for these files only; they exist as long as the folder.
+            rows: Rows of the blobs by digest.
+            folder: Folder in which local files may be created; the returned paths are valid as long as it exists.
 
         Raises:
             LostFileError: If the file store does not have a blob.
@@ -167,7 +168,7 @@ class Blobs(ABC):
 
     @abstractmethod
     def begin_upload(self, upload_id: str) -> None:
-        """Prepare for the bytes of a new upload, whose row exists already."""
+        """Prepare for receiving the bytes of a new upload, whose database row exists already."""
 
     @abstractmethod
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
@@ -187,7 +188,7 @@ class Blobs(ABC):
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
         """Turn a completely saved upload into a blob and return the blob's SHA-256.
 
-        The upload's bytes remain until the database knows the blob, so the call can be repeated after a crash.
+        The upload's bytes remain until the blob has a database row, so the call can be repeated after a crash.
 
         Raises:
             NotFoundError: If the upload's bytes are gone.
@@ -196,12 +197,12 @@ class Blobs(ABC):
 
     @abstractmethod
     def forget_upload(self, upload_id: str) -> None:
-        """Remove the received bytes of an upload whose row is gone."""
+        """Remove the received bytes of an upload whose database row is gone."""
 
     def collect(self) -> int:
         """Remove unused blobs and leftovers of crashes; return the number of removed files.
 
-        After a rollback of the database no blob is removed, because the database may not know who needs it.
+        After a rollback of the database no blob is removed, because the rows of jobs that use it may have been lost.
         """
         for upload_id in self._inputs.expire_uploads():
             self.forget_upload(upload_id)
@@ -214,7 +215,7 @@ class Blobs(ABC):
         return removed
 
     def _expiry(self) -> float:
-        """Return the time by which files expire: the earlier of the clocks of this machine and of the database."""
+        """Return the reference time for expiry: the earlier of this machine's clock and the database's expiry time."""
         return min(time.time(), self._inputs.expiry())
 
     @abstractmethod
@@ -235,9 +236,9 @@ class BlobFolder(Blobs):
         """Move or link a received file to its final path and return its SHA-256.
 
         Args:
-            path: File that nobody writes to any more.
-            upload_id: Upload or receipt that holds the blob from now on.
-            leave: Whether to link the file, so that its old path remains.
+            path: Complete file that is no longer written to.
+            upload_id: Upload or receipt (`service.store.inputs`) that holds the blob from now on; None for none.
+            leave: Whether to hard-link the file instead of moving it, so that `path` remains.
         """
         path.chmod(0o400)
         size, sha256 = path.stat().st_size, file_digest(path)
@@ -254,7 +255,7 @@ class BlobFolder(Blobs):
             final.unlink()
             raise
         known = self._blobs / location
-        if known != final:  # replaces the known file of the same content, which may be lost or damaged
+        if known != final:  # replace the earlier file of the same content, which may be lost or damaged
             known.parent.mkdir(exist_ok=True)
             final.replace(known)
             final.unlink(missing_ok=True)  # renaming one of two hard links to the other is a no-op
@@ -266,7 +267,7 @@ class BlobFolder(Blobs):
         for location in locations:
             (self._blobs / location).unlink(missing_ok=True)
 
-    def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (others need it)
+    def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (base signature)
         """Return the paths of the verified blobs; `folder` is not used."""
         for sha256, row in rows.items():
             self.objects.check(f"{BLOBS}/{row.location}", sha256)
@@ -325,7 +326,7 @@ class BlobFolder(Blobs):
 class _FileWriter:
     """Writer to the file of an unfinished upload, starting at the offset in the database.
 
-    Only one writer per upload is open at a time, across processes: it locks the file descriptor that it writes to.
+    Each writer locks the file, so that only one writer per upload is open at a time across all processes.
     """
 
     def __init__(self, path: Path, inputs: Inputs, upload: UploadRow, seconds: float) -> None:
@@ -337,9 +338,9 @@ class _FileWriter:
             raise gone(upload) from None
         try:
             _lock(self._file)
-            # read again: under the lock nobody changes it
+            # read the row again: no other writer changes it while the lock is held
             check_offset(inputs.upload(upload.id, upload.owner), upload.offset)
-            # seeking beyond the end would fill the gap with zeros
+            # writing beyond the end of the file would fill the gap with zeros
             if os.fstat(self._file.fileno()).st_size < upload.offset:
                 raise gone(upload)
             self._file.truncate(upload.offset)  # a crash may have left unrecorded bytes
@@ -396,7 +397,7 @@ def write_all(file: object, data: bytes) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Make the names in a folder durable."""
+    """Make the entries of a folder durable (fsync)."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,9 +1,9 @@
 """Cache of stored files on one host, verified by their SHA-256 and limited in total size.
 
-Each file is fetched once and named by its digest. A user of a file gets a hard link to it in a folder of its own on the
-same file system. A file with more than one link is in use and is not evicted. Any number of processes may share a
-cache: files appear atomically by renaming, each digest is fetched under a lock, and evicting a file leaves the links of
-its users intact.
+Each file is fetched once and named by its digest. Callers get a hard link to the file in their own folder, which must
+be on the same file system. A file with more than one link is in use and is not evicted. Any number of processes may
+share a cache: files appear atomically by renaming, each digest is fetched under a lock, and evicting a file leaves the
+callers' links intact.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from pathlib import Path
 from service.errors import DamagedFileError, LostFileError, NoSpaceError
 
 _CHUNK = 1 << 20
-#: Number of fetches before a file counts as damaged in the store itself.
+#: Number of fetches with a wrong digest after which the file counts as damaged in the store.
 _TRIES = 2
-#: Age in seconds at which partial files of dead processes are removed: no fetch takes that long.
+#: Age in seconds at which partially fetched files are removed; no fetch takes that long, so their processes have died.
 _HALF_SECONDS = 6 * 3600.0
 #: Error numbers of a full disk.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
@@ -108,7 +108,7 @@ class FileCache:
             self._remove_half_files()
 
     def free(self, size: int) -> None:
-        """Evict up to `size` bytes of unused files when the disk space is needed elsewhere."""
+        """Evict unused files to free `size` bytes of disk space for other purposes."""
         self.evict(self._limit - self._total() + size)
 
     def _fill(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
@@ -119,7 +119,7 @@ class FileCache:
                 self._fetch(half, fetch)
                 found = file_digest(half)
                 if found == sha256:
-                    os.link(half, target)  # linked first, because an unused file could be evicted
+                    os.link(half, target)  # link first: a file without other links could be evicted
                     self._keep(half, sha256)
                     return
         except FileNotFoundError as error:
@@ -149,7 +149,7 @@ class FileCache:
     def _keep(self, source: Path, sha256: str) -> None:
         """Move a file into the cache.
 
-        Its modification time is derived from its content, so it is the same on every host and after every fetch.
+        The modification time is derived from the digest, so that it is the same on every host and after every fetch.
         """
         moment = int(sha256[:8], 16)
         source.chmod(0o400)

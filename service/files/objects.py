@@ -1,7 +1,7 @@
 """File store behind an fsspec URL: a local folder, an S3-compatible bucket, or any other file system of fsspec.
 
-Objects are written as a whole, and each name is written once. Failures of a remote store (unreachable, slow, broken)
-are raised as `StoreError`; errors of a local folder are raised unchanged.
+Objects are written as a whole, and overwritten only to repair them. Failures of a remote store (unreachable, slow,
+broken) are raised as `StoreError`; errors of a local folder are raised unchanged.
 """
 
 from __future__ import annotations
@@ -21,17 +21,19 @@ from fsspec.implementations.local import LocalFileSystem
 
 from service.errors import DamagedFileError, LostFileError, StoreError
 
-#: Limits for S3: timeouts of connecting and of responses in seconds, and numbers of tries. The S3 client itself retries
-#: 503 (SlowDown) with exponential backoff. In total, an unreachable store is given up after half a minute.
+#: Limits for S3: timeouts for connecting and for responses in seconds, and numbers of attempts by the S3 client and by
+#: fsspec. The S3 client retries 503 (SlowDown) with exponential backoff. In total, an unreachable store raises an error
+#: after half a minute.
 _CONNECT_SECONDS, _ANSWER_SECONDS = 3.0, 30.0
 _CLIENT_TRIES, _TRIES = 3, 3
-#: Size and concurrency of the chunks of large objects sent to and from S3: the defaults would keep half a gigabyte in
-#: memory.
+#: Chunk size in bytes and number of concurrent chunks for transfers of large S3 objects; the defaults would use half a
+#: gigabyte of memory.
 _PIECE_BYTES, _PIECES = 16 << 20, 3
 #: Minimum and maximum size of an S3 object part in bytes (the last one may be smaller), and maximum number of parts.
 MIN_PART_BYTES, _MAX_PART_BYTES, _MAX_PARTS = 5 << 20, 5 << 30, 10_000
 _CHUNK = 1 << 20
-#: Time in seconds after which an unchanged file is hashed again before it is sent, and number of files remembered.
+#: Time in seconds for which a verified object is not hashed again unless it changes, and maximum number of objects for
+#: which this is cached.
 _CHECKED_SECONDS, _MAX_CHECKED = 3600.0, 10_000
 
 _log = logging.getLogger(__name__)
@@ -45,7 +47,7 @@ class TruncatedError(OSError):
 
 
 class ObjectStore:
-    """Objects below a URL, named relative to it."""
+    """Objects of a file store; their names are relative to its URL."""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -61,7 +63,7 @@ class ObjectStore:
         return (found,) if isinstance(found, str) else tuple(found)
 
     def put(self, source: Path, name: str) -> None:
-        """Store a file that nobody writes to, atomically."""
+        """Upload a file atomically; it must not change during the upload."""
         with self._told(name):
             options = {"chunksize": _PIECE_BYTES, "max_concurrency": _PIECES} if self._s3 else {}
             self._files.put_file(str(source), self._path(name), **options)
@@ -134,7 +136,7 @@ class ObjectStore:
             return -1
 
     def digest(self, name: str) -> str:
-        """Return the SHA-256 of an object, which is read completely.
+        """Read an object completely and return its SHA-256.
 
         Raises:
             FileNotFoundError: If there is no such object.
@@ -182,7 +184,7 @@ class ObjectStore:
             return False
 
     def check_once(self, name: str, sha256: str) -> None:
-        """Call `check` unless `is_checked`."""
+        """Call `check` unless `is_checked` returns True."""
         if not self.is_checked(name, sha256):
             self.check(name, sha256)
 
@@ -209,18 +211,18 @@ class ObjectStore:
         with self._told(folder):
             self._files.invalidate_cache()
             inside = f"{self._path(folder).rstrip('/')}/"
-            found = self._files.find(inside, detail=True)  # may list an empty folder as an object of its name
+            found = self._files.find(inside, detail=True)  # some stores list an empty folder as an object
             return {
                 path[len(self.root) + 1 :]: _changed(entry) for path, entry in found.items() if path.startswith(inside)
             }
 
     def can_join(self, sizes: list[int]) -> bool:
-        """Return whether the store can concatenate objects of these sizes without uploading them again."""
+        """Return whether the server can concatenate objects of these sizes itself, without another upload."""
         fit = all(size >= MIN_PART_BYTES for size in sizes[:-1]) and max(sizes, default=0) <= _MAX_PART_BYTES
         return self._s3 and 0 < len(sizes) <= _MAX_PARTS and fit
 
     def join(self, parts: list[str], name: str) -> None:
-        """Concatenate objects inside the store by S3's multipart upload with copied parts; see `can_join`."""
+        """Concatenate objects on the server, by an S3 multipart upload with copied parts; see `can_join`."""
         with self._told(name):
             where = dict(zip(("Bucket", "Key"), self._path(name).split("/", 1), strict=True))
             begun = self._files.call_s3("create_multipart_upload", **where)

@@ -13,10 +13,10 @@ from worker.regions import MOST_REGIONS, RegionRequest
 from worker.styles import MOST_PICTURES
 
 ROLES = ("scene", "style", "cameras", "photos")
-#: Maximum number of style images: those of the job's own style, plus one for each region.
+#: Maximum number of style images: those that belong to no region, plus one for each region.
 MOST_STYLES = MOST_PICTURES + MOST_REGIONS
-#: Maximum number of camera files: a COLMAP model has at most cameras, images, points3D, rigs and frames, and a
-#: transforms.json may have a companion.
+#: Maximum number of camera files: a COLMAP model has up to five (cameras, images, points3D, rigs, frames), and a
+#: transforms.json may come with a dataparser_transforms.json.
 MAX_CAMERA_FILES = 8
 _CAMERA_SUFFIXES = {".json", ".bin", ".txt"}
 _MAX_NAME, _MAX_DEPTH = 120, 8  # bytes of a path component: file systems allow 255, and suffixes are added later
@@ -24,7 +24,7 @@ _MAX_NAME, _MAX_DEPTH = 120, 8  # bytes of a path component: file systems allow 
 
 @dataclass(frozen=True)
 class Staged:
-    """Paths of a job's files relative to the staging folder, so that reports do not reveal where it is."""
+    """Paths of a job's files relative to the staging folder, so that reports do not reveal its location."""
 
     scene: Path
     styles: tuple[Path, ...]
@@ -81,7 +81,7 @@ def check_roles(
 
     Args:
         orbit: Whether the cameras are on an orbit, which excludes camera files.
-        weights: Weights of the images of the job's own style; None for equal weights.
+        weights: Weights of the style images that belong to no region; None for equal weights.
         of_regions: Names of the style images of regions.
 
     Raises:
@@ -130,7 +130,7 @@ def check_roles(
 
 
 def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int:
-    """Verify that the styles of regions have been sent, and return the number of images of the job's own style."""
+    """Verify that the styles of regions have been sent, and return the number of style images without a region."""
     missing = next((name for name in of_regions if name not in names), None)
     if missing is not None:
         raise RefusedInputError(
@@ -159,7 +159,7 @@ def _first_duplicate(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None
 
 
 def _check_folders(photos: Sequence[Mapping[str, Any]]) -> None:
-    """Refuse a photo whose name is also the folder of another photo."""
+    """Reject photos if the name of one is also the folder of another."""
     names = {entry["name"] for entry in photos}
     for name in names:
         above = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in names), None)
@@ -214,7 +214,7 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
     Args:
         folder: Existing folder.
         inputs: Inputs as for `layout`.
-        blobs: Files by digest.
+        blobs: Local paths of the files by digest.
     """
     staged, files = layout(inputs)
     for path, sha256 in files:
@@ -226,7 +226,7 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
 
 
 def _camera_path(names: Sequence[str]) -> Path | None:
-    """Return the path of the cameras: the only file, a transforms.json with a companion, or a COLMAP model's folder."""
+    """Return the path of the cameras: the only file, the transforms.json, or the folder of a COLMAP model."""
     jsons = [name for name in names if name.lower().endswith(".json") and name != "dataparser_transforms.json"]
     if not names:
         return None

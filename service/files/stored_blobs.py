@@ -1,4 +1,4 @@
-"""Inputs in the file store, which all hosts share, read through this host's cache."""
+"""Inputs in a remote file store that all hosts share; reads go through a cache on this host."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from service.settings import ServiceSettings
 from service.store.inputs import Inputs
 from service.store.tables import BlobRow, UploadPartRow, UploadRow
 
-#: Age in seconds at which objects without a row are removed: the row of a younger object may not have been written yet.
+#: Age in seconds at which objects without a database row are removed; younger objects may not have their row yet.
 _ORPHAN_SECONDS = 6 * 3600.0
-#: Interval between searches of the store for such objects, in seconds.
+#: Interval between searches of the store for objects without a database row, in seconds.
 _LOOK_SECONDS = 3600.0
 
 _log = logging.getLogger(__name__)
 
 
 def open_blobs(settings: ServiceSettings, inputs: Inputs, artifacts: Artifacts) -> Blobs:
-    """Return the inputs: in the data folder if the file store is a local folder, otherwise in the file store."""
+    """Return the store of inputs: the data folder if the file store is a local folder, otherwise the file store."""
     if artifacts.local:
         return BlobFolder(settings.folder, inputs, settings.min_free_bytes)
     return StoredBlobs(settings, inputs, artifacts.objects)
@@ -52,7 +52,7 @@ class StoredBlobs(Blobs):
     def __init__(self, settings: ServiceSettings, inputs: Inputs, objects: ObjectStore) -> None:
         super().__init__(settings.folder, inputs, settings.min_free_bytes, objects)
         self._cache = open_cache(settings)
-        self._before = settings.folder / "blobs"  # inputs of a service that used a local folder earlier
+        self._before = settings.folder / "blobs"  # inputs from a time when the file store was local
         self._looked_at = float("-inf")
 
     def ensure_room(self, size: int) -> None:
@@ -126,7 +126,7 @@ class StoredBlobs(Blobs):
         return _ObjectWriter(self.incoming, self.objects, self._inputs, upload, seconds)
 
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Join the parts, inside the store if possible, and fetch the result once for its digest and for the cache."""
+        """Concatenate the parts, on the server if possible, and fetch the result once to hash and cache it."""
         whole = self.incoming / f"{secrets.token_hex(12)}.part"
         try:
             try:
@@ -160,7 +160,7 @@ class StoredBlobs(Blobs):
         if joined is None:
             self._gather([part.location for part in parts], whole)
             return self.keep(whole, upload.id)
-        # hash the very object that becomes the blob
+        # hash the stored object itself, because it becomes the blob
         self.objects.get(f"{BLOBS}/{joined}", whole)
         sha256 = file_digest(whole)
         location = self._register(sha256, joined, upload.length, upload.id)
@@ -170,7 +170,7 @@ class StoredBlobs(Blobs):
         return sha256
 
     def _join(self, upload_id: str, parts: Sequence[UploadPartRow]) -> str | None:
-        """Join parts to an object among the blobs and return its location; None if the store cannot join them."""
+        """Concatenate parts on the server and return the location of the new blob; None if that is not possible."""
         if not self.objects.can_join([part.size for part in parts]):
             return None
         location = f"joined/{upload_id}-{secrets.token_hex(4)}"
@@ -212,7 +212,7 @@ class StoredBlobs(Blobs):
         return removed
 
     def _collect_orphans(self) -> int:
-        """Remove objects without rows, left behind by processes that died."""
+        """Remove objects without database rows, which processes left behind when they died."""
         before = self._expiry() - _ORPHAN_SECONDS
         old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
         known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()

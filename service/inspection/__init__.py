@@ -1,1 +1,1 @@
-"""Checks of users' files in a separate process, which a malicious file may crash."""
+"""Checks of users' files in a separate process, so that a malicious file cannot crash the service."""

@@ -39,9 +39,9 @@ _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
 LEFT_SECONDS = 3600.0
 #: Additions to the limits of an inspection per byte of its files. CPU seconds: the slowest readers (text, images) read
-#: at least 30 MB/s; this allows 8 MB/s. Memory: numbers in text become float64 of at most four times the text's size,
-#: since each takes a digit and a space, and then float32 of twice its size; a binary file is mapped (once its size) and
-#: becomes float32 of four times its size if its numbers have one byte.
+#: at least 30 MB/s, and the limit allows for 8 MB/s. Memory: a number in a text file takes at least two bytes (a digit
+#: and a space) and becomes a float64 (4x) and then a float32 (2x). A binary file is mapped (1x), and its numbers of one
+#: byte or more become float32 (at most 4x).
 _SECONDS_PER_BYTE = 120 / 1e9
 MEMORY_PER_BYTE = 6
 #: Maximum of the memory limit, as a fraction of the machine's memory.
@@ -50,7 +50,7 @@ _MEMORY_SHARE = 0.8
 #: is less than a third of them.
 _PLAN_SECONDS_PER_GAUSSIAN = 5e-6
 _PLAN_SECONDS_PER_PIXEL = 5e-6
-#: Jobs with more bytes of files have a process of their own, so that small jobs do not wait for them.
+#: Total size in bytes above which a job's files are checked in a separate process, so that small jobs do not wait.
 _LARGE_BYTES = 64 << 20
 
 #: Environment variables passed to the inspecting process: locations of code, weights and kernels, and memory
@@ -79,7 +79,7 @@ class InspectionProcess:
         self._waiting = 0
 
     async def ask(self, request: dict[str, Any], show: Show = lambda now: None) -> dict[str, Any]:
-        """Return the answer to a request; `show` receives the progress of planning.
+        """Return the response to a request; `show` receives the progress of planning.
 
         Raises:
             BusyError: If too many requests wait already, or the process died twice.
@@ -129,9 +129,9 @@ class InspectionProcess:
                 show(answer["planning"])
             return None
         except (OSError, ValueError):
-            await self.close()  # further output must not be taken for an answer to a later request
+            await self.close()  # further output must not be taken for a response to a later request
             return None
-        except asyncio.CancelledError:  # the pending answer would be taken for that to the next request
+        except asyncio.CancelledError:  # the pending response would be taken for that to the next request
             await self.close()
             raise
         finally:
@@ -139,16 +139,17 @@ class InspectionProcess:
                 await self.close()
 
     def _environment(self) -> dict[str, str]:
-        """Return the environment of the process, without secrets because it reads hostile files.
+        """Return the environment variables of the process.
 
-        Libraries must not start threads on import, because the process forks.
+        They contain no secrets, because the process reads untrusted files. They keep libraries from starting threads on
+        import, because the process forks.
         """
         kept = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self._threads))
         return {**kept, **threads, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
 
     async def close(self) -> None:
-        """Kill the process, and with it the child that reads files."""
+        """Kill the process; its child that reads files dies with it."""
         process, self._process = self._process, None
         if process is not None and process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
@@ -157,12 +158,12 @@ class InspectionProcess:
 
 
 class Inspector:
-    """Validator and planner of complete jobs; results are stored per files and parameters."""
+    """Validator and planner of complete jobs; its findings are cached by files and parameters."""
 
     def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs) -> None:
         self._settings = settings
         self._store, self._blobs = store, blobs
-        # two lanes: if one owner's files occupy a lane for its full time limit, the other one serves everybody else
+        # two lanes: if one owner's files occupy a lane for the full time limit, the other lane serves all other owners
         self._validating = Lanes([InspectionProcess(), InspectionProcess()])
         self._warming: asyncio.Task[None] | None = None
         self._validating_large = Lanes([InspectionProcess()])
@@ -187,7 +188,7 @@ class Inspector:
         """Return the stored finding of `inspect` for the same inputs; None if there is none.
 
         Raises:
-            RefusedInputError: If the stored finding is a refusal.
+            RefusedInputError: If the stored finding is a rejection.
         """
         known = self._store.inputs.inspection(self._key(work, inputs, parameters))
         return None if known is None else found_or_refused(known)
@@ -201,15 +202,16 @@ class Inspector:
         parameters: JobParameters,
         show: Show = lambda now: None,
     ) -> dict[str, Any]:
-        """Return what `service.inspection.process` finds in a job's inputs.
+        """Return the findings of `service.inspection.process` about a job's inputs.
 
         Args:
             work: Task; "plan" requires validated inputs.
             owner: Owner of the job; waiting owners take turns.
             inputs: `role`, `name`, `sha256` and `size` of each file.
-            rows: Files by digest.
+            rows: Blob rows by digest.
             parameters: Parameters of the job.
-            show: Callback that receives `step`, `total`, `fraction` and `eta_s` of planning; its steps are views.
+            show: Callback that receives the progress of planning: `step`, `total`, `fraction` and `eta_s`. One step is
+                one view.
 
         Raises:
             RefusedInputError: If the inputs cannot be used.
@@ -223,7 +225,7 @@ class Inspector:
         async with self._lanes(work, inputs).turn(owner) as process:
             answer = await self._ask_process(process, work, inputs, rows, parameters, show)
         passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
-        if not passing:  # transient refusals are not stored: a later check may succeed
+        if not passing:  # transient rejections are not stored: a later check may succeed
             key = self._key(work, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
         return found_or_refused(answer)
@@ -278,7 +280,7 @@ class Inspector:
     def _key(self, work: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
         files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
         told = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
-        # weights follow the order of the styles
+        # style weights are matched to styles by their order
         styles = [entry["name"] for entry in inputs if entry["role"] == "style"]
         order = styles if len(styles) > 1 else []
         text = json.dumps([_VERSION, work, files, order, told, self._limits], sort_keys=True)
@@ -296,16 +298,16 @@ def _size(inputs: Sequence[Mapping[str, Any]]) -> int:
 
 
 def _threads_of_a_job(settings: ServiceSettings) -> int:
-    """Return the number of threads of a job on this machine; planning uses the same number, so that its times apply."""
+    """Return a job's number of threads on this machine; planning uses as many, so that its timings are valid."""
     told = os.environ.get("OMP_NUM_THREADS", "")
     return int(told) if told.isdigit() and int(told) else max(1, (os.cpu_count() or 1) // (settings.parallel_jobs or 1))
 
 
 def found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the process found.
+    """Return the findings in a response of the inspecting process.
 
     Raises:
-        RefusedInputError: If the answer is an error.
+        RefusedInputError: If the response is an error.
     """
     if "error" in answer:
         error = answer["error"]

@@ -46,7 +46,7 @@ class Packer:
                 shutil.rmtree(left, ignore_errors=True)
 
     async def packed(self, job: JobRow, form: PackedForm) -> ArtifactRow:
-        """Return a job's result in a compressed format; its loss is stored beside it as JSON.
+        """Return a job's result in a compressed format; the compression error is stored beside it as JSON.
 
         Raises:
             NotFoundError: If the job has no result yet, or the result is gone.
@@ -97,7 +97,7 @@ class Packer:
     def _publish(self, folder: Path, job: JobRow, result: ArtifactRow, name: str, loss: dict[str, Any]) -> None:
         loss_file = folder / "loss.json"
         loss_file.write_text(json.dumps(loss, indent=1) + "\n")
-        # later than the last lease's epoch, so that no sweep takes the files for leftovers of an attempt
+        # later than the epoch of the last lease, so that the files are not swept as leftovers of an attempt
         epoch = job.lease_epoch + 1
         files: list[Published] = [
             self._artifacts.put(job.id, epoch, f"{name}.json", loss_file, final=True),
@@ -107,5 +107,5 @@ class Packer:
             self._artifacts.remove(location)
 
     async def close(self) -> None:
-        """Stop the process, and with it any compression in progress."""
+        """Stop the process, which also aborts any compression in progress."""
         await self._process.close()

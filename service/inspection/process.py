@@ -1,9 +1,9 @@
 """Process that reads users' files and compresses results: `python -m service.inspection.process`.
 
-It imports the slow modules once. For each request it forks a child with limits on time and memory, which reads the
-files and exits. The child is confined (`service.inspection.sandbox`): a hostile file that takes it over can falsify the
-answer to its own request, and nothing else. Requests and answers are lines of JSON on stdin and stdout, one request at
-a time. Lines of progress, `{"planning": ...}`, precede the answer to a plan.
+The process imports slow modules once. For each request it forks a child with limits on time and memory, which reads the
+files and exits. The child is confined (`service.inspection.sandbox`): a hostile file that takes over the child can
+falsify the response to its own request, and nothing else. Requests and responses are lines of JSON on stdin and stdout,
+one request at a time. The response to a plan is preceded by lines of progress, `{"planning": ...}`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from worker.inputs import check_something_in_view, load_styles, read_cameras_of,
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
 
-#: Maximum size of an answer in bytes.
+#: Maximum size of a response in bytes.
 MAX_ANSWER = 64 << 20
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
@@ -94,7 +94,8 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
         `gaussians`, `dropped`, `sh_degree`, `views`, `pixels` (of all views), `style` (width, height), `photos`.
 
     Raises:
-        RefusedError, InvalidInputError: If an input cannot be used; the attribute `part` is its role.
+        RefusedError, InvalidInputError: If an input cannot be used; the error's attribute `part` is the role of the
+            input.
     """
     return _read_inputs(staged, parameters, limits)[0]
 
@@ -157,7 +158,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
 
 
 def _once(settings: Settings) -> str:
-    """Return the suffix of a number of Gaussians that counts those of the refined scene."""
+    """Return the note for an error message that a number of Gaussians includes refinement; empty without refinement."""
     return f" once it is refined to at most {settings.refine:g} times as many" if settings.refine > 1 else ""
 
 
@@ -246,10 +247,10 @@ def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
 
 
 def _check_frames_have_sizes(path: Path) -> None:
-    """Refuse frames of a transforms.json without sizes.
+    """Reject a transforms.json with frames that have no image size.
 
-    The size would be read from the image, whose path may lead anywhere on this machine, and the answer would reveal
-    what is there.
+    The size would otherwise be read from the image file. Its path may point anywhere on this machine, and the response
+    would reveal what exists there.
     """
     for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
         try:
@@ -266,7 +267,7 @@ def _check_frames_have_sizes(path: Path) -> None:
 
 
 def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
-    """Return the final answer of a child: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
+    """Return the final response of a child: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
         os.chdir(request["folder"])
         staged = Staged.of_json(request["staged"])
@@ -299,8 +300,8 @@ def _limit_resources(seconds: float, size: int) -> None:
 def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
     """Fork a confined child and yield the lines that it sends through a pipe.
 
-    A child that ends without an answer has hit one of three limits: CPU time of all threads, memory, or twice that time
-    on the clock.
+    A child that ends without a response has exceeded one of three limits: the CPU time of all its threads, its memory,
+    or its wall-clock time (twice the requested `seconds`).
     """
     reading, writing = os.pipe()
     child = os.fork()
@@ -319,7 +320,7 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
         os.close(reading)
         os.kill(child, signal.SIGKILL)  # an exited child stays a zombie until waitpid, so its id is still valid
         _, status = os.waitpid(child, 0)
-    # the child is dead: nothing can change the files behind the answer any more
+    # the child is dead, so it can no longer change the files that the response refers to
     if answer is None:
         answer = {**_refusal("inspection-limit", _limit_text(request), None), "log": f"wait status {status}, no answer"}
     if answer.pop("compiled", False):
@@ -330,15 +331,15 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
 
 
 def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
-    """Answer a request and exit, without touching the state of the forked process."""
+    """Process a request in the forked child and exit, without running cleanup code of the parent."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         die_with_parent()  # the setting is not inherited across a fork
         _close_descriptors(writing)
-        if request["threads"] > 1:  # the parent has not started threads, so the fork misses none
+        if request["threads"] > 1:  # the parent has no other threads, which a fork would not copy
             torch.set_num_threads(request["threads"])
         _die_first()
-        # every thread uses CPU time while it waits for the others
+        # threads that wait for each other use CPU time too
         _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _beside_reading(request))
         with os.fdopen(writing, "w") as file:
 
@@ -359,7 +360,7 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
 
 
 def _close_descriptors(kept: int = 2) -> None:
-    """Close all descriptors but one: the inherited ones carry answers to other requests and the log."""
+    """Close all file descriptors except `kept`; inherited ones lead to responses to other requests and to the log."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for descriptor in range(3):
         os.dup2(nothing, descriptor)
@@ -368,10 +369,10 @@ def _close_descriptors(kept: int = 2) -> None:
 
 
 def _confine(request: dict[str, Any]) -> list[None]:
-    """Allow this child to read its job's files and the installation, and to write the requested compressed result.
+    """Restrict this child to reading its job's files and the installation, and to writing the compressed result.
 
     Returns:
-        A list that gains an entry for each kernel that has to be compiled.
+        List to which an entry is appended for each kernel that has to be compiled.
     """
     folder = Path(request["folder"])
     links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
@@ -389,10 +390,10 @@ def _confine(request: dict[str, Any]) -> list[None]:
 
 @functools.cache
 def _compile_kernels() -> None:
-    """Plan a small built-in scene in a child that stores its kernels on disk, which confined children cannot do.
+    """Compile kernels for later children, by planning a small built-in scene in an unconfined child.
 
-    This happens at most once, because an untrusted child requests it. Nothing waits for that child, and it dies with
-    this process.
+    Confined children cannot store compiled kernels on disk. This runs at most once per process, because an untrusted
+    child requests it. Nothing waits for the new child, and it dies with this process.
     """
     if os.fork():
         return
@@ -412,13 +413,13 @@ def _compile_kernels() -> None:
 
 
 def _die_first() -> None:
-    """Make the system kill this process rather than a job if the machine runs out of memory."""
+    """Make the kernel kill this process rather than a job if the machine runs out of memory."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500")
 
 
 def _beside_reading(request: dict[str, Any]) -> int:
-    """Return the memory limit in bytes beyond reading: for threads, and for what planning or compressing computes."""
+    """Return the memory limit in bytes for everything but reading: threads, and planning or compressing."""
     threads: int = request["threads"] * _THREAD_BYTES
     if request["work"] == "validate":
         return threads
@@ -433,7 +434,7 @@ def _limit_text(request: dict[str, Any]) -> str:
 
 
 def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
-    """Yield answers until the other end closes, sends an invalid answer, or the deadline passes."""
+    """Yield messages until the child closes the pipe or sends an invalid message, or the deadline passes."""
     begun = b""
     while (left := deadline - time.monotonic()) > 0 and len(begun) < MAX_ANSWER:
         if not select.select([descriptor], [], [], left)[0]:
@@ -467,7 +468,7 @@ def _is_answer(answer: Any) -> bool:
 
 
 def main() -> None:
-    """Answer requests until stdin closes."""
+    """Process requests until stdin is closed."""
     torch.set_num_threads(1)  # a child forked from a process with threads could wait for them forever
     die_with_parent()
     for line in sys.stdin.buffer:

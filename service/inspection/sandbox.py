@@ -35,7 +35,7 @@ _SYSTEM = (
     "/sys/kernel/mm/transparent_hugepage",
 )
 
-#: System calls that are refused, by number on x86_64 and aarch64; aarch64 lacks some.
+#: Rejected system calls, with their numbers on x86_64 and aarch64; None if aarch64 lacks the call.
 _REFUSED: dict[str, tuple[int, int | None]] = {
     # network; no network descriptor is inherited either
     "socket": (41, 198), "socketpair": (53, 199), "io_uring_setup": (425, 425),
@@ -69,7 +69,7 @@ _REFUSED: dict[str, tuple[int, int | None]] = {
     "adjtimex": (159, 171), "clock_adjtime": (305, 266), "sethostname": (170, 161), "setdomainname": (171, 162),
     "iopl": (172, None), "ioperm": (173, None),
 }  # fmt: skip
-#: System calls that are refused unless the first argument is the caller's own process id, or 0 if that means the same.
+#: System calls that are rejected unless their first argument is the caller's process id, or 0 where 0 means the caller.
 _OWN_ONLY: dict[str, tuple[int, int, bool]] = {
     "kill": (62, 129, False), "tgkill": (234, 131, False), "prlimit64": (302, 261, True),
     "sched_setaffinity": (203, 122, True), "sched_setscheduler": (144, 119, True), "sched_setparam": (142, 118, True),
@@ -87,7 +87,7 @@ _NUMBER_AT, _ARCHITECTURE_AT, _FIRST_ARGUMENT_AT = 0, 4, 16
 
 
 def missing() -> list[str]:
-    """Return what this kernel lacks to confine a process, as messages for the operator; empty if nothing."""
+    """Return messages for the operator about the confinement features that this kernel lacks."""
     found = []
     if _landlock_version() < 1:
         found.append("Landlock (Linux 5.13): a reader that is taken over can read what this user can read")
@@ -176,9 +176,9 @@ def _allow(libc: ctypes.CDLL, ruleset: int, path: Path, rights: int) -> None:
 
 
 def _has_seccomp() -> bool:
-    """Return whether the kernel supports filters.
+    """Return whether the kernel supports seccomp filters.
 
-    If it does, an attempt with a null filter fails because of the address (EFAULT), not because of the mode.
+    If it does, installing a null filter fails with EFAULT (bad address) rather than EINVAL (unknown mode).
     """
     if not sys.platform.startswith("linux") or platform.machine() not in _ARCHITECTURES:
         return False
@@ -195,7 +195,7 @@ def _restrict_calls(libc: ctypes.CDLL) -> None:
 
 
 def seccomp_program(machine: str, process: int) -> bytes:
-    """Assemble the classic BPF filter of a process: every system call is allowed unless it is listed above."""
+    """Assemble the classic BPF filter of a process: all calls are allowed except those listed in this module."""
     column, architecture = _ARCHITECTURES[machine]
     refuse, absent = _ERRNO | errno.EPERM, _ERRNO | errno.ENOSYS
     code = [

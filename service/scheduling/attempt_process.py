@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from worker.execute import Result
     from worker.request import StylizeRequest
 
-#: Niceness of a job that uses all cores. On the service's own machine, requests take precedence; on a machine of its
-#: own, a job loses nothing.
+#: Niceness of CPU jobs, which use all cores: the API takes precedence if it runs on the same machine.
 _NICENESS = 5
 #: Folder of previews, relative to the attempt's folder.
 _PREVIEWS = Path("out", "previews")
@@ -51,8 +50,9 @@ class Task:
         workers: Maximum number of ranks; 1 runs the job in this process alone.
         cluster: Whether to run even a single rank on the Ray cluster.
         resume: Whether to resume from the checkpoint in `out` or in the workplace if it is usable.
-        checkpoint_seconds, preview_seconds: Intervals as in the settings.
-        workplace: Workplace of ranks on machines that share no folder with this one; None if they do.
+        checkpoint_seconds, preview_seconds: Intervals of checkpoints and previews, as in `ServiceSettings`.
+        workplace: Description of the job's files for ranks on machines that share no folder with this one; None if all
+            ranks share the folder.
     """
 
     staged: Staged
@@ -158,7 +158,7 @@ class AttemptProcess:
 
 
 def tell_planning(now: PlanningProgress) -> None:
-    """Report the progress of the survey; its steps are views."""
+    """Report the progress of planning; one step is one view."""
     tell(
         {
             "kind": "stage",
@@ -209,7 +209,7 @@ def tell_preview(path: Path) -> None:
 
 
 def summary(result: Result) -> dict[str, Any]:
-    """Return the result for the job's record; the report has the details."""
+    """Return a summary of the result for the job's record; the report has the details."""
     before, after = result.losses
     return {
         "stopped": result.stopped,

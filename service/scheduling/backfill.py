@@ -1,10 +1,10 @@
 """Backfilling: short jobs run on capacity that is reserved for a large job, until that job can start.
 
 Capacity is reserved for a job that needs more of a machine than is free, because otherwise smaller jobs would overtake
-it forever. Without backfilling, the free part would be idle until the last of the preceding jobs ends: one GPU in ten
-on a fully loaded fleet. Jobs that are expected to end by then are therefore started (EASY backfilling: D. Lifka, "The
-ANL/IBM SP scheduling system", 1995). The duration of a job is estimated from its record and scaled by the measured pace
-of this machine; nothing is backfilled before a pace is known.
+it forever. Without backfilling, the capacity that is already free would be idle until the last of the preceding jobs
+ends: one GPU in ten on a fully loaded fleet. Jobs that are expected to end by then are therefore started (EASY
+backfilling: D. Lifka, "The ANL/IBM SP scheduling system", 1995). The duration of a job is estimated from its record and
+scaled by the measured pace of this machine; nothing is backfilled before a pace is known.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Backfill:
         self._kept, self._begins = "", -math.inf
 
     def learn(self, held: Sequence[Holding]) -> None:
-        """Update the pace of jobs on this machine."""
+        """Update the pace of jobs on this machine from the running jobs."""
         if paces := [each.pace for each in held if each.pace is not None]:
             self._pace = median(paces)
 
@@ -61,7 +61,7 @@ class Backfill:
 
         Dispatchers do not know each other's forecasts. Capacity is therefore reserved only once the job has already
         waited for at least as long as it would still have to wait here. The machine with the shortest wait is thus the
-        first to reserve it.
+        first to reserve capacity.
         """
         begins = self._foreseen(job, held, waiting)
         return job.id == self._kept or begins is None or begins - now <= now - job.queued_at
@@ -71,8 +71,8 @@ class Backfill:
     ) -> Callable[[JobRow], Grant | None] | None:
         """Return a function that grants capacity to jobs expected to end before `kept` can start; None if no job would.
 
-        The earliest forecast of that start is used, never a later one. The `kept` job is thus delayed only by jobs that
-        exceed their estimates by far.
+        If the forecast of that start changes, the earliest one is used. The `kept` job is thus delayed only by jobs
+        that exceed their estimates by far.
 
         Args:
             held: Capacity of running jobs.
@@ -98,7 +98,7 @@ class Backfill:
         return grant
 
     def _foreseen(self, kept: JobRow, held: Sequence[Holding], waiting: int) -> float | None:
-        """Return when enough running jobs will have ended for the kept one; None if unknown.
+        """Return when enough running jobs will have ended for `kept` to start; None if unknown.
 
         Jobs with unknown ends count as the first to end.
         """

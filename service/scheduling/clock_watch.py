@@ -20,9 +20,10 @@ class ClockWatch:
     """Checks of other machines' clocks.
 
     On PostgreSQL all times come from the server. On SQLite each process writes times of its own machine, whose clock
-    may be wrong. A lease that has expired by this machine's clock is therefore not lost yet. It is lost if it is not
-    renewed for another lease duration of the monotonic clock, in which its holder would have renewed it several times.
-    Nothing is deleted while another dispatcher sends heartbeats whose times disagree with this machine's clock.
+    may be wrong. A lease that has expired by this machine's clock therefore does not count as lost yet. It counts as
+    lost if it is not renewed for another lease duration by the monotonic clock, because a live holder would have
+    renewed it several times. Nothing is deleted while another dispatcher sends heartbeats whose times disagree with
+    this machine's clock.
 
     Args:
         lease_seconds: Duration of a lease.
@@ -54,9 +55,8 @@ class ClockWatch:
     def confirm(self) -> bool:
         """Advance the expiry time unless a live dispatcher contradicts this clock; return whether deleting is allowed.
 
-        A new heartbeat was sent since the last call. That includes the heartbeats of this dispatcher itself, so a clock
-        that was just changed is detected too. Heartbeats that have not changed may come from dead dispatchers and are
-        ignored.
+        Only heartbeats that were sent since the last call are compared with this clock; older ones may come from dead
+        dispatchers. Heartbeats of this dispatcher are compared too, which detects a change of this machine's clock.
         """
         before, now = self._heard_at, self._monotonic()
         since = 0.0 if before is None else now - before

@@ -40,14 +40,14 @@ from service.weights import check_weights
 
 #: Interval between searches for expired and leftover data, in seconds.
 _HOUSEKEEPING_SECONDS = 60.0
-#: Interval between searches for files that nothing refers to, in seconds.
+#: Interval between searches for stray files, in seconds (`service.scheduling.strays`).
 _STRAYS_SECONDS = 3600.0
-#: Time that housekeeping has to stop with the dispatcher, in seconds.
+#: Time for which a stopping dispatcher waits for each of its background threads, in seconds.
 _LAST_SECONDS = 5.0
-#: Maximum number of jobs swept per round.
+#: Maximum number of jobs whose leftover files are removed per round of housekeeping.
 _SWEEPS = 20
-#: Fractions of a lease's duration: after the first it is renewed, after the second a job is killed if renewing has
-#: failed. The second is below 1 because others may take an expired lease and clocks differ.
+#: Fractions of a lease's duration: the age at which a lease is renewed, and the age at which its job is killed if
+#: renewing has failed. The latter is below 1, because other dispatchers may take an expired lease and clocks differ.
 _RENEW_SHARE, _ABANDON_SHARE = 1 / 3, 3 / 4
 
 _log = logging.getLogger(__name__)
@@ -190,7 +190,7 @@ class Dispatcher:
 
     def _renew_leases(self) -> None:
         """Renew the leases of all running attempts, and handle jobs that are canceled or lost."""
-        now = time.monotonic()  # a lease counts from before the request
+        now = time.monotonic()  # taken before the request, so that a lease is never assumed to last too long
         if not self._running:
             self._renewed_at = now
             return
@@ -240,7 +240,7 @@ class Dispatcher:
     # --- housekeeping ----------------------------------------------------------------------------------------------
 
     def _keep_house_now_and_then(self) -> None:
-        """Run housekeeping in its own thread, so that leases are renewed however slow the file store is."""
+        """Run housekeeping periodically, in its own thread so that a slow file store does not delay renewing leases."""
         while not self._ended.is_set():
             self._keep_house()
             self._ended.wait(_HOUSEKEEPING_SECONDS)

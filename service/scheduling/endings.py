@@ -70,13 +70,13 @@ def attempt_ending(
     has_result: bool,
     cluster: bool = False,
 ) -> Ending:
-    """Return how an attempt ended whose process has exited.
+    """Return the ending of an attempt whose process has exited.
 
     Args:
         wish: CANCEL or RELEASE if the end was requested, possibly too late; None otherwise.
         last: Final message of the process, `done`, `failed` or `interrupted`; None if it sent none.
         exit_code: Exit code of the process; negative for the signal that killed it.
-        log_tail: End of its log; None if there is no log.
+        log_tail: Last part of the process' log; None if there is no log.
         has_result: Whether the stylized scene exists.
         cluster: Whether the process only supervises ranks on a Ray cluster. Ray terminates it with an exit code and
             without a message if the cluster's head or the machine's own node dies; that counts as an outage.

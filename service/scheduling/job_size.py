@@ -1,8 +1,8 @@
-"""Estimate of how many GPUs a job is worth from its record, before its files are read or planned.
+"""Estimate of how many GPUs a job should get, based on its database record before its files are read.
 
-The job's plan, made with measured times, has the final say, and GPUs that it does not use are returned. Until then the
-job holds what it was given, so a job of a few seconds should not be given eight GPUs. All estimates are for one H200
-and come from `benchmarks.forecast`; on slower machines all jobs are worth more GPUs than estimated here.
+When the job runs, its plan decides from measured times how many of these GPUs to use, and the others are released.
+Until then the job occupies all of them, so a job of a few seconds should not get eight GPUs. All constants are for H200
+GPUs and come from `benchmarks.forecast`; on slower GPUs, jobs could use more GPUs than estimated here.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.settings import Settings, make_settings
 from worker.ranks.host_memory import GAUSSIAN_BYTES, scene_bytes
 
-#: Bytes per pixel of a photo as cameras save it (JPEG, 3 bits).
+#: Typical bytes per pixel of a camera's JPEG file (about 3 bits).
 _PHOTO_BYTES = 0.35
 #: Default longer side of views, and default ratio of height to width.
 _LONGER_SIDE, _ASPECT = 1600, 0.625
-#: Seconds per step: per pixel forward and backward through the network by precision, per Gaussian, and per step for
-#: launches from the host.
+#: Seconds per step: network forward and backward per pixel, by precision; rasterization per Gaussian; and a fixed time
+#: for kernel launches.
 _PIXEL_SECONDS = {"float32": 5.5e-8, "tf32": 1.6e-8, "bfloat16": 9e-9}
 _GAUSSIAN_SECONDS, _FIXED_SECONDS = 2e-9, 2.1e-3
-#: Cost of a pixel of the full view in phase 1, which optimizes only the coarsest scale, relative to phase 2.
+#: Network time of a step in phase 1, which optimizes only the coarsest scale, as a fraction of that in phase 2.
 _COARSE_SHARE = 0.1
 #: Communication between ranks: bytes per second that one rank sends, and seconds of latency per message.
 _LINK_BYTES, _LINK_SECONDS = 3e11, 1e-5
-#: Minimum efficiency of a GPU that is worth adding, and minimum seconds of steps per GPU: starting a job takes as long.
-#: Both err toward too many GPUs, since the plan returns superfluous ones.
+#: Minimum parallel efficiency with an additional GPU, and minimum duration of all steps per additional GPU in seconds
+#: (starting a job takes as long). Both err toward too many GPUs, because the plan releases superfluous ones.
 _LEAST_SHARE, _LEAST_SECONDS = 0.6, 10.0
 #: Seconds before a job's first step (process, CUDA, network and plan), and bytes per second at which its files are
 #: staged.
@@ -68,7 +68,7 @@ class JobSize:
         return 6 * (gpus - 1) * _LINK_SECONDS + moved / _LINK_BYTES
 
     def gpus(self, most: int) -> int:
-        """Return the number of GPUs that the job is worth, between 1 and `most`."""
+        """Return the number of GPUs that the job should get, between 1 and `most`."""
         alone, found = self.seconds(), 1
         for gpus in range(2, most + 1):
             seconds = self.seconds(gpus)

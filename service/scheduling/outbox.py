@@ -28,7 +28,7 @@ RESULTS = frozenset((RESULT, *_RESULTS))
 
 
 class Outbox:
-    """Uploader that stores files under an attempt's epoch; rows make them visible later.
+    """Uploader of an attempt's files; users can see them only once they have database rows.
 
     Args:
         out: Folder that the attempt writes to.
@@ -40,7 +40,7 @@ class Outbox:
         self._put: dict[str, tuple[int, int]] = {}
 
     def unfinished(self) -> dict[str, Path]:
-        """Return the files that are visible while the job runs, whether they exist or not."""
+        """Return the files that are visible while the job runs; some may not exist yet."""
         files = {
             "plan.json": self._out / f"{_STEM}.plan.json",
             "views.jpg": self._out / f"{_STEM}.views.jpg",

@@ -1,14 +1,14 @@
-"""Packing of jobs on a machine: pure decisions about what the next job gets, or whether it has to wait.
+"""Packing of jobs on a machine: pure functions that decide what capacity the next job gets, or that it has to wait.
 
-Jobs do not share GPUs. A job that does not specify `workers` is offered its portion of the free ones: all of them if no
-other job waits, one if many do, but never more than a job of its size is worth (`service.scheduling.job_size`). The
-plan, made with measured times, then uses as many as make the job faster, and the rest are returned
-(`service.scheduling.running`). The machine's memory is counted too: a job waits if the running ones leave too little
-for its scene. On a Ray cluster, Ray counts it per machine (`worker.ranks.placement`).
+Jobs do not share GPUs. A job that does not specify `workers` gets a portion of the free GPUs: all of them if no other
+job waits, one if many do, but never more than its size justifies (`service.scheduling.job_size`). The job's plan then
+decides from measured times how many of them make the job faster, and the others are released
+(`service.scheduling.running`). A job also waits if the running jobs leave too little of the machine's memory for its
+scene. On a Ray cluster, Ray tracks the memory per machine (`worker.ranks.placement`).
 
-Without GPUs, slots stand for fractions of the CPU and of the memory. There is one slot unless the operator wants
-several concurrent jobs, because one job uses all cores well. A job that needs more memory than one slot has takes
-several.
+Without GPUs, slots stand for fractions of the CPU and of the memory. There is one slot unless the operator sets
+`parallel_jobs`, because a single job uses all cores well. A job that needs more memory than one slot has takes several
+slots.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from service.scheduling.machine import Machine
 from service.store.tables import JobRow
 from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 
-#: Fractions of the machine's memory: maximum planned by all concurrent jobs together, and by one of them. The latter
-#: equals what a job on its own plans with (`sgsst_core.budget`), so that it rounds in the same way.
+#: Maximum fractions of the machine's memory that all concurrent jobs together, and each of them, may plan with. The
+#: latter equals the default of a job that runs alone (`sgsst_core.budget`), so that both round in the same way.
 _MEMORY_SHARE, _JOB_SHARE = 0.8, 0.4
 #: Minimum memory of a job besides its scene, and number of copies of the scene: as read, as rendered, and twice for
 #: what the views and the optimizer store per Gaussian. Measured peaks: 5.8 GB for 4 million Gaussians (1 GB), 0.95 GB
@@ -41,8 +41,8 @@ class Grant:
         gpus: Names of GPUs; empty without GPUs.
         places: Number of slots.
         threads: Number of CPU threads; None for all.
-        memory: Memory to plan with in bytes; None for the default of a job on its own.
-        scene: Size of its scene in memory in bytes.
+        memory: Memory to plan with in bytes; None for the default of a job that runs alone.
+        scene: Size of the job's scene in memory, in bytes.
     """
 
     ranks: int
@@ -54,7 +54,7 @@ class Grant:
 
     @property
     def beside_gpus(self) -> int:
-        """Bytes of the machine's memory that a job on GPUs is counted with."""
+        """Host memory in bytes that is reserved for a job on GPUs; 0 without GPUs."""
         return memory_beside_gpus(self.ranks, self.scene) if self.gpus else 0
 
 
@@ -63,7 +63,7 @@ class Room:
 
     Args:
         machine: Total hardware.
-        parallel_jobs: Maximum number of concurrent jobs; None for one per GPU, or one without GPUs.
+        parallel_jobs: Maximum number of concurrent jobs; None for one per GPU (one in total if there are no GPUs).
     """
 
     def __init__(self, machine: Machine, parallel_jobs: int | None) -> None:
@@ -81,7 +81,7 @@ class Room:
         return len(self._free_gpus(held)) if self._machine.gpus else self._free_places(held)
 
     def grant(self, job: JobRow, held: Iterable[Grant], waiting: int) -> Grant | None:
-        """Return what a job gets besides the running ones; None if it has to wait.
+        """Return the capacity that a job gets beside the running jobs; None if it has to wait.
 
         Args:
             held: Capacity of running jobs.
@@ -113,7 +113,7 @@ class Room:
         if ranks > len(free):
             return None
         grant = Grant(ranks, tuple(free[:ranks]), scene=_scene_bytes(job))
-        if not held or self._machine.cluster:  # a job on its own may try
+        if not held or self._machine.cluster:  # a job that runs alone is started even if memory may be short
             return grant
         together = sum(each.beside_gpus for each in (grant, *held))
         return grant if together <= _MEMORY_SHARE * self._machine.memory else None
@@ -141,9 +141,10 @@ def _scene_bytes(job: JobRow) -> int:
 
 
 def _asked(job: JobRow, name: str) -> int:
-    """Return an integer parameter of a job; 0 if it is missing.
+    """Return an integer parameter of a job; 0 if it is missing or has another type.
 
-    Other types were stored by an earlier version. The attempt rejects them, so they need no capacity.
+    Other types were stored by an earlier version of the service. The attempt will reject them, so they need no
+    capacity.
     """
     value = job.parameters.get(name)
     return max(value, 0) if isinstance(value, int) else 0

@@ -18,8 +18,8 @@ from service.store.leases import Lease, Published
 
 #: Length of the log's end in the error of a crash, in bytes.
 _LOG_TAIL = 2000
-#: Delay in seconds before files that the store rejected are uploaded again, and time after which the attempt is given
-#: up if results cannot be stored: a restart of the store must not lose a job that has just ended.
+#: Delay in seconds before a failed upload is retried, and time in seconds after which an attempt fails if its results
+#: cannot be uploaded. The latter is long enough for a restart of the file store, which must not lose a finished job.
 _AGAIN_SECONDS, PATIENCE_SECONDS = 5.0, 600.0
 
 _log = logging.getLogger(__name__)
@@ -119,7 +119,7 @@ class Publisher:
 
 
 def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Published]:
-    """Upload a job's results, retrying because they would be lost otherwise.
+    """Upload a job's results; retry failed uploads, because the results would be lost otherwise.
 
     Raises:
         StoreError: If the file store was unreachable for too long, or `given_up` returned true.

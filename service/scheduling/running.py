@@ -1,4 +1,4 @@
-"""Attempt as seen by the dispatcher: its folder, its process, the messages, and how it ends."""
+"""Supervision of one attempt by the dispatcher: its folder, its process, its messages, and its ending."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class RunningAttempt:
 
     @property
     def abandoned(self) -> bool:
-        """Whether the attempt has ended or was told to end at once."""
+        """Whether the attempt was abandoned or has ended."""
         return self._wish == Wish.ABANDON or not self.alive
 
     @property
@@ -210,7 +210,7 @@ class RunningAttempt:
         return self._store.inputs.blobs(sorted({entry["sha256"] for entry in self.lease.job.inputs}))
 
     def _workplace(self, checkpoint: ArtifactRow | None) -> StoreWorkplace:
-        """Return what ranks on other machines need to stage the job's files."""
+        """Return the description that ranks on other machines need to stage the job's files."""
         job = self.lease.job
         files = [StoredFile(f"{BLOBS}/{row.location}", row.sha256, row.size) for row in self._input_rows().values()]
         saved = StoredFile(checkpoint.location, checkpoint.sha256, checkpoint.size) if checkpoint is not None else None
@@ -288,7 +288,7 @@ class RunningAttempt:
             self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
 
     def _give_back(self, gpus: list[str]) -> None:
-        """Return GPUs that the plan does not use; on a cluster only their number matters."""
+        """Release GPUs that the plan does not use; on a cluster only their number matters."""
         left = len(self.grant.gpus) - len(gpus)
         kept = self.grant.gpus[:left] if self._cluster else tuple(x for x in self.grant.gpus if x not in gpus)
         self.grant = replace(self.grant, ranks=len(kept), gpus=kept)
@@ -345,7 +345,7 @@ def progress_seconds(elapsed: float) -> float:
 
 
 def progress_record(message: Message, attempt: int) -> dict[str, Any]:
-    """Return the progress for a job's record from a message; steps of `planning` are views."""
+    """Convert a message to the progress in a job's record; in the stage `planning`, one step is one view."""
     step, total = message.get("step", 0), message.get("total", 0)
     return {
         "stage": message.get("stage", "coarse" if message["kind"] == "progress" else "starting"),

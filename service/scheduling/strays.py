@@ -1,4 +1,4 @@
-"""Search of the file store for stray files: files of jobs that nothing refers to.
+"""Search of the file store for stray files: files of jobs that no database row refers to.
 
 Files of failed attempts are swept when their job ends. Strays come from interrupted attempts that stored another file
 after the job had already ended elsewhere.
@@ -13,13 +13,13 @@ from service.files.artifacts import Artifacts
 from service.store import Store
 from service.store.states import UNFINISHED
 
-#: Minimum age of a stray in seconds: the row of a younger file may not have been written yet.
+#: Minimum age of a stray in seconds; younger files may not have their database row yet.
 _STRAY_SECONDS = 6 * 3600.0
 _PREFIX = "job_"
 
 
 def remove_strays(store: Store, artifacts: Artifacts) -> int:
-    """Delete stray files and return their number; after a rollback of the database they cannot be identified."""
+    """Delete stray files and return their number; do nothing after a rollback of the database (rows may be lost)."""
     if store.database.rolled_back:
         return 0
     before = min(time.time(), store.database.expiry()) - _STRAY_SECONDS
@@ -37,7 +37,7 @@ def remove_strays(store: Store, artifacts: Artifacts) -> int:
 
 
 def strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
-    """Return the files of a job that nothing refers to or will refer to."""
+    """Return the files of a job that no database row refers to or will refer to."""
     try:
         job = store.jobs.get(job_id, None)
     except NotFoundError:

@@ -1,7 +1,7 @@
 """Webhooks: signed messages about finished jobs (Standard Webhooks, https://www.standardwebhooks.com).
 
-Receivers are not trusted. Each message is sent on its own to a verified address. One deadline covers everything from
-the name lookup to the head of the response, and only the status of the response is read.
+Receivers are not trusted. Each message is sent over its own connection, to a verified address. One deadline covers
+everything from the name lookup to the head of the response, and only the status of the response is read.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def signature(secret: str, message_id: str, timestamp: int, body: bytes) -> str:
 
 
 def check_url(url: str, settings: ServiceSettings) -> None:
-    """Check that a job may name a URL as its webhook; its addresses are checked at each delivery.
+    """Check that a URL may be used as a webhook; the addresses of its host are checked at each delivery.
 
     Raises:
         RefusedInputError: If webhooks are off or the URL cannot be called.
@@ -140,7 +140,7 @@ async def checked_address(host: str, port: int, *, private_allowed: bool) -> str
     """Return an address of a host that may be called; callers connect to this address, not to the name.
 
     Raises:
-        PermissionError: If any address of the host is private.
+        PermissionError: If any address of the host is not public.
         OSError: If the name is unknown.
     """
     found = [address.partition("%")[0] for address in await asyncio.wrap_future(_look_up(host, port))]
@@ -155,7 +155,7 @@ class Deliverer:
     """Sender of due messages, with its own thread.
 
     Args:
-        tls: Certificates for verifying receivers; None for the public ones.
+        tls: SSL context for verifying receivers; None for the public certificate authorities.
     """
 
     def __init__(self, settings: ServiceSettings, store: Store, tls: ssl.SSLContext | None = None) -> None:
@@ -201,7 +201,7 @@ class Deliverer:
         )
 
     async def _deliver(self, delivery: Delivery) -> None:
-        """Send one message and record the outcome; errors concern this message only."""
+        """Send one message and record the outcome; errors do not affect other messages."""
         try:
             async with asyncio.timeout(_DEADLINE):
                 error = await self._send(delivery)

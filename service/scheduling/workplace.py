@@ -38,7 +38,7 @@ from worker.ranks import sweeper
 from worker.ranks.host_memory import scene_bytes
 from worker.workplace import Stored
 
-#: Interval between checks for new files of the job, in seconds.
+#: Interval between checks for new files to upload, in seconds.
 _LOOK_SECONDS = 0.5
 #: Delay in seconds before files that the store rejected are uploaded again.
 _AGAIN_SECONDS = 5.0
@@ -119,7 +119,7 @@ class StoreWorkplace:
             raise InfrastructureError(f"The job's files cannot be laid out here: {error}.") from error
 
     def after(self, stored: Sequence[Published]) -> StoreWorkplace:
-        """Return the description with the last checkpoint among these files."""
+        """Return a copy whose checkpoint is the last one among these files."""
         found = [file for file in stored if file.name == CHECKPOINT]
         if not found:
             return self
@@ -131,9 +131,9 @@ class StoreWorkplace:
 
 
 class RankFolder:
-    """Folder of a rank, locked while the rank lives, so that others can recognize leftover folders.
+    """Folder of a rank, locked while the rank lives, so that other ranks can recognize leftover folders.
 
-    A helper process removes it if the rank is killed. If that process is killed too, other ranks remove the folder.
+    A helper process removes the folder if the rank is killed. If the helper is killed too, other ranks do.
     """
 
     def __init__(self, workplace: StoreWorkplace, rank: int, stored: Stored) -> None:
@@ -182,7 +182,7 @@ class RankFolder:
             _fetch_checkpoint(objects, workplace.checkpoint, out / f"{Path(RESULT).stem}.checkpoint.safetensors")
 
     def finish(self, *, done: bool) -> None:
-        """Store the remaining files: a checkpoint, or the results.
+        """Upload the remaining files: a checkpoint, or the results.
 
         Raises:
             StoreError: If the store was unreachable for too long.
@@ -257,7 +257,7 @@ def _ranks_folder(settings: ServiceSettings) -> Path:
 
 
 def _remove_left(above: Path) -> None:
-    """Remove folders that nobody holds a lock on."""
+    """Remove folders whose lock is not held."""
     if not above.is_dir():
         return
     with _locked(above / "all"):
@@ -277,7 +277,7 @@ def _locked(path: Path) -> Any:
 
 
 def _fetch_checkpoint(objects: ObjectStore, checkpoint: StoredFile, target: Path) -> None:
-    """Fetch a checkpoint; if it has been replaced meanwhile or is damaged, the job starts again."""
+    """Fetch a checkpoint; if it is missing or damaged, the job starts from the first step."""
     try:
         objects.get(checkpoint.name, target)
     except FileNotFoundError:

@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 class Store:
-    """All parts of the store on one database; `clock` and `answer_seconds` are those of `Database`."""
+    """Complete store on one database; `clock` and `answer_seconds` are passed to `Database`."""
 
     def __init__(
         self, settings: ServiceSettings, clock: Clock | None = None, answer_seconds: float = ANSWER_SECONDS
@@ -56,7 +56,8 @@ def open_store(
     """Open the store, and create its tables or migrate them to the current version.
 
     Args:
-        patience: Time in seconds to wait for a database server that does not respond: services may start before it.
+        patience: Time in seconds to wait for a database server that does not respond, because services may start before
+            the server.
 
     Raises:
         DatabaseUnavailableError: If the database does not respond.

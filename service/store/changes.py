@@ -1,4 +1,4 @@
-"""Changes to a job's rows that users and dispatchers share: its status, its events, and its end.
+"""Changes to a job's rows that both users and dispatchers make: its status, its events, and its end.
 
 All functions run within the caller's transaction.
 """
@@ -19,7 +19,7 @@ _EVENTS = Base.metadata.tables[EventRow.__tablename__]
 
 
 def move(session: Session, job: JobRow, transition: Transition, now: float) -> None:
-    """Change a job's status and add an event for its watchers.
+    """Change a job's status and add an event for clients that watch the job.
 
     Raises:
         TransitionError: If the job's status does not allow the transition.
@@ -75,8 +75,8 @@ def release_blobs(session: Session, holder: str) -> list[str]:
         Locations of the deleted blobs. The caller removes their files once the transaction is committed.
     """
     held = select(BlobUseRow.sha256).where(BlobUseRow.holder == holder)
-    # locked in a fixed order before the uses are deleted: of two concurrent releases, the second sees that it is the
-    # last
+    # lock blobs in a fixed order before deleting their uses: of two concurrent releases, the second one then sees that
+    # no other use remains
     rows = session.scalars(
         select(BlobRow).where(BlobRow.sha256.in_(held)).order_by(BlobRow.sha256).with_for_update()
     ).all()
@@ -90,7 +90,7 @@ def release_blobs(session: Session, holder: str) -> list[str]:
 
 
 def holder_name(job_id: str) -> str:
-    """Return the holder name of a job's inputs."""
+    """Return the name under which a job holds its inputs."""
     return f"job:{job_id}"
 
 

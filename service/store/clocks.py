@@ -1,9 +1,9 @@
-"""Time of the store: the clock that it uses, and the time by which data expire.
+"""Time of the store: its clock, and the separate time by which data expire.
 
 On PostgreSQL all processes use the server's clock. SQLite has no clock, so its processes use their machine's. That
-clock may be wrong, and deleted data are lost. Deletion therefore has its own *expiry time*, a number in the database.
-It is never ahead of the clock. A dispatcher advances it toward the clock at most `CATCH_UP` times as fast as its
-monotonic clock runs:
+clock may be wrong, and deleted data cannot be restored. Deletion therefore uses a separate *expiry time*, which is
+stored in the database and never ahead of the clock. A dispatcher advances it toward the clock at most `CATCH_UP` times
+as fast as its monotonic clock runs:
 
 - A clock that is 31 days ahead has to stay wrong for 31 hours of work before the first result is deleted too early, and
   then the oldest results go first.
@@ -12,7 +12,7 @@ monotonic clock runs:
 
 A dispatcher whose clock disagrees with the heartbeats of another live one neither advances the expiry time nor deletes
 anything (`service.scheduling.clock_watch`), because it is unknown which clock is right. The expiry time never goes
-back, so a clock that was temporarily behind delays nothing later.
+back, so a clock that was temporarily behind does not delay later deletions.
 """
 
 from __future__ import annotations
@@ -71,10 +71,10 @@ def expiry_time(connection: Connection | Session, now: float) -> float:
 
 
 def kept_until(connection: Connection | Session, now: float, seconds: float) -> float:
-    """Return the expiry of something that is kept for `seconds`.
+    """Return the time at which data that are kept for `seconds` expire.
 
-    The expiry time is taken into account: by a slow clock alone, the data would expire as soon as the clock is
-    corrected.
+    The period starts at the later of the clock and the expiry time. If the clock is behind, data would otherwise expire
+    as soon as the clock is corrected.
     """
     return max(now, _stored_time(connection, now)) + seconds
 
@@ -92,8 +92,8 @@ def advance_expiry_time(session: Session, now: float, seconds: float) -> None:
         seconds: Working time of the dispatcher since its last call, by its monotonic clock.
     """
     row = session.get(CounterRow, (_NAME, ""), with_for_update=True)
-    # limited by the newest job, which others created: heartbeats may come from a dispatcher that has just started with
-    # a wrong clock
+    # the first value is limited to the creation time of the newest job: a dispatcher that has just started may have a
+    # wrong clock
     if row is None:
         newest = session.scalar(select(func.max(JobRow.created_at)))
         session.add(CounterRow(name=_NAME, labels="", value=now if newest is None else min(now, newest)))

@@ -27,7 +27,7 @@ from service.store.tables import Base, CounterRow, IdempotencyRow
 #: Version of the newest migration; a database with this version is opened without loading the migrations.
 SCHEMA = "0006"
 MIGRATIONS = Path(__file__).with_name("migrations")
-#: Default timeout of a transaction in seconds, for its turn, for a connection, and for each response; all are short.
+#: Default timeout in seconds of each wait of a transaction: for its turn to write, a connection, and each response.
 ANSWER_SECONDS = 30.0
 #: Timeout of health checks and of queries of the server's time, on separate connections, in seconds.
 _ASIDE_SECONDS = 2.0
@@ -41,10 +41,10 @@ _LOST_AFTER = {
 }
 #: Minimum lifetime of an Idempotency-Key in seconds; housekeeping deletes it later.
 IDEMPOTENCY_SECONDS = 86_400.0
-#: Number of the advisory lock, unlikely to be used by anything else in a PostgreSQL database.
+#: Key of the PostgreSQL advisory lock for migrations; other applications are unlikely to use this number.
 _LOCK = 7_347_758
 _SERVER_TIME = text("SELECT extract(epoch FROM clock_timestamp())")
-#: Upper bounds of histogram buckets in seconds, from a click to a day.
+#: Upper bounds of histogram buckets in seconds, from one second to one day.
 BUCKETS = (1, 5, 15, 60, 300, 900, 1800, 3600, 7200, 14400, 43200, 86400)
 
 
@@ -56,7 +56,8 @@ class Database:
     Args:
         url: SQLAlchemy URL of the database.
         clock: Clock to use; None for the server's clock, or this machine's with SQLite.
-        answer_seconds: Timeout of a transaction in seconds, for its turn, for a connection, and for each response.
+        answer_seconds: Timeout in seconds of each wait of a transaction: for its turn to write, a connection, and each
+            response.
     """
 
     def __init__(self, url: str, clock: Clock | None = None, answer_seconds: float = ANSWER_SECONDS) -> None:
@@ -70,7 +71,7 @@ class Database:
         self._writer = self.engine.execution_options(sgsst_writes=True)
         self._marker = Marker(Path(self.url.database)) if self.sqlite and self.url.database else None
         self._aside = self._make_engine(_ASIDE_SECONDS, pool_size=2, max_overflow=0)
-        # SQLite's writers wait by polling, which the writers of one process can avoid
+        # SQLite's writers wait for each other by polling; a lock avoids that within one process
         self._turn = threading.Lock() if self.sqlite else None
         self._reads, self._writes = Gate(), Gate()
 
@@ -106,7 +107,7 @@ class Database:
 
     @contextmanager
     def _taking_turns(self) -> Iterator[None]:
-        """Hold this process' turn as the only writer on SQLite."""
+        """Hold this process' write lock if the database is SQLite."""
         if self._turn is None:
             yield
             return
@@ -127,7 +128,7 @@ class Database:
     def reading_rows(self) -> Iterator[Connection]:
         """Provide a connection as `reading` does, but without the ORM.
 
-        It takes a third of the work, for queries that run hundreds of times a second.
+        This takes a third of the time, which matters for queries that run hundreds of times per second.
         """
         with self._reads.guarded(), self.engine.connect() as connection:
             yield connection
@@ -149,9 +150,9 @@ class Database:
             return float(connection.execute(_SERVER_TIME).scalar_one())
 
     def upgrade(self) -> None:
-        """Migrate the tables to this version; of several processes that start at once, one does it.
+        """Migrate the tables to this version; if several processes start at once, only one does it.
 
-        Tables of a later version are used as they are. Its migrations only add to the schema, so processes of this
+        Tables of a later version are used as they are. Later migrations only add to the schema, so processes of this
         version keep working, and can be restarted, while they are replaced one by one.
         """
         if self.is_up_to_date():
@@ -175,7 +176,7 @@ class Database:
 
     @property
     def rolled_back(self) -> bool:
-        """Whether files may exist that the database has lost its rows of."""
+        """Whether the database may have lost the rows of existing files."""
         return self._marker is not None and self._marker.note.exists()
 
     def is_up_to_date(self) -> bool:
@@ -263,7 +264,7 @@ def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, no
     Raises:
         IdempotencyError: If the key was used for a different request.
     """
-    # of two concurrent requests, the second waits here for the first, on every database
+    # on both kinds of databases, the second of two concurrent requests waits here for the first
     insert = upsert(session)(IdempotencyRow).values(
         owner=owner, key=key, fingerprint=fingerprint, created_id="", created_at=now
     )

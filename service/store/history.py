@@ -1,8 +1,8 @@
-"""History of a job's loss from the first step, thinned as it is written; events hold only the newest progress.
+"""Loss history of a job, thinned as it is written; the job's events contain only the most recent progress.
 
 A point is stored when the job's running time has grown by one percent since the previous one. Points are thus evenly
-spaced on the logarithmic time axis of loss charts: 25 hours of an attempt with a point per second give 784 points. The
-points of jobs with many attempts are halved.
+spaced on the logarithmic time axis of loss charts: 25 hours of an attempt with a point per second give 784 points. If a
+job with many attempts has too many points, every second point is deleted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from service.store.tables import Base, ProgressPointRow
 
 #: Ratio of the running times of consecutive points.
 GROWTH = 1.01
-#: Number of points of a job above which they are halved at the start of an attempt.
+#: Number of points of a job above which every second one is deleted at the start of an attempt.
 MOST_POINTS = 2000
 
 
@@ -28,7 +28,7 @@ class Point:
     """Point of a job's loss history.
 
     Attributes:
-        attempt, step: Position of the point; later ones are greater.
+        attempt, step: Attempt and step of the point; points are ordered by both.
         total: Maximum number of steps.
         stage: Stage of the job.
         seconds: Duration of all steps so far.

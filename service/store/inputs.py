@@ -15,9 +15,9 @@ from service.store.database import Database, idempotency_row, new_id, upsert
 from service.store.quotas import IS_RECEIPT, NO_QUOTAS, RECEIPT, Quotas, check_bytes, lock_owner
 from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadPartRow, UploadRow
 
-#: Lifetime of an unreferenced blob in seconds: the request that brought it may not have created its job yet.
+#: Lifetime of an unreferenced blob in seconds: the request that uploaded it may not have created its job yet.
 GRACE_SECONDS = 3600.0
-#: Fraction of that time during which a touched blob is not touched again.
+#: Fraction of `GRACE_SECONDS` within which a blob's `touched_at` is not updated again, which saves writes.
 _HOLD_SHARE = 0.1
 #: Maximum number of unfinished uploads per key.
 MAX_OPEN_UPLOADS = 1000
@@ -41,7 +41,7 @@ def check_offset(upload: UploadRow, offset: int) -> None:
 
 
 class Inputs:
-    """Inputs in the store."""
+    """Database rows of blobs, uploads, receipts and inspections."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -53,7 +53,7 @@ class Inputs:
             sha256: SHA-256 of the content.
             location: Name of its file among the blobs.
             size: Size of the content in bytes.
-            upload_id: Upload or receipt that brought the content and holds it from now on.
+            upload_id: Upload or receipt that the content came with; it holds the blob from now on.
 
         Raises:
             NotFoundError: If the upload or receipt is gone.
@@ -88,7 +88,7 @@ class Inputs:
             NotFoundError: If a blob is gone.
         """
         found = self.blobs(digests)
-        # recently touched blobs are not touched again, so consecutive submissions of one scene need no write
+        # `touched_at` is not updated if it is recent, so consecutive submissions of one scene need no write
         recent = self._database.clock() - _HOLD_SHARE * GRACE_SECONDS
         if any(sha256 not in found or found[sha256].touched_at < recent for sha256 in digests):
             with self._database.writing() as session:
@@ -105,7 +105,7 @@ class Inputs:
         return found
 
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
-        """Return blobs by digest, for a job that holds them."""
+        """Return blobs by digest; missing ones are left out."""
         found: dict[str, BlobRow] = {}
         with self._database.reading_rows() as connection:
             for start in range(0, len(digests), 500):
@@ -126,7 +126,7 @@ class Inputs:
 
     @property
     def rolled_back(self) -> bool:
-        """Whether files may exist that the database has lost its rows of."""
+        """Whether the database may have lost the rows of existing files."""
         return self._database.rolled_back
 
     def expiry(self) -> float:
@@ -134,7 +134,7 @@ class Inputs:
         return self._database.expiry()
 
     def locations(self) -> set[str]:
-        """Return all locations that rows refer to."""
+        """Return the locations of all blobs."""
         with self._database.reading() as session:
             return set(session.scalars(select(BlobRow.location)))
 
@@ -195,7 +195,7 @@ class Inputs:
         return row
 
     def uploads(self, upload_ids: Sequence[str], owner: str) -> dict[str, UploadRow]:
-        """Return uploads of this owner by id, without missing and expired ones."""
+        """Return uploads of this owner by id; missing and expired ones are left out."""
         now = self._database.clock()
         found: dict[str, UploadRow] = {}
         with self._database.reading_rows() as connection:
@@ -256,7 +256,7 @@ class Inputs:
         """Delete an upload; a blob made from it remains for the jobs that use it.
 
         Returns:
-            Locations of blobs that nothing needs any more, for `Blobs.remove`.
+            Locations of blobs that are no longer used, for `Blobs.remove`.
         """
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
@@ -308,7 +308,7 @@ class Inputs:
         """Delete the receipt of a request that ended without a job.
 
         Returns:
-            Locations of blobs that nothing needs any more, for `Blobs.remove`.
+            Locations of blobs that are no longer used, for `Blobs.remove`.
         """
         with self._database.writing() as session:
             session.execute(delete(UploadRow).where(UploadRow.id == receipt))
@@ -352,7 +352,7 @@ def hand_over(session: Session, receipt: str) -> None:
 
 
 def _lock_upload(session: Session, upload_id: str) -> UploadRow:
-    """Return an upload's row, locked before any blob's row."""
+    """Lock and return an upload's row; call this before locking rows of blobs, so that no deadlock occurs."""
     row = session.get(UploadRow, upload_id, with_for_update=True)
     if row is None:
         raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")

@@ -36,7 +36,7 @@ _UNFINISHED_OF = select(func.count()).where(_JOBS.c.owner == bindparam("owner"),
 
 
 def _count_ahead() -> Select[int]:
-    """Return the query that counts the queued jobs ahead of one: two ranges of the queue's index."""
+    """Return the query that counts the queued jobs ahead of a job, in two ranges of the queue's index."""
     queued = select(func.count()).select_from(_JOBS).where(_JOBS.c.status == JobStatus.QUEUED)
     higher = queued.where(_JOBS.c.priority > bindparam("priority"))
     own_place = tuple_(bindparam("queued_at", type_=Float), bindparam("job_id", type_=String))
@@ -98,7 +98,7 @@ class Jobs:
             limit: Maximum number of unfinished jobs of the owner.
             quotas: Quotas of the owner.
             idempotency: Idempotency-Key of the request; None for none.
-            receipt: Receipt for the request's files, which a new job takes over; None if the request has no files.
+            receipt: Receipt for the request's files, which the new job takes over; None if the request has no files.
 
         Returns:
             Job, and whether it is new; if the Idempotency-Key was used before, the job created then.
@@ -181,7 +181,7 @@ class Jobs:
     def queue_position(self, job: JobRow) -> int | None:
         """Return the number of queued jobs ahead by priority and age, plus one; None if the job is not queued.
 
-        Turns between owners are ignored, because they change with every lease.
+        The turns of owners are ignored, because they change with every lease.
         """
         with self._database.reading_rows() as connection:
             return _queue_position(connection, job)
@@ -236,7 +236,7 @@ class Jobs:
         """Delete an ended job and release its inputs; the caller removes its results afterwards.
 
         Returns:
-            Locations of inputs that nothing needs any more, for `Blobs.remove`.
+            Locations of inputs that are no longer used, for `Blobs.remove`.
 
         Raises:
             ConflictError: If the job has not ended.
@@ -262,10 +262,10 @@ class Jobs:
             return session.get(ArtifactRow, (job_id, name))
 
     def add_made(self, source: ArtifactRow, files: Sequence[Published]) -> list[str]:
-        """Publish files derived from a published one, unless that one is gone.
+        """Publish files derived from `source`, unless `source` has been removed or replaced.
 
         Returns:
-            Locations of files without a row: others were faster, or the job is gone.
+            Locations of files that were not published, because files of these names exist or `source` is gone.
         """
         unused = []
         with self._database.writing() as session:

@@ -1,8 +1,9 @@
 """Leases of jobs: all operations of a dispatcher on a job, from taking it to its end.
 
-A dispatcher leases the job that it runs for a few seconds at a time. Each lease of a job has a number, its epoch. Every
-write of a dispatcher names the epoch that it holds, and raises `LeaseLostError` without effect if the job has been
-leased again since. Two dispatchers may thus both believe that they run a job, but only one of them can write.
+A dispatcher holds a lease of each job that it runs. A lease lasts some seconds unless it is renewed. Each lease of a
+job has a number, its epoch. Every write of a dispatcher names the epoch that it holds, and raises `LeaseLostError`
+without effect if the job has been leased again since. Two dispatchers may thus both believe that they run a job, but
+only one of them can write.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _BACKFILLED = 16
 
 @dataclass(frozen=True)
 class Lease:
-    """Right to write to a job until another lease has a higher epoch."""
+    """Right to write to a job, valid until the job is leased again with a higher epoch."""
 
     job: JobRow
     dispatcher: str
@@ -51,7 +52,7 @@ class Lease:
 
 @dataclass(frozen=True)
 class Published:
-    """Stored file, to be made visible by a row; `step` is set for checkpoints."""
+    """File in the file store that is or will be published by a database row; `step` is set for checkpoints."""
 
     name: str
     location: str
@@ -90,19 +91,19 @@ class Leases:
         Jobs with expired leases are candidates like queued ones. If such a job has used up its attempts, it is ended as
         failed, and if it was being canceled, as canceled; then the next job is tried.
 
-        A job that does not fit is reserved: this dispatcher takes no other job of its priority until it fits, so that
-        smaller jobs do not overtake it forever. Another dispatcher takes it if it fits there first, and skips it
-        otherwise, so a large job blocks one dispatcher rather than all. Jobs that may run `before` the reserved one are
-        taken meanwhile, and the reservation remains.
+        If a job does not fit, it is reserved: this dispatcher takes no other job of the same priority until the
+        reserved job fits, so that smaller jobs do not overtake it forever. Other dispatchers take the job if it fits
+        there first and skip it otherwise, so a large job blocks only one dispatcher. Jobs that may run `before` the
+        reserved one are taken meanwhile, and the reservation remains.
 
         Args:
             dispatcher: Name of the dispatcher.
             fits: Callback that returns whether there is capacity for a job.
-            keeps: Callback that returns whether to reserve capacity for a job that does not fit; other jobs are
+            keeps: Callback that returns whether to reserve capacity for a job that does not fit; if not, the job is
                 skipped.
-            before: Callback that returns, for a reserved job, the condition for jobs that do not delay it; None for no
-                job.
-            is_lost: Callback that returns whether a job with an expired lease may be taken over; other jobs are
+            before: Callback that returns, for a reserved job, a predicate of jobs that would not delay it; None if no
+                job may run before it.
+            is_lost: Callback that returns whether a job with an expired lease may be taken over; if not, the job is
                 skipped.
         """
         passed: list[str] = []
@@ -152,7 +153,7 @@ class Leases:
         return None
 
     def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float, *, keep: bool = False) -> Lease:
-        """Lease a job; `keep` preserves the dispatcher's reservation for another one."""
+        """Lease a job; `keep` preserves the dispatcher's reservation for another job."""
         job.attempt += 1
         job.lease_epoch += 1
         job.lease_owner, job.lease_expires_at = dispatcher, now + self._seconds
@@ -183,7 +184,7 @@ class Leases:
         return found
 
     def statuses(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
-        """Return the status of leased jobs as `renew` does, without renewing."""
+        """Return what `renew` returns, without renewing the leases."""
         ids = [lease.job_id for lease in leases]
         with self._database.reading() as session:
             rows = {row.id: row for row in session.scalars(select(JobRow).where(JobRow.id.in_(ids)))}
@@ -242,7 +243,7 @@ class Leases:
             session.execute(_FORGET_PROGRESS, {"of_job": lease.job_id})
 
     def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
-        """Publish files, replacing those of the same names; return locations that nothing refers to any more."""
+        """Publish files, replacing those of the same names; return the locations of the replaced files."""
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._held_or_raise(session, lease)
@@ -253,7 +254,7 @@ class Leases:
     def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> list[str]:
         """End a job as succeeded and publish its results in one transaction, as `publish` does.
 
-        A job whose cancellation came too late has succeeded.
+        If a cancellation came too late, the job still counts as succeeded.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -312,7 +313,7 @@ class Leases:
             end(session, job, Transition.STOP, now, self._retention)
 
     def _close_lost(self, session: Session, job: JobRow, now: float) -> bool:
-        """Close the attempt of a lost dispatcher; return whether the job has ended with it."""
+        """Close the attempt of a lost dispatcher; return whether this has ended the job."""
         error = {"code": "dispatcher-lost", "message": "The process that ran the job was not heard of again."}
         verdict = self._close(session, job, AttemptOutcome.LOST, error, now)
         count(session, "sgsst_lease_expirations_total")

@@ -23,7 +23,7 @@ _ALIVE = select(func.count()).select_from(DispatcherRow).where(_IS_ALIVE)
 
 @dataclass(frozen=True)
 class Delivery:
-    """Message that a dispatcher has taken to send.
+    """Webhook message that a dispatcher has claimed for sending.
 
     Attributes:
         id, job_id: Ids of the message and of its job.
@@ -42,7 +42,7 @@ class Delivery:
 
 
 def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
-    """Return an expression that maps a column's value to its count."""
+    """Return an SQL expression for the count of a column's value; 0 for values without a count."""
     return case(dict(counts), value=column, else_=0) if counts else literal(0)
 
 
@@ -132,7 +132,7 @@ class Operations:
     def due_deliveries(
         self, hold_seconds: float, sending: Collection[Delivery], *, total: int, per_owner: int, per_url: int
     ) -> list[Delivery]:
-        """Take due messages; no other dispatcher gets them for `hold_seconds`.
+        """Claim due messages for sending; no other dispatcher gets them for `hold_seconds`.
 
         Args:
             sending: Messages that this dispatcher is already sending; they count toward the limits.
@@ -140,7 +140,7 @@ class Operations:
                 that does not respond, or an owner with many such receivers, from delaying the messages of others.
         """
         now = self._database.clock()
-        owner = func.coalesce(JobRow.owner, "")  # messages of deleted jobs count as one owner's
+        owner = func.coalesce(JobRow.owner, "")  # messages of deleted jobs count as those of one owner
         per_url_rank = func.row_number().over(partition_by=DeliveryRow.url, order_by=DeliveryRow.next_at)
         due = (
             select(DeliveryRow.id, DeliveryRow.next_at, owner.label("owner"))
@@ -177,7 +177,7 @@ class Operations:
             return taken
 
     def settle_delivery(self, delivery_id: str, wait_seconds: float | None) -> None:
-        """Delete a delivered or abandoned message (None), or make it due again after `wait_seconds`."""
+        """Make a message due again after `wait_seconds`; if None, delete it because it was delivered or given up."""
         with self._database.writing() as session:
             row = session.get(DeliveryRow, delivery_id, with_for_update=True)
             if row is None:

@@ -14,20 +14,21 @@ from service.errors import DatabaseBusyError, DatabaseUnavailableError
 
 #: Time in seconds after which clients should retry.
 _RETRY_SECONDS = 5
-#: Time in seconds that a transaction waits for the result of another one before it is refused.
+#: Time in seconds that a transaction waits for a probing transaction before it is rejected.
 _PROBE_SECONDS = 0.2
-#: SQLite's errors of a locked database and of an unusable file; other errors are bugs of the service.
+#: Names of SQLite errors for a locked database and for an unusable file; all other errors are bugs of the service.
 _SQLITE_BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED")
 _SQLITE_AWAY = ("SQLITE_CANTOPEN", "SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY")
-#: Classes of PostgreSQL errors of conflicting transactions.
+#: Classes of PostgreSQL errors for conflicting transactions.
 _POSTGRESQL_BUSY = ("40", "55")
 
 
 class Gate:
-    """Gate that keeps transactions off a database that did not respond to the last one.
+    """Circuit breaker for transactions on a database that does not respond.
 
-    After an outage, one transaction at a time probes the database and the others are refused immediately. Otherwise
-    every thread of a process would wait for its own timeout, and none would be left for requests that need no database.
+    After a transaction failed because of an outage, one transaction at a time probes the database, and all others are
+    rejected almost immediately. Otherwise every thread of a process would wait for its own timeout, and none would be
+    left for requests that need no database.
     """
 
     def __init__(self) -> None:
@@ -39,7 +40,7 @@ class Gate:
         """Run a transaction.
 
         Raises:
-            DatabaseUnavailableError: If the database does not respond, or an outage lasts.
+            DatabaseUnavailableError: If the database does not respond, or an earlier outage continues.
         """
         refusal = self._refusal
         if refusal is not None and not self._probe.acquire(timeout=_PROBE_SECONDS):
@@ -75,12 +76,12 @@ def translated() -> Iterator[None]:
 
 
 def busy() -> DatabaseBusyError:
-    """Return the error of a wait that took too long."""
+    """Return the error for a wait for the database that took too long."""
     return DatabaseBusyError("The service's database is busy. Try again later.", retry_after=_RETRY_SECONDS)
 
 
 def _refusal(error: DBAPIError) -> DatabaseUnavailableError | None:
-    """Return the exception for callers that a driver's error stands for; None if it is a bug of the service."""
+    """Convert a driver's error to an exception for callers; return None if the error is a bug of the service."""
     sqlite: str | None = getattr(error.orig, "sqlite_errorname", None)
     sqlstate: str = getattr(error.orig, "sqlstate", None) or ""
     if (sqlite or "").startswith(_SQLITE_BUSY) or sqlstate.startswith(_POSTGRESQL_BUSY):

@@ -34,9 +34,9 @@ from service.store.database import upsert
 from service.store.states import ACTIVE, JobStatus
 from service.store.tables import JobRow, ReservationRow, TurnRow
 
-#: Time in seconds that no lease and no retry delay reaches: a time further in the future comes from a wrong clock.
+#: Upper bound of lease durations and retry delays in seconds; a time further in the future comes from a wrong clock.
 _IMPLAUSIBLE_SECONDS = 3600.0
-#: Fraction of a reservation's duration below which it is renewed, so that not every query of the queue writes.
+#: Fraction of a reservation's duration; it is renewed when less than that remains, which saves writes.
 _RENEW_SHARE = 0.5
 
 
@@ -63,7 +63,7 @@ def _count(condition: ColumnElement[bool]) -> Select[int]:
 
 # Built once, because building a query takes longer than running it.
 _NOW: BindParameter[float] = bindparam("now", type_=Float)
-#: Queries that count the jobs that may start `now`, and the lost ones, up to `most`.
+#: Queries that count the jobs that may start `now`, and the jobs with expired leases, up to `most`.
 WAITING, LOST = _count(queued_now(_NOW)), _count(expired(_NOW))
 
 
@@ -73,9 +73,9 @@ def mine(dispatcher: str | BindParameter[str]) -> ColumnElement[bool]:
 
 
 def next_job(session: Session, dispatcher: str, now: float, passed: Sequence[str] = ()) -> JobRow | None:
-    """Return the next job for a dispatcher: by priority, then its reservation, then turns of owners, then age.
+    """Return a dispatcher's next job: by priority, then the dispatcher's reservation, then owners' turns, then age.
 
-    The job's row is locked; rows locked by others are skipped.
+    The job's row is locked; rows locked by other transactions are skipped.
 
     Args:
         passed: Ids of jobs to skip.
@@ -116,7 +116,7 @@ def _first() -> Select[JobRow]:
         .outerjoin(TurnRow, TurnRow.owner == JobRow.owner)
         .outerjoin(ReservationRow, ReservationRow.job_id == JobRow.id)
         .where(JobRow.id.in_(bindparam("candidates", type_=String, expanding=True)))
-        # repeated for rows that have changed since they were found
+        # checked again, because rows may have changed since they were found
         .where(or_(queued_now(now), expired(now)))
     )
     order = (JobRow.priority.desc(), kept, turn, JobRow.queued_at, JobRow.id)

@@ -1,4 +1,4 @@
-"""Quotas of keys: jobs and GPU seconds per day (UTC), and stored bytes; usage is counted when it occurs."""
+"""Quotas of keys: jobs and GPU seconds per day (UTC), and stored bytes; usage is counted as it occurs."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from service.store.database import Database, upsert
 from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, UploadRow, UsageRow
 
 _DAY = 86_400
-#: Retry delay of an exceeded storage quota in seconds: by then something may have been deleted or expired.
+#: Retry delay of an exceeded storage quota in seconds: by then data may have been deleted or expired.
 _BYTES_AGAIN = 3600
 
 _USAGE = Base.metadata.tables[UsageRow.__tablename__]
-#: Prefix and condition of receipts, the charges for the files of one request (`service.store.inputs`).
+#: Prefix of the ids of receipts, and the SQL condition for receipts. A receipt charges a key for the bytes of one
+#: request (`service.store.inputs`).
 RECEIPT = "rcp"
 IS_RECEIPT = UploadRow.id.startswith(f"{RECEIPT}_", autoescape=True)
 
@@ -57,7 +58,7 @@ class Quotas:
         return replace(self, **{name: value for name, value in (own or {}).items() if name in known})
 
     def given(self) -> dict[str, Any]:
-        """Return the quotas that set a limit, for `with_own`."""
+        """Return the quotas that are not None by name, for `with_own`."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -95,18 +96,18 @@ def day_of(now: float) -> int:
 def lock_owner(session: Session, owner: str) -> None:
     """Lock an owner's limits until the end of the transaction, so that concurrent checks of the same owner wait.
 
-    Take this lock before any other and before the check: two transactions that do not see each other's rows would both
-    pass. On SQLite a writing transaction is exclusive anyway.
+    Call this before taking other locks and before the check. Otherwise two concurrent transactions, which do not see
+    each other's rows, could both pass the check. On SQLite a writing transaction is exclusive anyway.
     """
     if session.get_bind().dialect.name == "postgresql":
         session.execute(_LOCK_OWNER, {"owner": f"sgsst-owner:{owner}"})
 
 
 def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
-    """Count a job that is being accepted, within its transaction.
+    """Count a new job, within the transaction that creates it.
 
     Raises:
-        QuotaError: If it exceeds the daily number, or today's GPU seconds are used up.
+        QuotaError: If the job exceeds the daily number of jobs, or today's GPU seconds are used up.
     """
     insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=1, gpu_seconds=0.0)
     counted = insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"jobs": _USAGE.c.jobs + 1})

@@ -18,7 +18,8 @@ class Retention:
     """Housekeeping of the store, which any dispatcher may do.
 
     Args:
-        retention: Time in seconds until results expire; the record of an expired job is kept for the same time again.
+        retention: Time in seconds until results expire; the record of an expired job is deleted after another such
+            period.
     """
 
     def __init__(self, database: Database, retention: float) -> None:
@@ -26,7 +27,7 @@ class Retention:
         self._retention = retention
 
     def advance(self, seconds: float) -> None:
-        """Advance the time by which everything expires (`service.store.clocks`).
+        """Advance the time by which data expire (`service.store.clocks`).
 
         Args:
             seconds: Working time of the caller since its last call, by its monotonic clock.
@@ -58,13 +59,13 @@ class Retention:
             return [job.id for job in due]
 
     def unswept(self, limit: int) -> list[tuple[str, int]]:
-        """Return ended jobs that may have left files without rows, each with the epoch of its last lease."""
+        """Return ended jobs that may have files without database rows, each with the epoch of its last lease."""
         query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
         with self._database.reading() as session:
             return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
 
     def mark_swept(self, job_id: str, epoch: int) -> None:
-        """Mark a job as free of such files, unless it has been queued again."""
+        """Mark a job as having no files without rows, unless it has been queued again."""
         same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
         with self._database.writing() as session:
             session.execute(update(JobRow).where(same).values(swept=True))

@@ -1,4 +1,4 @@
-"""Pure decisions about a job whose attempt ended without a result; `leases` carries them out."""
+"""Pure functions that decide about a job whose attempt ended without a result; `service.store.leases` calls them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from service.store.states import AttemptOutcome, JobStatus, Transition
 
-#: Maximum delay between attempts in seconds; until then it doubles.
+#: Maximum delay between attempts in seconds; the delay doubles up to this limit.
 MAX_RETRY_SECONDS = 300.0
 
 
@@ -25,8 +25,8 @@ class FailureCount:
     def with_failure(self, saved_step: int | None) -> FailureCount:
         """Return the count after another failure.
 
-        A failure after progress resets the count. A long job thus survives many accidents, while one that breaks at the
-        same step each time does not.
+        A failure after progress resets the count. A long job thus survives many sporadic failures, while a job that
+        fails at the same step each time does not.
 
         Args:
             saved_step: Last saved step of the job; None for no step.

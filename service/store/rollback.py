@@ -1,7 +1,7 @@
 """Detection of an SQLite database that was rolled back: its write-ahead log was lost, or an old copy replaced it.
 
-Files of jobs that such a database does not know must not be deleted. A marker file beside the database holds the number
-of the newest event, which only grows. A database that is behind its marker has lost later commits.
+Files of jobs that are missing from such a database must not be deleted. A marker file beside the database holds the
+number of the newest event, which only grows. A database that is behind its marker has lost later commits.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class Marker:
             return 0
 
     def reach(self, number: int) -> None:
-        """Record a committed number; recording it before the commit would make a crash look like a rollback."""
+        """Record the number of a committed event; before the commit, a crash would look like a rollback."""
         if number > self._reached:
             self._reached = number
             self._write(number)
 
     def compare(self, marked: int, number: int) -> None:
-        """Leave a note if the database is behind its marker.
+        """Write a message to `note` if the database is behind its marker.
 
         Args:
             marked: Result of `read` from before the database was queried.

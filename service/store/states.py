@@ -1,4 +1,4 @@
-"""States of a job and all transitions between them, in one table that the store's updates follow."""
+"""States of a job, and the table of all transitions between them."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class AttemptOutcome(StrEnum):
 class Transition(StrEnum):
     """Transition of a job from one state to another."""
 
-    #: A dispatcher leases the job, for the first time or after a lost one.
+    #: A dispatcher leases the job, for the first time or after its previous lease was lost.
     TAKE = "take"
-    #: The inputs are read and the steps start.
+    #: The inputs have been read and the first step starts.
     BEGIN = "begin"
     SUCCEED = "succeed"
     #: An attempt failed and is not followed by another one.
@@ -59,7 +59,7 @@ ACTIVE = (_S.STARTING, _S.RUNNING, _S.CANCELING)
 UNFINISHED = (_S.QUEUED, *ACTIVE)
 #: States of an ended job that still has its files.
 FINISHED = (_S.SUCCEEDED, _S.FAILED, _S.CANCELED)
-#: States in which nothing more happens, unless the user retries the job.
+#: Final states, unless the user retries the job.
 ENDED = (*FINISHED, _S.EXPIRED)
 
 #: Target state per transition and initial state; other combinations are not allowed. A job that is being canceled is

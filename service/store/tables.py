@@ -30,7 +30,7 @@ class JobRow(Base):
 
     `lease_epoch` counts its leases; every write of a dispatcher names the epoch that it holds. `failures` counts
     consecutive failed attempts without progress. `saved_step` is the step of the newest checkpoint, and `failed_step`
-    its value at the last failure. `swept` means that the job has ended and has no files without rows.
+    its value at the last failure. `swept` is set once the job has ended and has no files without database rows.
     """
 
     __tablename__ = "jobs"
@@ -63,7 +63,7 @@ class JobRow(Base):
 
     __table_args__ = (
         Index("ix_jobs_queue", "status", "priority", "queued_at", "id"),  # covers counting a queue position
-        # finds the first job of each owner without reading the others (`service.store.queue`)
+        # finds the first job of each owner without reading other jobs (`service.store.queue`)
         Index("ix_jobs_turns", "status", "owner", text("priority DESC"), "queued_at", "id"),
         Index("ix_jobs_lease_expires_at", "lease_expires_at"),
         Index("ix_jobs_owner_id", "owner", "id"),
@@ -115,7 +115,7 @@ class TurnRow(Base):
 
 
 class ReservationRow(Base):
-    """Queued job that a dispatcher reserves its capacity for, until the time `until` unless it is renewed."""
+    """Queued job for which a dispatcher reserves capacity; the reservation ends at `until` unless it is renewed."""
 
     __tablename__ = "reservations"
 
@@ -139,7 +139,7 @@ class EventRow(Base):
 
 
 class ProgressPointRow(Base):
-    """Point of a job's loss history; `scales` has the loss of each scale, None for scales that took no part."""
+    """Point of a job's loss history; `scales` has the loss of each scale, None for scales that the step left out."""
 
     __tablename__ = "progress_points"
 
@@ -168,7 +168,7 @@ class ArtifactRow(Base):
 
 
 class BlobRow(Base):
-    """Content of an input, shared by all its users; `location` is the file's name among the blobs."""
+    """Content of an input, shared by all jobs and uploads with it; `location` is the file's name among the blobs."""
 
     __tablename__ = "blobs"
 
@@ -188,7 +188,7 @@ class BlobUseRow(Base):
 
 
 class UploadRow(Base):
-    """Multipart upload; `sha256` is set once it is complete."""
+    """Multipart upload or receipt (`service.store.inputs`); `sha256` is set once an upload is complete."""
 
     __tablename__ = "uploads"
 
@@ -229,7 +229,7 @@ class KeyRow(Base):
 
 
 class UsageRow(Base):
-    """Usage of an owner on a day, which is a number of days since 1970 (UTC)."""
+    """Usage of an owner on one day; `day` is the number of days since 1970 (UTC)."""
 
     __tablename__ = "usage"
 

@@ -1,4 +1,4 @@
-"""Heartbeats of dispatchers, and the columns of jobs for their saved steps and for sweeping."""
+"""Heartbeats of dispatchers, and columns of jobs for saved steps and for the removal of leftover files."""
 
 from __future__ import annotations
 

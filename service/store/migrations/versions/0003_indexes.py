@@ -1,4 +1,4 @@
-"""Indexes that count queue positions, and an owner's jobs by status, without reading the jobs."""
+"""Indexes for counting queue positions, and an owner's jobs by status, without reading the rows of jobs."""
 
 from __future__ import annotations
 

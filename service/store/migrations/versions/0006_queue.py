@@ -1,6 +1,6 @@
-"""Queries of the next job that scale with the queue, reservations of dispatchers, and quotas of keys.
+"""Indexes for finding the next job in a long queue, reservations of dispatchers, and quotas of keys.
 
-The previous version also works with these tables: the new columns have defaults and nothing is required of it.
+The previous version of the service works with these tables too, because all new columns are optional.
 """
 
 from __future__ import annotations
