@@ -187,7 +187,7 @@ def _fill(disparity: Array, known: Mask, photo: Array) -> tuple[Array, _Behind]:
 
 
 def _in_other_photo(disparity: Array, direction: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
-    """Return row and column of each pixel in the other photo, and a mask of the pixels that lie inside it.
+    """Return the row and column of each pixel in the other photo, and a mask of the pixels inside that photo.
 
     `direction` is -1 from left to right and 1 from right to left. Columns outside are clamped to the border.
     """
@@ -204,7 +204,7 @@ def _hidden(disparity: Array, other: Array, direction: int) -> Mask:
 
 
 def _move_to_right(disparity: Array) -> tuple[Array, Mask]:
-    """Return the left photo's disparity as seen by the right camera, and a mask of the pixels that it covers.
+    """Return the left photo's disparity as seen by the right camera, and a mask of the pixels that have a value.
 
     The disparity is 0 where no pixel of the left photo is visible.
     """

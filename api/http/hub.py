@@ -49,7 +49,7 @@ class _Channel:
 
 
 class Hub:
-    """Poller of job events that wakes the watchers of each job."""
+    """Poller of job events that notifies the watchers of each job."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -70,7 +70,7 @@ class Hub:
             self._task.cancel()
 
     async def ended(self, job_id: str, after: int) -> bool:
-        """Return whether the job has ended and has no events after the given one."""
+        """Return whether the job has ended and has no events after the one with id `after`."""
         last = (await asyncio.to_thread(self._store.jobs.last_events, [job_id])).get(job_id)
         if last is None or last > after:
             return False
@@ -78,7 +78,7 @@ class Hub:
         return bool(rows) and _to_item(rows[0]).ends
 
     async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
-        """Yield the events of a job after the given one, as text, until the job has ended."""
+        """Yield the encoded events of a job after the one with id `after`, until the job has ended."""
         channel = self._channels.get(job_id)
         if channel is None:
             channel = self._channels.setdefault(job_id, _Channel(0, 0))

@@ -286,7 +286,7 @@ class _Attempts:
         self._listener.left_out(rank.place.gpus)
 
     def _tell_resumed(self) -> None:
-        """Report the first step after a loss, and record how long the recovery took."""
+        """Report that the job has resumed after a loss, and record how long the recovery took."""
         if not self._lost or self._lost[-1].seconds_to_resume:
             return
         now = time.monotonic()
