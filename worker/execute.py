@@ -30,7 +30,7 @@ from worker.options import RunOptions
 from worker.prepare import Job, Warn
 from worker.request import Outputs
 
-#: Default seconds between checkpoints. A lost rank costs at most this much work.
+#: Default seconds between checkpoints. If a rank is lost, at most this much work is repeated.
 CHECKPOINT_SECONDS = RunOptions().checkpoint_seconds
 
 
@@ -40,9 +40,9 @@ class Result:
 
     Attributes:
         stopped: Reason why the job ended; see `run`. If it is "interrupted", only a checkpoint was written.
-        step, total: Completed and planned numbers of steps.
+        step, total: Number of completed steps, and number of all steps.
         before, after: Losses on the evaluation views before and after the job; empty if the job was interrupted.
-        bought: Relation of the loss to the time spent; see `report.bought`. None if no step was made on all scales.
+        bought: Loss as a function of the time spent; see `report.bought`. None if no step was made on all scales.
         report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
         packed: Measured loss of quality in the compressed file; None if no compressed file was requested.
         weights: Weights of the scales in `before` and `after`.
@@ -75,18 +75,19 @@ def execute(
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     run_id: str | None = None,
 ) -> Result:
-    """Run a prepared job and write its outputs, the PLY first, so that a failing report cannot lose it.
+    """Run a prepared job and write its outputs.
 
-    Every participating rank must call this function. The callbacks are used on rank 0 only.
+    The PLY is written first, so that it exists even if the report fails. Every participating rank must call this
+    function. The callbacks are used on rank 0 only.
 
     Args:
         job: Prepared job.
         progress: Callback for the progress of the steps.
         stop: Callback that returns True to interrupt the job.
-        warn: Callback for warnings. A checkpoint that cannot be written is a warning while the job continues.
+        warn: Callback for warnings, such as a checkpoint that cannot be written while the job runs.
         preview: Callback after every step; see `Previews`. None writes no previews.
         saved: Callback that receives the step of each checkpoint.
-        checkpoint_seconds: Seconds between checkpoints. A job that ends early writes one more.
+        checkpoint_seconds: Seconds between checkpoints. A job that ends early writes one more at its end.
         run_id: Identifier of this run, stored in checkpoints. None generates one.
 
     Raises:
@@ -107,7 +108,7 @@ def execute(
     if first:
         callbacks.progress, callbacks.stop = progress, stop
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
-        callbacks.preview_seconds = 0.0  # `Previews` decides itself when to write one
+        callbacks.preview_seconds = 0.0  # `Previews` itself limits how often a preview is written
     stopped = run(stylizer, callbacks)
     if stopped == "interrupted":
         if checkpoint.error is not None:
@@ -169,7 +170,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
     measure.at_the_end()
-    # The initial loss is evaluated here too: before the first step, preparing the views would delay the job.
+    # The initial loss is evaluated here, because evaluating it before the first step would delay the job.
     before, after = measure.evaluate(unstylized=True), measure.evaluate()
     error = _write_reports(job, stopped, before, after, packed) if first else None
     found = bought(stylizer, before)
@@ -204,7 +205,7 @@ def _write_packed(job: Job) -> PackedLoss | None:
 def _write_reports(
     job: Job, stopped: Stopped, before: Evaluation, after: Evaluation, packed: PackedLoss | None
 ) -> Exception | None:
-    """Write the reports beside the PLY. Return an error instead of raising it, since the scene itself is written."""
+    """Write the reports beside the PLY. Return an error instead of raising it, because the PLY is already written."""
     stylizer, outputs = job.stylizer, job.outputs
     try:
         if job.request.colors and _only_colors_change(job):
@@ -220,6 +221,6 @@ def _write_reports(
         write_contact_sheet(outputs.sheet, stylizer)
         write_loss_chart(outputs.curves, report)
         write_page(outputs.page, report, outputs.sheet, outputs.views if outputs.views.exists() else None)
-    except Exception as error:  # no error of a report may make the job itself fail
+    except Exception as error:  # a failing report must not fail the job
         return error
     return None

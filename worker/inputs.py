@@ -1,7 +1,7 @@
 """Readers of a job's inputs: scene, cameras, style, photos and network weights.
 
-The command line, the inspection of the service and every rank of a job use these readers, so that all of them see the
-same inputs.
+The command line, the service's inspection process and every rank of a job use these readers, so that all of them
+interpret the files in the same way.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class Inputs:
     Attributes:
         weights: Weights of the feature network.
         style: Style images, [H, W, 3] in 0..1.
-        scene_file: Scene and the rows that were dropped from its file.
+        scene_file: Scene, and which rows of its file were dropped.
         cameras: Cameras at the sizes at which the scene is stylized.
         orbit: Orbit that generated the cameras; None if they come from a file.
-        photos: Content image of each camera; None for unstylized renders.
+        photos: Path of each camera's photo for the content term; None if it uses unstylized renders.
         regions: Regions of the scene; None if the job has none.
         fingerprint: Hash of all inputs and settings; equal for equal jobs.
     """
@@ -114,7 +114,7 @@ def read_regions(
         check_style_size(style, cameras, settings.style_scale)
         return style
 
-    # One rank selects for all: masks vote with renders, which different processors may round differently.
+    # Only one rank selects: mask votes depend on renders, which different processors may round differently.
     return collectives.broadcast(
         lambda: select_regions(request.regions, file, cameras, near, load, settings.sh_attenuation)
     )
@@ -137,7 +137,7 @@ def _cameras_on_all_ranks(
 ) -> tuple[list[Camera], Orbit | None]:
     """Return the result of `read_cameras_of`, the same on every rank.
 
-    Every rank reads a camera file itself. An orbit is computed by rank 0 only, since processors may round differently.
+    Every rank reads a camera file itself. Only rank 0 computes an orbit, since processors may round differently.
     """
     if source.cameras is None:
         return collectives.broadcast(lambda: read_cameras_of(source, scene))
@@ -185,7 +185,7 @@ def _orbit_request(source: SceneRequest) -> OrbitRequest:
 
 
 def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:
-    """Check that at least one camera sees a Gaussian. Rendering stops at the first one that does.
+    """Check that at least one camera sees a Gaussian. Views are rendered until one shows a Gaussian.
 
     Raises:
         CameraError: If no camera sees a Gaussian.
@@ -197,7 +197,7 @@ def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> N
 def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
     """Check that at least one camera sees a Gaussian, if possible without rendering.
 
-    A Gaussian whose center lies in a view suffices. Views are rendered only if there is none.
+    A Gaussian whose center projects into a view counts as seen. Views are rendered only if there is no such Gaussian.
 
     Raises:
         CameraError: If no camera sees a Gaussian.
@@ -217,7 +217,7 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
     """Call `make` on every rank, and return this rank's result once all ranks have succeeded.
 
     Raises:
-        SgsstError: If `make` raises it on a rank. Every rank raises the error of the lowest such rank.
+        SgsstError: If `make` raises it on any rank. Every rank then raises the error of the lowest failed rank.
     """
     value, error = None, None
     try:
@@ -249,7 +249,7 @@ def _same_fingerprint(own: str | None, collectives: Collectives) -> str:
                 f"The files of this job are not the same on {found[0][1]} and {host}: scene, cameras, style or weights "
                 "differ. Give paths on a file system that all machines share."
             )
-    assert found[0][0] is not None  # the first rank reads for itself
+    assert found[0][0] is not None  # rank 0 always reads the scene itself
     return found[0][0]
 
 

@@ -1,7 +1,7 @@
 """Options of a job, declared once for the command line and the API.
 
-`StylizeOptions` holds all options that both accept: those of the views, all settings of the method, and those of the
-job itself.
+`StylizeOptions` holds the options that both accept: view options, all settings of the method, and options of the job
+itself.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ViewOptions(BaseModel):
 
 
 def _settings_to_choose() -> dict[str, Any]:
-    """Return a field for each setting. None leaves a setting to the preset."""
+    """Return a model field for each setting. A field that is None takes its value from the preset."""
     fields: dict[str, Any] = {}
     for name, setting in declared(Settings).items():
         text = default_text(setting)
@@ -84,7 +84,7 @@ else:
 
 
 class StylizeOptions(_Chosen):
-    """Options of `sgsst stylize` and of a job of the service. Options that are not given follow the preset."""
+    """Options of `sgsst stylize` and of a job of the service. Omitted options take their values from the preset."""
 
     backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 if it is installed, else VGG16.")
     compute_everything: bool = Field(
@@ -101,7 +101,7 @@ class StylizeOptions(_Chosen):
     )
 
     def given_settings(self) -> dict[str, Any]:
-        """Return the settings that were given, except the preset, by their names in `Settings`."""
+        """Return the explicitly given settings, except the preset, by their names in `Settings`."""
         known = declared(Settings)
         given = {known[name].field: getattr(self, name) for name in self.model_fields_set & known.keys() - {"preset"}}
         given["keep"] = EVERYTHING if self.compute_everything else None

@@ -76,7 +76,7 @@ def prepare(
         InvalidInputError: If an input cannot be used. Every rank raises the same error.
         RankLeftOut: If the plan does not use this rank.
     """
-    timer = Timer()  # host time suffices: no GPU work is pending at the end of a part
+    timer = Timer()  # no CUDA synchronization needed: no GPU work is pending when a phase ends
     outputs = collectives.broadcast(lambda: check_request(request))
     with timer("reading"):
         inputs = read_inputs(request, collectives)
@@ -134,7 +134,7 @@ def prepare(
 def _refine(
     inputs: Inputs, settings: Settings, collectives: Collectives, show: ShowPlanning | None
 ) -> Refinement | None:
-    """Return how the scene is refined; None if `settings.refine` turns refinement off."""
+    """Return the refinement of the scene; None if `settings.refine` turns it off."""
     return refine(
         inputs.scene_file.scene,
         inputs.cameras,
@@ -150,8 +150,8 @@ def _refine(
 def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:
     """Return the plan of a resumed job, or None if there is none or it cannot be used here.
 
-    A plan made for another device or for fewer ranks cannot be used. A GPU rasterizer is tried first: compiling its
-    kernels may take longer than ranks wait for each other during a step.
+    A plan made for another device or for fewer ranks cannot be used. If the plan uses a GPU rasterizer, its kernels are
+    compiled and checked here: compiling may take longer than ranks wait for each other during a step.
     """
     if resumed is None or collectives.size > resumed.ranks:
         return None

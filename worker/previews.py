@@ -21,8 +21,8 @@ _SIDE = 960
 class Previews:
     """Preview callback for `loop.Callbacks.preview`.
 
-    A preview is a render of the first evaluation view with the current colors. Another one is written before the first
-    step with the colors of a warm start, which gives users a first impression of the result within seconds.
+    A preview is a render of the first evaluation view with the current colors. One is also written before the first
+    step, with the colors of a warm start, so that users get a first impression of the result within seconds.
 
     Args:
         folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview.

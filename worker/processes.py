@@ -18,7 +18,7 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True)
 class ProcessId:
-    """Unique identifier of a process. A process ID alone may be reused by another process.
+    """Unique identifier of a process. A process ID alone is not unique, because the system reuses it.
 
     Attributes:
         home: Machine, process namespace and user; see the function `home`.
@@ -36,7 +36,7 @@ class ProcessId:
         return ProcessId(home(), os.getpid(), psutil.Process().create_time())
 
     def find(self) -> psutil.Process | None:
-        """Return the process, or None if it has ended. Must be called on its own machine."""
+        """Return the process, or None if it has ended. Must be called on the machine that the process runs on."""
         try:
             process = psutil.Process(self.number)
             return process if abs(process.create_time() - self.started) < 1 else None
@@ -45,7 +45,10 @@ class ProcessId:
 
 
 def home() -> tuple[str, ...]:
-    """Return an identifier of the kernel, process namespace and user: equal for processes that can see each other."""
+    """Return an identifier of the running kernel, process namespace and user.
+
+    Processes that can see each other have the same one.
+    """
     if not sys.platform.startswith("linux"):
         return socket.gethostname(), str(os.geteuid())
     boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()

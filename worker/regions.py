@@ -134,7 +134,7 @@ def parse_selection(text: str, where: str) -> Selection:
 
     Args:
         text: SPEC.
-        where: Option or region that holds it, for error messages.
+        where: Option or region that the SPEC belongs to, for error messages.
 
     Raises:
         SettingsError: If it is not a valid SPEC.

@@ -136,7 +136,7 @@ class Outputs:
 
     @property
     def all(self) -> list[Path]:
-        """Return all paths except the older checkpoint, which is only ever created by renaming."""
+        """Return the paths of all output files except the older checkpoint, which is only created by renaming."""
         found = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
         found.append(self.colors)
         return found if self.packed is None else [*found, self.packed]
@@ -194,7 +194,7 @@ def check_steps(settings: Settings) -> None:
 
 
 def check_request(request: StylizeRequest) -> Outputs:
-    """Check what can be checked without reading the inputs, and return the output files. Creates nothing.
+    """Check a request as far as possible without reading the inputs, and return the output files. Creates nothing.
 
     Raises:
         InvalidInputError: If there are no steps or no cameras, or the outputs cannot be written.

@@ -40,7 +40,7 @@ def select_regions(
     Args:
         requests: Requested regions; see `worker.regions.region_requests`.
         file: Scene.
-        cameras: Cameras of the masks, at the sizes at which the scene is stylized.
+        cameras: Cameras that mask images may belong to, at the sizes at which the scene is stylized.
         near: Near plane in world units.
         load: Function that reads the images of a style.
         sh_attenuation: SH attenuation of the job, 0 to 1.
@@ -69,7 +69,7 @@ def select_regions(
 
 
 def select(selection: Selection, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
-    """Return whether a selection contains each Gaussian of a scene, [N] bool; see `select_regions`."""
+    """Return a flag for each Gaussian of a scene, [N] bool: whether the selection contains it. See `select_regions`."""
     means, numbers, path = file.scene.means, selection.numbers, selection.path
     match selection.kind:
         case "box":
@@ -97,7 +97,7 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
     rows = len(file.scene) if file.kept is None else len(file.kept)
     try:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # the last one for an unclosed bracket
+    except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # TokenError: unclosed bracket
         raise SceneError(f"{path}: cannot be read as .npy: {error}. Write it with numpy.save.") from error
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "biuf":
         raise SceneError(f"{path}: does not hold an array of flags or numbers. Write it with numpy.save.")
@@ -112,7 +112,7 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
 
 
 def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
-    """Return whether the masks of some views contain each Gaussian, [N] bool; see `planning.masks`.
+    """Return a flag for each Gaussian, [N] bool: whether the masks of some views select it. See `planning.masks`.
 
     Raises:
         ImageError: If there are no masks, or if a mask cannot be used.

@@ -31,7 +31,7 @@ class StyleFile:
 def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> StyleFile:
     """Parse FILE or FILE:WEIGHT.
 
-    If a file with the whole text as its name exists, it is that file, even if the text ends like a weight.
+    If a file named like the whole text exists, the text is its path, even if it ends in `:WEIGHT`.
 
     Args:
         text: Text to parse.

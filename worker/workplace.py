@@ -1,6 +1,6 @@
 """Protocols for the files of a job whose ranks run on machines without a shared folder.
 
-The caller that starts the job implements them: only it knows where the files come from and where results are stored.
+The program that starts the job implements them: only it knows where the files come from and where results are stored.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-#: Callback for each file that was stored outside this machine. It receives the implementation's description of the
-#: file, and the step if the file is a checkpoint (else None).
+#: Callback for each file that was stored outside this machine. It receives a description of the file, whose type the
+#: implementation chooses, and the step if the file is a checkpoint (else None).
 Stored = Callable[[Any, int | None], None]
 
 
@@ -34,14 +34,14 @@ class OpenWorkplace(Protocol):
 
 
 class Workplace(Protocol):
-    """Factory of such folders. It is pickled and sent to every rank."""
+    """Factory of folders with the files of a job. It is pickled and sent to every rank."""
 
     @property
     def scene_bytes(self) -> int:
-        """Return the bytes of the job's scene in memory, estimated from its file."""
+        """Return the bytes that the job's scene needs in memory, estimated from its file."""
 
     def open(self, rank: int, stored: Stored) -> OpenWorkplace:
-        """Create the folder with the job's files. On rank 0, store new output files from then on.
+        """Create the folder with the job's files. On rank 0, also start to store new output files.
 
         Args:
             rank: Rank that opens the folder.
@@ -55,4 +55,4 @@ class Workplace(Protocol):
         """Return the workplace of the next attempt, which resumes from the stored files."""
 
     def tidy(self) -> None:
-        """Delete folders of this machine whose ranks were killed."""
+        """Delete folders that killed ranks have left on this machine."""

@@ -103,7 +103,7 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     """Run the variants, and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
 
     Args:
-        progress: Callback that gets a variant and each of its points.
+        progress: Callback that receives the variant and the `Point` of each evaluation.
 
     Raises:
         InvalidInputError: If an input cannot be used; the first one is reported.
@@ -119,10 +119,10 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
 
 
 def run_quality(request: VariantsRequest, progress: Any) -> Quality:
-    """Run the variants, judge them, and write `quality.json`, plots, `quality.jpg` and scenes into the folder.
+    """Run the variants, measure their quality, and write `quality.json`, plots, `quality.jpg` and scenes.
 
     Args:
-        progress: Callback that gets a variant and each of its points.
+        progress: Callback that receives the variant and the `Point` of each evaluation.
 
     Raises:
         InvalidInputError: If an input cannot be used; the first one is reported.

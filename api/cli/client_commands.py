@@ -127,7 +127,7 @@ def submit(
 
 
 def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return regions as the API expects them.
+    """Return regions as JSON objects for the API.
 
     Args:
         names: Names under which the style images of the regions are sent, in the order of `region_requests`.
@@ -268,7 +268,7 @@ def _transfer(what: str) -> Iterator[Any]:
 
 @contextmanager
 def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
-    """Show one progress bar, first of the sent bytes, then of the surveyed views; only on a terminal."""
+    """Show a progress bar of the sent bytes, then of the surveyed views; only on a terminal."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
     with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
         task = bar.add_task("checking", total=None, text="")
@@ -328,7 +328,7 @@ def _tell_loss(client: Client, job_id: str, form: PackedForm | None) -> None:
 
 
 def _packed_form(out: Path) -> PackedForm | None:
-    """Return the compressed format of a file name; None if it has none."""
+    """Return the compressed format that the ending of a file name stands for; None for any other name."""
     form = form_of_name(out.name)
     return form if form in PACKED_FORMS else None
 

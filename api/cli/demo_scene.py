@@ -2,8 +2,9 @@
 
 The pair and its disparity are from the Middlebury 2014 benchmark (Scharstein et al., "High-resolution stereo datasets
 with subpixel-accurate ground truth", GCPR 2014). Every pixel of the left photo becomes a flat Gaussian that covers just
-that pixel as seen from the left camera. Surfaces that only the right camera sees are added from the right photo. A thin
-margin behind depth edges is invented, so that views between and around the two cameras have no cracks.
+that pixel as seen from the left camera. Surfaces that only the right camera sees are added from the right photo. Behind
+depth edges, a thin margin of background is extrapolated, so that views between and around the two cameras have no
+cracks.
 
 World: meters, the left camera's axes (x right, y down, z forward), the origin at the left camera.
 """
@@ -31,8 +32,9 @@ from sgsst_core.scene.gaussians import Scene
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Calibration at the size of the photos (741x500), as documented by scikit-image's `stereo_motorcycle`. It is
-#: Middlebury's (focal 3979.911 px, doffs 124.343 px at 2964x2000, baseline 193.001 mm) divided by 4.
+#: Calibration for the size of the photos (741x500), as documented by scikit-image's `stereo_motorcycle`: focal length
+#: and principal point in pixels, and baseline in meters. Lengths in pixels are Middlebury's (focal 3979.911 px, doffs
+#: 124.343 px at 2964x2000) divided by 4.
 FOCAL = 994.978
 CENTER_X, CENTER_Y = 311.193, 254.877
 BASELINE = 0.193001
@@ -41,29 +43,31 @@ DISPARITY_OFFSET = 31.086
 
 #: Standard deviation of a Gaussian in pixels of its photo. Larger values blur, smaller ones leave a visible lattice.
 PIXEL_SIGMA = 0.5
-#: The same for a Gaussian that replaces several pixels: the rasterizer's own blur of 0.3 px^2 widens it less.
+#: Standard deviation of a Gaussian that replaces several pixels, relative to their joint side length. It is larger,
+#: because the rasterizer's own blur of 0.3 px^2 widens a large Gaussian less.
 MERGED_SIGMA = 0.62
 #: Ratio of a disc's thickness to its smaller radius.
 FLATNESS = 0.1
 OPACITY = 0.97
-#: Maximum slope (depth per unit of width) of a lifted surface. Steeper slopes are clamped: they mostly are differences
-#: across an edge between two objects, and would make needles.
+#: Maximum slope (depth per unit of width) of a lifted surface. Steeper slopes are clamped, because most of them come
+#: from edges between two objects and would produce needle-shaped Gaussians.
 MAX_SLOPE = 3.0
 #: Disparity step in pixels that counts as an edge between two objects.
 EDGE_STEP = 3.0
-#: Rows and columns of the window that is searched for the surface behind a pixel; half of it on each side of an edge is
-#: invented. Wide because the cameras lie side by side; low because the floor's disparity grows downwards.
+#: Rows and columns of the window that is searched for the surface behind a pixel. On each side of an edge, half of the
+#: window is extrapolated. It is wide because the cameras lie side by side, and low because the floor's disparity grows
+#: downwards.
 EDGE_WINDOW = (13, 49)
 #: Width in pixels of the rim beside an edge that may be foreground although its disparity is unknown.
 RIM = 3.0
 #: Color difference (0..1) between the two photos above which a guessed disparity is dropped.
 WRONG_COLOR = 0.2
-#: Four pixels whose colors differ by less (0..1) and whose disparities lie on a plane within FLAT_STEP share one
-#: Gaussian. That saves a third of the Gaussians with no visible difference.
+#: Maximum color difference (0..1) of four pixels that are merged into one Gaussian. Their disparities must also lie on
+#: a plane within FLAT_STEP. Merging saves a third of the Gaussians with no visible difference.
 FLAT_COLOR = 0.08
 FLAT_STEP = 0.3
 
-#: Views of the camera path: an ellipse around both cameras, looking at the motorcycle.
+#: Number of views on the camera path: an ellipse around both cameras, looking at the motorcycle.
 VIEWS = 10
 VIEW_WIDTH, VIEW_HEIGHT = 720, 480
 #: Focal length of the views; a little longer than the photos', so that the border of the photos stays out of view.
@@ -152,7 +156,7 @@ def lift_pair() -> Scene:
 
 
 class _Behind(NamedTuple):
-    """Invented surface behind depth edges: its mask, disparity and color."""
+    """Extrapolated surface behind depth edges: its mask, disparity and color."""
 
     mask: Mask
     disparity: Array
@@ -163,7 +167,8 @@ def _fill(disparity: Array, known: Mask, photo: Array) -> tuple[Array, _Behind]:
     """Return the disparity with unknown pixels filled in, and the surface behind the rims of the foreground.
 
     Unknown pixels lie mostly beside a foreground object that hides the background from the other camera. They get the
-    disparity of the nearest pixel that is not foreground, that is, not nearer than something else in its window.
+    disparity of the nearest background pixel. A pixel is foreground if its window contains a surface that is clearly
+    farther from the camera.
     """
     lowest = ndimage.minimum_filter(np.where(known, disparity, np.inf), size=EDGE_WINDOW)
     source = known & (disparity <= lowest + EDGE_STEP)
@@ -182,7 +187,7 @@ def _fill(disparity: Array, known: Mask, photo: Array) -> tuple[Array, _Behind]:
 
 
 def _in_other_photo(disparity: Array, direction: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
-    """Return row and column of each pixel in the other photo, and a mask of the pixels that lie inside it.
+    """Return the row and column of each pixel in the other photo, and a mask of the pixels inside that photo.
 
     `direction` is -1 from left to right and 1 from right to left. Columns outside are clamped to the border.
     """
@@ -193,13 +198,16 @@ def _in_other_photo(disparity: Array, direction: int) -> tuple[NDArray[np.intp],
 
 
 def _hidden(disparity: Array, other: Array, direction: int) -> Mask:
-    """Return where a surface is hidden in the other photo: behind something there, or beyond its border."""
+    """Return a mask of the pixels that the other photo does not show: occluded there, or outside its border."""
     rows, columns, inside = _in_other_photo(disparity, direction)
     return ~inside | (other[rows, columns] > disparity + EDGE_STEP)
 
 
 def _move_to_right(disparity: Array) -> tuple[Array, Mask]:
-    """Return the left photo's disparity as seen by the right camera (0 where it has none), and a mask of its pixels."""
+    """Return the left photo's disparity as seen by the right camera, and a mask of the pixels that have a value.
+
+    The disparity is 0 where no pixel of the left photo is visible.
+    """
     rows, columns, inside = _in_other_photo(disparity, -1)
     moved = np.full(disparity.shape, -np.inf)
     np.maximum.at(moved, (rows[inside], columns[inside]), disparity[inside])  # the nearest surface wins
@@ -235,7 +243,7 @@ def _samples(disparity: Array, photo: Array, chosen: Mask) -> Samples:
 def _slope(disparity: Array, axis: int) -> Array:
     """Return the gradient of the disparity: the smaller of the differences to both sides, 0 if their signs differ.
 
-    A pixel beside an edge therefore takes the slope of its own surface. The differences span two pixels, to reduce
+    A pixel beside an edge therefore gets the slope of its own surface. The differences span two pixels, to reduce
     noise.
     """
     ahead = (np.roll(disparity, -2, axis) - disparity) / 2

@@ -29,7 +29,8 @@ class StopFlag:
 def stop_on_signal(announce: Callable[[], None]) -> Iterator[StopFlag]:
     """Turn the first SIGINT or SIGTERM into a flag, and call `announce` when it arrives.
 
-    The second signal has its usual effect. Outside the main thread, where Python allows no handlers, nothing changes.
+    The second signal has its usual effect. Outside the main thread, Python allows no signal handlers, so the flag stays
+    unset.
     """
     flag = StopFlag()
     if threading.current_thread() is not threading.main_thread():

@@ -34,12 +34,12 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command i
     from worker.ranks.attempts import RanksResult, WorkerOptions
     from worker.request import Outputs, StylizeRequest
 
-#: Exit codes: an unusable input (as for a wrong option), and any other failure.
+#: Exit codes for an unusable input or option, and for any other failure.
 BAD_INPUT, FAILURE = 2, 1
 #: Width in characters of tables that a narrower terminal would truncate.
 TABLE_WIDTH = 180
-#: Resolution and steps of the demo, and seconds after which it stops on a slow machine; in total it takes less than
-#: five minutes.
+#: Resolution and number of steps of the demo, and seconds after which it stops on a slow machine. The whole demo takes
+#: less than five minutes.
 DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 180
 
 app = typer.Typer(
@@ -399,7 +399,7 @@ def demo(
     _stylize(request, arguments)
 
 
-#: Options of a job that `bench` applies to all variants.
+#: Options of a job that `sgsst bench` accepts and applies to all variants.
 _OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")
 BenchSeconds = Annotated[float, typer.Option(min=1, help="Seconds of optimization per variant.")]
 

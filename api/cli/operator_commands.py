@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from service.settings import ServiceSettings
     from service.store import Store
 
-#: Exit codes of `sgsst fsck`; the exit status is their sum.
+#: Exit codes of `sgsst fsck` by kind of finding. The exit status is the sum over all kinds that were found.
 _FSCK_CODES = {"missing": 4, "damaged": 8, "orphaned": 16}
 _FSCK_ROLLED_BACK = 32
 

@@ -27,10 +27,10 @@ def with_options(
 ) -> Callable[[Command], Command]:
     """Return a decorator that replaces one argument of a command by options, one per field of a model.
 
-    The function gets a model with the given values; fields that were not given are unset in it.
+    The decorated function receives an instance of the model. Only options given on the command line are set in it.
 
     Args:
-        argument: Name of the function's argument.
+        argument: Name of the function's argument that receives the model.
         only: Names of the options to offer; None for all.
         without: Names of options to leave out.
     """
@@ -86,7 +86,7 @@ def help_text(option: Declared) -> str:
 
 
 def _parameter(option: Declared) -> inspect.Parameter:
-    """Return the parameter of a command's function. typer checks words and switches, the model all other values."""
+    """Return an option as a function parameter. typer validates words and switches, the model all other values."""
     form = FORMS.get(option.option.unit)
     kind: Any = kind_of(option) if is_switch(option) or get_origin(kind_of(option)) is Literal else str
     shown: dict[str, Any] = {} if is_switch(option) else {"metavar": metavar(option)}
@@ -97,7 +97,7 @@ def _parameter(option: Declared) -> inspect.Parameter:
 
 
 def kind_of(option: Declared) -> Any:
-    """Return the type of an option's values without None and bounds; the first type of a union."""
+    """Return the type of an option's values, without None and bounds. For a union, return its first type."""
     found = option.info.annotation
     kinds = [kind for kind in get_args(found) if kind is not type(None)]
     first = kinds[0] if type(None) in get_args(found) else found
@@ -110,7 +110,7 @@ def is_switch(option: Declared) -> bool:
 
 
 def _checked(model: type[M], given: dict[str, object]) -> M:
-    """Return a model of the given values.
+    """Return an instance of a model with the given values.
 
     Raises:
         SettingsError: If a value is invalid; the message names the option.

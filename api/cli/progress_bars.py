@@ -1,4 +1,4 @@
-"""Progress of a job on a terminal: live bars, or a line per minute where bars cannot be drawn."""
+"""Progress of a job: live bars on a terminal, or one line per minute elsewhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sgsst_core.stylizing.loop import Progress as StepProgress
     from worker.description import Prepared
 
-#: Seconds between lines where no bar can be drawn, such as in a log file.
+#: Seconds between lines if there is no terminal, such as in a log file.
 LOG_SECONDS = 60.0
 _STAGES = {"coarse": "coarsest scale", "sos": "all scales", "measuring": "measuring"}
 

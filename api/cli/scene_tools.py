@@ -1,6 +1,6 @@
 """Implementation of the commands `plan`, `check` and `render`.
 
-They read and check all inputs, compute, and write the outputs. They print nothing. `stylize` is implemented by
+The functions check all inputs, compute, and write the outputs, but print nothing. `stylize` is implemented by
 `worker.prepare` and `worker.execute`, on one rank or several.
 """
 
@@ -38,14 +38,14 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     Args:
         request: Request whose `out` is the file of the plan.
         show_planning: Callback that shows the progress of the survey of the views.
-        sheet: JPEG of the views, written before the plan is made; None for none.
+        sheet: JPEG file for images of the views, written before the plan is made; None writes no file.
 
     Raises:
         InvalidInputError: If an input cannot be used; the first one is reported.
     """
     source, settings, out = request.source, request.settings, request.out
     check_choice(source)
-    if out.is_dir() or out.suffix.lower() != ".json":  # a typing mistake must not replace a scene or its cameras
+    if out.is_dir() or out.suffix.lower() != ".json":  # a mistyped path must not overwrite a scene or its cameras
         raise OutputError(f"{out}: not the name of a JSON file. Give one, such as plan.json.")
     if source.cameras and out.exists() and source.cameras.exists() and out.samefile(source.cameras):
         raise OutputError(f"{out}: is the camera file, which would be overwritten. Give another file name.")

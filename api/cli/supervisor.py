@@ -17,8 +17,8 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError
 
-#: A process that dies within the first number of seconds is restarted after a wait, which doubles each time up to the
-#: second number of seconds.
+#: Seconds of life below which a dead process is restarted only after a wait, and maximum wait in seconds. The wait
+#: doubles each time.
 _SHORT_LIFE, _LONGEST_WAIT = 5.0, 10.0
 _LOOK_SECONDS = 0.2
 #: Seconds that processes have to stop, on top of the time that jobs have to save their state.
@@ -56,7 +56,7 @@ class _Child:
         self.started = time.monotonic()
 
     def restart_if_dead(self, announce: Callable[[str], None]) -> None:
-        """Restart the process if it has died, after a wait if its life was short."""
+        """Restart the process if it has died, after a wait if it ran only briefly."""
         now = time.monotonic()
         if self.process is not None and self.process.poll() is not None:
             lived = now - self.started
@@ -75,7 +75,7 @@ def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
     refused.
 
     Raises:
-        ServeError: If the address is in use, or if other machines could use the service and there is no key.
+        ServeError: If the address is in use, or if other machines can reach the service and no API key exists.
     """
     keep_private(settings)
     store = open_store(settings)

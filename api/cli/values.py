@@ -18,12 +18,12 @@ _COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 @dataclass(frozen=True)
 class Form:
-    """Command-line format of the values of a unit.
+    """Command-line syntax of values with a certain unit.
 
     Attributes:
         parse: Parser of the text.
         metavar: Placeholder of the value in the help.
-        hint: Text that continues the option's help.
+        hint: Text that is appended to the option's help.
     """
 
     parse: Callable[[str], object]
@@ -75,7 +75,7 @@ def parse_weights(text: str) -> tuple[float, ...]:
         ) from None
 
 
-#: Units whose values are written differently than in JSON.
+#: Units whose values have a different syntax on the command line than in JSON.
 FORMS = {
     "RGB, 0 to 1": Form(parse_color, "COLOR", ": black, white, or R,G,B from 0 to 255."),
     "factor or strength": Form(parse_strength, "W", f" {_STRENGTHS}"),

@@ -1,4 +1,4 @@
-"""Answers of the service as clients see them: jobs, events and errors."""
+"""Contents of the service's responses, for users of the clients: jobs, events and errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ApiError(SgsstError):
     """A request that the service refused, or a service that cannot be reached.
 
     Attributes:
-        status: HTTP status; 0 if there was no answer.
+        status: HTTP status; 0 if there was no response.
         problem: Problem document; empty if there is none.
     """
 
@@ -41,7 +41,7 @@ class RequestError(ApiError, InvalidInputError):
 
 @dataclass(frozen=True)
 class Job:
-    """State of a job as the service last sent it; `data` is the whole answer."""
+    """State of a job as the service last sent it; `data` is the complete JSON response."""
 
     id: str
     status: str
@@ -97,10 +97,10 @@ def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
 
 
 def is_passing(error: Exception) -> bool:
-    """Return whether the same request may succeed later: there was no answer, or it reports a temporary failure."""
+    """Return whether the same request may succeed later: there was no response, or it reports a temporary failure."""
     return isinstance(error, httpx.TransportError) or (isinstance(error, ApiError) and error.status in _PASSING)
 
 
 def unreachable(base: str, error: Exception) -> ApiError:
-    """Return the error for a service that did not answer."""
+    """Return the error for a service that did not respond."""
     return ApiError(f"{base} cannot be reached ({error}). Is `sgsst serve` running? --url names another address.")

@@ -64,12 +64,12 @@ class JobMethods(Methods):
 
         Args:
             scene: Scene file.
-            style: Style image. Several are mixed, by the parameter `style_weights`.
-            cameras: Same as `sgsst stylize --cameras`; None requires the parameter `orbit`.
+            style: Style image, or several that are mixed with the weights of the parameter `style_weights`.
+            cameras: Camera file or folder, as for `sgsst stylize --cameras`; None requires the parameter `orbit`.
             photos: Folder of photos for the content term; None for unstylized renders.
             webhook: URL that is called when the job has ended; None for none.
-            progress: Callback that gets the uploaded bytes and the total bytes of all large files.
-            parameters: Fields of `JobParameters`; None leaves one out.
+            progress: Callback that receives the uploaded bytes and the total bytes of all large files.
+            parameters: Fields of `JobParameters`; those that are None are not sent.
 
         Raises:
             RequestError: If an input cannot be used; the message says which and why.
@@ -90,17 +90,17 @@ class JobMethods(Methods):
         planning: Progress = no_progress,
         **parameters: Any,
     ) -> Steps[dict[str, Any]]:
-        """Plan a job without queueing it, and return what it would do and need. Other arguments are those of `submit`.
+        """Plan a job without queueing it, and return the plan. The other arguments are the same as for `submit`.
 
         Args:
-            planning: Callback that gets the number of surveyed views and of all views.
+            planning: Callback that receives the number of surveyed views and the number of all views.
         """
         files = Path(scene), _paths(style), _path(cameras), _path(photos)
         return (yield from uploads.plan_job(files, parameters, progress=progress, planning=planning))
 
     @Operation
     def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> Steps[str]:
-        """Upload a file in parts, and return the upload's id. Any number of jobs may use it."""
+        """Upload a file in parts, and return the upload's id. Any number of jobs may use the upload."""
         path = Path(path)
         return (yield from uploads.upload(path, name or path.name, progress))
 
@@ -126,7 +126,7 @@ class JobMethods(Methods):
 
     @Iteration
     def watch(self, job_id: str, after: int = 0) -> Walk[Event]:
-        """Yield the events of a job as they happen, until it has ended. Lost connections are resumed."""
+        """Yield the events of a job as they happen, until it has ended. No event is lost when a connection breaks."""
         yield from self._watch(job_id, after)
 
     def _watch(self, job_id: str, after: int) -> Steps[None]:
@@ -135,7 +135,7 @@ class JobMethods(Methods):
             try:
                 yield Listen(stream)
             except httpx.TransportError as error:
-                # stamina does not fit here: each event resets the count of failures
+                # stamina cannot do this: each event resets the count of failures
                 seconds = stream.broken()
                 if stream.failures >= TRIES:
                     raise unreachable(self.url, error) from None
@@ -165,14 +165,14 @@ class JobMethods(Methods):
         progress: Progress = no_progress,
         form: str | None = None,
     ) -> Steps[Path]:
-        """Download a file of a job, and check its SHA-256. A partial download resumes.
+        """Download a file of a job, and check its SHA-256. If part of it was downloaded before, resume from there.
 
         Args:
             form: Format of stylized.ply: "compressed.ply" or "spz"; None for PLY. The service converts the file on the
                 first request.
 
         Raises:
-            RequestError: If there is no such file (yet).
+            RequestError: If the file does not exist, or does not exist yet.
         """
         target = Path(target)
         query = f"?format={form}" if form else ""
@@ -211,8 +211,9 @@ class Client(JobMethods, BlockingDriver):
     """Client of the service over HTTP.
 
     Args:
-        url: Address of the service; None for the environment's SGSST_URL, else port 8000 of this machine.
-        key: API key; None for the environment's SGSST_KEY.
+        url: Address of the service. None uses the environment variable SGSST_URL, or port 8000 of this machine if the
+            variable is not set.
+        key: API key; None uses the environment variable SGSST_KEY.
     """
 
 

@@ -1,4 +1,4 @@
-"""State of one download: its request headers, and the handling of the answer. Sends nothing itself."""
+"""State of one download. It creates the headers of the request and handles the response, but does not send anything."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from api.client.answers import ApiError
 
 Progress = Callable[[int, int], None]
 
-#: Bytes per read from or write to the disk.
+#: Bytes per read or write operation on the disk.
 BLOCK = 1 << 20
 
 
 class Download:
-    """Download of a file to a target. A partial file is resumed, and the whole is checked by its SHA-256.
+    """Download of a file to a target path. A partial file is resumed, and the complete file is checked by its SHA-256.
 
     Attributes:
         path: Path of the file on the service.
@@ -41,10 +41,10 @@ class Download:
         return {"Range": f"bytes={self._done}-", "If-Range": self._stamp.read_text()}
 
     def begin(self, response: httpx.Response) -> bool:
-        """Process the headers of a successful answer, or of a 416: there are no bytes beyond those received.
+        """Process the headers of a successful response, or of status 416, which means that all bytes were received.
 
         Returns:
-            Whether the answer's body must be written.
+            Whether the response's body must be written.
         """
         self._tag = response.headers.get("etag", "")
         if response.status_code == httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
@@ -74,7 +74,7 @@ class Download:
         """Check the whole file, then rename it to its target.
 
         Raises:
-            ApiError: If the file differs from what was sent. It is deleted.
+            ApiError: If the SHA-256 differs from the service's. The partial file is then deleted.
         """
         expected = self._stamp.read_text() if self._stamp.exists() else self._tag
         self._stamp.unlink(missing_ok=True)
@@ -84,7 +84,7 @@ class Download:
         self._part.replace(self._target)
 
     def _sha256(self) -> str:
-        """Return the SHA-256 of the partial file; bytes left by an earlier program are read and hashed here."""
+        """Return the SHA-256 of the partial file. Bytes that an earlier process has written are read for that."""
         with self._part.open("rb") as file:
             file.seek(self._hashed)
             while block := file.read(BLOCK):

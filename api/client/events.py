@@ -1,4 +1,4 @@
-"""State of one watcher of a job's events: its position, and its waits after lost connections. Does no I/O itself."""
+"""State of one watcher of a job's events: its position, and the waits after lost connections. It does no I/O itself."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from api.client.answers import Event, checked
 
 #: Seconds of silence after which a stream is considered dead; the service sends something every 15 s.
 _SILENCE_SECONDS = 60.0
-#: Seconds to wait after the first connection that breaks without an event; each further wait is twice as long.
+#: Seconds to wait before reconnecting. The wait doubles with each further connection that breaks without an event.
 FIRST_WAIT = 1.0
 
 
@@ -37,22 +37,22 @@ class EventStream:
         return {"headers": headers, "timeout": httpx.Timeout(30.0, read=_SILENCE_SECONDS)}
 
     def refuse(self, response: httpx.Response) -> None:
-        """Handle an answer without events, which ends the watch.
+        """Handle a response without events, which ends the watch.
 
         Raises:
-            RequestError, ApiError: If the answer is an error.
+            RequestError, ApiError: If the response is an error.
         """
         checked(response)
         self.over = True
 
     def take(self, sent: ServerSentEvent) -> Iterator[Event]:
-        """Yield the event that the service has sent; nothing for messages about the connection."""
+        """Yield the event of a server-sent message. Messages without data only keep the connection alive."""
         if sent.data:
             event = Event.of(sent)
             self._after, self.failures = event.id, 0
             yield event
 
     def broken(self) -> float:
-        """Count a broken connection, and return the seconds to wait before the next one."""
+        """Count a broken connection, and return the seconds to wait before reconnecting."""
         self.failures += 1
         return FIRST_WAIT * 2.0 ** (self.failures - 1)

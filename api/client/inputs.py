@@ -1,4 +1,4 @@
-"""Selection of a job's files on the client's side, and the names under which they are sent."""
+"""Selection of the local files that a client sends for a job, and the names under which they are sent."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def input_files(scene: Path, styles: Sequence[Path], cameras: Path | None, photo
 
 
 def different_names(paths: Sequence[Path]) -> list[str]:
-    """Return a unique name for each file: its own, with a number in front if an earlier file has the same name."""
+    """Return a unique name for each file: its own, prefixed by a number if an earlier file has the same name."""
     names: list[str] = []
     for number, path in enumerate(paths, 1):
         taken = {name.lower() for name in names}

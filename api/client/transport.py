@@ -2,8 +2,8 @@
 
 A method yields steps (`Call`, `Hear`, `Fetch`, `Listen`, `FileWork`, `Wait`). The driver runs each step, and sends its
 result or its error back to the method. `BlockingDriver` runs steps in the caller's thread. `AwaitingDriver` awaits
-them, and leaves file access to other threads. `Operation` and `Iteration` turn such a generator into a method of either
-kind.
+them, and runs file access in other threads. `Operation` and `Iteration` turn such a generator into a blocking or an
+asynchronous method.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Call:
-    """Request whose whole answer is wanted. It is retried if it may succeed later."""
+    """Request whose response is read completely. It is retried after temporary failures."""
 
     method: str
     path: str
@@ -52,9 +52,9 @@ class Call:
 
 @dataclass(frozen=True)
 class Hear:
-    """Request that may be answered by a stream of events.
+    """Request whose response may be a stream of events.
 
-    Each event is passed to `take`, and the step has no result. Any other answer is handled as that of a `Call`.
+    Each event is passed to `take`, and the step has no result. Any other response is handled like that of a `Call`.
     """
 
     call: Call
@@ -84,7 +84,7 @@ class Wait:
 
 @dataclass(frozen=True)
 class Item(Generic[T]):
-    """Value to yield to the caller's iteration."""
+    """Value that the method yields to its caller."""
 
     value: T
 
@@ -136,7 +136,7 @@ class Iteration(Generic[P, T]):
 
 
 class Methods:
-    """Base of a class with operations and iterations. A subclass that is also a driver gets them as its methods.
+    """Base class for operations and iterations. In a subclass that is also a driver, they become methods.
 
     Attributes:
         url: Address of the service.
@@ -145,7 +145,7 @@ class Methods:
     url: str
 
     def __init_subclass__(cls) -> None:
-        """Replace the operations and iterations of the bases by functions."""
+        """Replace the operations and iterations of the base classes by functions."""
         if not issubclass(cls, BlockingDriver | AwaitingDriver):
             return
         for base in cls.__mro__:
@@ -159,7 +159,7 @@ class Methods:
 def _named(method: Any, steps: Callable[..., Any], answer: str) -> Any:
     """Give a method the name, docstring and signature of its steps, and return it.
 
-    `answer` is the format of the return annotation, filled with the type of the steps' result.
+    `answer` is the format string of the return annotation. The type of the steps' result is inserted into it.
     """
     functools.update_wrapper(method, steps)
     signature = inspect.signature(steps)
@@ -178,7 +178,7 @@ def _http_options(url: str | None, key: str | None) -> dict[str, Any]:
 
 
 def _has_file(response: httpx.Response) -> bool:
-    """Return whether an answer is a file, a part of one, or 416: the file has no more bytes than were received."""
+    """Return whether a response is a file, a part of one, or status 416, which means that all bytes were received."""
     return not response.is_error or response.status_code == httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE
 
 
@@ -191,8 +191,9 @@ class BlockingDriver:
     """Driver that runs steps in the caller's thread.
 
     Args:
-        url: Address of the service; None for the environment's SGSST_URL, else port 8000 of this machine.
-        key: API key; None for the environment's SGSST_KEY.
+        url: Address of the service. None uses the environment variable SGSST_URL, or port 8000 of this machine if the
+            variable is not set.
+        key: API key; None uses the environment variable SGSST_KEY.
     """
 
     _iterator = "Iterator[{}]"
@@ -321,8 +322,9 @@ class AwaitingDriver:
     """Driver that awaits steps, and reads and writes files in other threads.
 
     Args:
-        url: Address of the service; None for the environment's SGSST_URL, else port 8000 of this machine.
-        key: API key; None for the environment's SGSST_KEY.
+        url: Address of the service. None uses the environment variable SGSST_URL, or port 8000 of this machine if the
+            variable is not set.
+        key: API key; None uses the environment variable SGSST_KEY.
     """
 
     _iterator = "AsyncIterator[{}]"

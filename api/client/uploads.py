@@ -74,13 +74,13 @@ Files = tuple[Path, Sequence[Path], Path | None, Path | None]
 def create_job(
     files: Files, parameters: Mapping[str, Any], *, webhook: str | None, progress: Progress
 ) -> Steps[dict[str, Any]]:
-    """Submit a job, and return the service's answer.
+    """Submit a job, and return the service's response.
 
     Args:
         files: Scene, style images, cameras and photos.
-        parameters: Parameters of the job; None leaves one out.
+        parameters: Parameters of the job; those that are None are not sent.
         webhook: URL that is called when the job has ended.
-        progress: Callback that gets the uploaded bytes and the total bytes of all large files.
+        progress: Callback that receives the uploaded bytes and the total bytes of all large files.
     """
     fields = yield from _send_files(files, parameters, progress)
     if webhook:
@@ -93,10 +93,10 @@ def create_job(
 def plan_job(
     files: Files, parameters: Mapping[str, Any], *, progress: Progress, planning: Progress
 ) -> Steps[dict[str, Any]]:
-    """Plan a job without queueing it. Other arguments are those of `create_job`.
+    """Plan a job without queueing it. The other arguments are the same as for `create_job`.
 
     Args:
-        planning: Callback that gets the number of surveyed views and of all views.
+        planning: Callback that receives the number of surveyed views and the number of all views.
     """
     fields = yield from _send_files(files, parameters, progress)
     told: dict[str, Any] = {}
@@ -117,13 +117,13 @@ def plan_job(
     if answer is not None:
         whole: dict[str, Any] = answer.json()
         return whole
-    if not told:  # the service was stopped, or a proxy cut the answer off
+    if not told:  # the service was stopped, or a proxy cut the response off
         raise ApiError("The connection ended before the plan had come. Try again.", 502)
     return told
 
 
 def _send_files(files: Files, parameters: Mapping[str, Any], progress: Progress) -> Steps[list[tuple[str, Any]]]:
-    """Upload the large files, and return the fields of the request, which carries the others."""
+    """Upload the large files, and return the form fields of the request, which contain the small files."""
     inputs: list[InputFile] = yield FileWork(partial(input_files, *files))
     total = sum(file.size for file in inputs if file.size > PART_BYTES)
     done = 0
@@ -142,5 +142,5 @@ def _send_files(files: Files, parameters: Mapping[str, Any], progress: Progress)
 
 
 def _report_sum(progress: Progress, before: int, total: int, done: int, _size: int) -> None:
-    """Report the progress of one file as a fraction of all files."""
+    """Report the progress of one file as part of the progress of all files."""
     progress(before + done, total)

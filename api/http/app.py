@@ -38,9 +38,9 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from service.weights import check_weights
 
-#: Number of threads for requests that read the store or the disk.
+#: Number of threads for requests that read the database or the disk.
 _THREADS = 40
-#: Seconds that a request waits for a locked database, and for each answer of the database server.
+#: Seconds that a request waits for a locked database, and for each response of the database server.
 _ANSWER_SECONDS = 8.0
 
 _access = logging.getLogger("api.access")
@@ -52,7 +52,7 @@ the job, and download `stylized.ply`. Errors are problem documents (RFC 9457) wi
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
-    """Return the app, with the store and folders of the settings."""
+    """Return the app, which uses the database and the folders of the settings."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -87,7 +87,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         context.hub.start()
         context.receipts.start()
-        with suppress(DamagedWeightsError):  # it is logged, and /readyz reports it
+        with suppress(DamagedWeightsError):  # the error is logged, and /readyz reports it
             await asyncio.to_thread(check_weights)
         yield
         context.receipts.close()
@@ -102,7 +102,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         version=_version(),
         description=_DESCRIPTION,
         lifespan=lifespan,
-        docs_url=None,  # FastAPI's own page loads its script from elsewhere
+        docs_url=None,  # FastAPI's own page loads its script from a CDN
         redoc_url=None,
     )
     for module in (jobs, events, inputs, artifacts, uploads, session, operations):

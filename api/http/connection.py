@@ -13,12 +13,12 @@ from api.http.memory import memory
 from api.http.problems import HeadTooLargeError, MalformedRequestError, TooManyConnectionsError, from_service
 from service.errors import ServiceError
 
-#: Maximum bytes of a request line and headers, if there are few connections; with many, each gets less
-#: (`api.http.memory`).
+#: Maximum bytes of a request line and headers. The limit is lower while many connections are open; see
+#: `api.http.memory`.
 MAX_HEAD_BYTES = 1 << 17
 #: Maximum number of headers: each takes far more memory than its bytes.
 MAX_HEADERS = 200
-#: Maximum number of requests that may wait on one connection for the answer to an earlier one.
+#: Maximum number of pipelined requests that may wait on one connection for the response to an earlier one.
 MAX_WAITING = 8
 
 
@@ -33,12 +33,13 @@ class _Stage(Enum):
 class Connection(HttpToolsProtocol):
     """A connection that is closed if its client takes too long or sends too much.
 
-    It reads at most one piece of a body ahead of the app, and drops trailers.
+    At most one block of a body is read ahead of the app. Trailers are dropped.
 
     Attributes:
-        head_seconds: Time limit in seconds for a head (request line and headers), from the connection or the head's
-            first byte to its end. Also the limit for the rest of a body that the app did not read, from the answer on.
-        most: Maximum number of simultaneous connections of this process; further ones are answered with 503.
+        head_seconds: Time limit in seconds for a head (request line and headers), from the start of the connection or
+            the first byte of the head. The same limit applies after a response to the body bytes that the app has not
+            read.
+        most: Maximum number of simultaneous connections of this process; further ones get status 503.
     """
 
     # An object with more than 30 attributes in its `__dict__` takes 2 kB more, and the base class has 28.
@@ -71,10 +72,7 @@ class Connection(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes | memoryview) -> None:
-        """Parse bytes; refuse the connection if too many arrive without finishing a head or belonging to a body.
-
-        Such bytes are heads, trailers and chunk extensions.
-        """
+        """Parse received bytes. Refuse the connection if a head, trailers or chunk extensions are too long."""
         steps = self._steps
         super().data_received(data)  # type: ignore[arg-type]
         if self.transport.is_closing():
@@ -111,7 +109,7 @@ class Connection(HttpToolsProtocol):
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """Pass on a piece of a body, and pause reading until the app has taken it."""
+        """Pass a block of a body to the app, and pause reading until the app has taken it."""
         self._steps += 1
         super().on_body(body)
         if not self.cycle.response_complete:
@@ -125,12 +123,12 @@ class Connection(HttpToolsProtocol):
         self._forget_answered()
 
     def on_response_complete(self) -> None:
-        """Finish an answer, and limit the time for the rest of a body that the app did not read."""
+        """Finish a response, and limit the time for the rest of a body that the app did not read."""
         super().on_response_complete()
         self._forget_answered()
 
     def _forget_answered(self) -> None:
-        """Free the memory of an answered request, then wait for its end or for the next request."""
+        """Free the memory of a request that has its response, then wait for the rest of it or for the next request."""
         if self.cycle is None or not self.cycle.response_complete or self.transport.is_closing():
             return
         if self._stage is _Stage.BODY:
@@ -140,7 +138,7 @@ class Connection(HttpToolsProtocol):
         self.cycle = None  # type: ignore[assignment]
         if self._stage is _Stage.BETWEEN:
             self.scope = self.headers = None  # type: ignore[assignment]
-            if self._timer is not None:  # The timer was the body's. uvicorn's own has stopped.
+            if self._timer is not None:  # Replaces the timer of the body, since uvicorn's own has stopped.
                 self._start_timer()
 
     def _start_timer(self) -> None:
@@ -155,22 +153,22 @@ class Connection(HttpToolsProtocol):
     def _close_late(self) -> None:
         self._timer = None
         if self.cycle is not None and not self.cycle.response_complete:
-            self._start_timer()  # an answer is still on its way to the same client
+            self._start_timer()  # a response is still being sent to the same client
         elif not self.transport.is_closing():
             self.transport.close()
 
     def _abort(self, error: ServiceError) -> None:
-        """Stop the parser; `send_400_response` then answers with the error."""
+        """Stop the parser; `send_400_response` then sends the error."""
         self._error = error
         raise error
 
     def send_400_response(self, msg: str) -> None:
-        """Answer malformed HTTP with a problem document; uvicorn's own answer is plain text."""
+        """Respond to malformed HTTP with a problem document; uvicorn's own response is plain text."""
         wrong = MalformedRequestError(f"{msg} Its first line, a header or a chunk is not as HTTP has it.")
         self._refuse(self._error or wrong)
 
     def _refuse(self, error: ServiceError) -> None:
-        """Close the connection; answer with the error unless an answer to this request has already started."""
+        """Close the connection. Send the error first, unless a response to this request has already started."""
         begun = self.cycle is not None and self.cycle.response_started
         if not begun or (self.cycle.response_complete and self._stage is not _Stage.BODY):
             answer = from_service(error)
@@ -184,7 +182,7 @@ _piece = memoryview(bytearray(MAX_HEAD_BYTES))
 
 
 class Reader(asyncio.BufferedProtocol):
-    """Adapter that reads a connection in pieces within its memory budget; uvloop itself reads 256 kB at once."""
+    """Adapter that reads a connection in blocks within its memory budget; uvloop itself reads 256 kB at once."""
 
     __slots__ = ("_connection",)
 
@@ -192,11 +190,11 @@ class Reader(asyncio.BufferedProtocol):
         self._connection = Connection(*args, **kwargs)
 
     def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
-        """Return the buffer for the next piece. All connections share it, because each piece is parsed at once."""
+        """Return the buffer for the next block. All connections share it, because each block is parsed immediately."""
         return _piece[: memory.share()]
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Parse a piece."""
+        """Parse the block that was read into the buffer."""
         self._connection.data_received(_piece[:nbytes])
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

@@ -3,8 +3,8 @@
 Programs send an API key with each request. A browser sends its key once (`POST /v1/session`) and gets a cookie, which
 it then also sends with images, downloads and event streams.
 
-A browser attaches the cookie to requests from any page. `SameSite=Strict` holds it back from other sites. In addition,
-a request that changes something must come from a page of this origin, according to the browser (`Origin`,
+Browsers may attach a cookie to requests from pages of any site; `SameSite=Strict` prevents that. In addition, a request
+that changes something must come from a page of this origin, according to the browser's headers (`Origin`,
 `Sec-Fetch-Site`).
 """
 
@@ -85,7 +85,7 @@ class Context:
 
 @dataclass(frozen=True)
 class Caller:
-    """Client that sends a request. It owns everything that it creates, and sees nothing else."""
+    """Client that sends a request. It can only access what it has created itself."""
 
     owner: str
     priority: int
@@ -117,11 +117,11 @@ async def get_caller(
 ) -> Caller:
     """Return the owner of the request's API key, or of its session if there is no key.
 
-    If the service requires no keys, all callers on this machine are the same one.
+    If the service requires no keys, all requests have the same owner.
 
     Raises:
         NoKeyError: If a key is required and missing, or the key is not valid.
-        CrossOriginError: If the session is valid, but a change is requested from another page than this service's.
+        CrossOriginError: If the session is valid, but the page that requests a change is not one of this service.
         ForeignSiteError: If there is no key, and the request comes from a web page that this service did not serve.
         RateLimitError: If requests with this key arrive too fast.
     """
@@ -159,10 +159,10 @@ def check_origin(request: Request, *, required: bool = True) -> None:
     """Check that a request comes from a page of this service, according to the browser's headers.
 
     Args:
-        required: Whether to refuse requests without such headers, as programs send them.
+        required: Whether to refuse requests without such headers, which only browsers send.
 
     Raises:
-        CrossOriginError: If the request comes from elsewhere.
+        CrossOriginError: If the request comes from another origin, or lacks required headers.
     """
     origin, site = request.headers.get("origin"), request.headers.get("sec-fetch-site")
     if origin is not None and _netloc(origin) != request.headers.get("host"):
@@ -179,8 +179,8 @@ def check_origin(request: Request, *, required: bool = True) -> None:
 def _check_site(request: Request, settings: ServiceSettings) -> None:
     """Refuse requests of other sites' pages to a service that requires no key.
 
-    A page open in a browser on this machine may call the service across origins, or through a DNS name of its own that
-    resolves to this machine. Neither is allowed.
+    A malicious page that is open in a browser on this machine could call the service across origins, or through a DNS
+    name that resolves to this machine (DNS rebinding). Both are refused.
 
     Raises:
         ForeignSiteError: If the Host or Origin header is not this service's.
@@ -210,5 +210,5 @@ _ID = re.compile(r"[a-z]{3}_[0-9a-f]{8,36}")
 
 
 def is_id(text: str) -> bool:
-    """Return whether a text has the format of an id; anything else needs no query of the store."""
+    """Return whether a text has the format of an id. Other texts need no database query."""
     return _ID.fullmatch(text) is not None

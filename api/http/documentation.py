@@ -1,4 +1,4 @@
-"""Parts of the OpenAPI document that route types do not cover: headers of answers, and errors with examples.
+"""Parts of the OpenAPI document that route types do not cover: headers of responses, and errors with examples.
 
 Examples of bodies are defined with their models (`api.http.schemas`, `api.http.submission`, `service.parameters`).
 """
@@ -29,7 +29,7 @@ _TEXT: dict[str, Any] = {"type": "string"}
 _COUNT: dict[str, Any] = {"type": "integer", "minimum": 0}
 _DATE = {"type": "string", "pattern": "GMT$"}
 
-#: Headers of answers: description, schema, example.
+#: Headers of responses: description, schema, example.
 _HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
     "Accept-Ranges": ("Parts can be asked for.", {"const": "bytes"}, "bytes"),
     "Cache-Control": ("Answers belong to one key, and change.", _TEXT, "private, no-cache"),
@@ -62,7 +62,7 @@ _HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
 
 
 def headers(*names: str, maybe: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the documentation of the headers that an answer always has (`names`) or may have (`maybe`)."""
+    """Return the documentation of the headers that a response always has (`names`) or may have (`maybe`)."""
     found = {}
     for name in (*names, *maybe):
         description, schema, example = _HEADERS[name]
@@ -98,10 +98,10 @@ _WITH_KEY: tuple[ServiceError, ...] = (
 
 
 def problems(*errors: ServiceError, key: bool = True) -> Responses:
-    """Return the documentation of an operation's errors by status, with an example answer for each.
+    """Return the documentation of an operation's errors by status, with an example response for each.
 
     Args:
-        errors: One error for each `code` of this operation. The errors that every operation may raise are added.
+        errors: One error for each `code` that is specific to this operation. Errors of all operations are added.
         key: Whether the operation may require a key.
     """
     found: Responses = {}
@@ -129,14 +129,14 @@ def invalid(at: str, message: str) -> ServiceError:
 
 
 def links(*operations: str, **parameters: str) -> dict[str, Any]:
-    """Return OpenAPI links from an answer to operations that take these parameters from it."""
+    """Return OpenAPI links from a response to operations that take these parameters from it."""
     return {name: {"operationId": name, "parameters": parameters} for name in operations}
 
 
 def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> None:
     """Complete FastAPI's OpenAPI document in place.
 
-    It lacks models that no route takes as an argument, drops nulls from examples, and has its own schemas for errors.
+    FastAPI omits models that no route takes as an argument, drops nulls from examples, and has its own error schemas.
     """
     schemas = document["components"]["schemas"]
     for model in models:
@@ -146,7 +146,7 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
     for path in document["paths"].values():
         for method, operation in path.items():
             for parameter in operation.get("parameters", []):
-                # It has a default only because tus answers 412, not 422, if it is missing.
+                # The header is required. It has a default only because tus requires status 412, not 422, without it.
                 if parameter["name"] == "Tus-Resumable":
                     parameter["required"] = True
                     parameter["schema"].pop("default", None)

@@ -1,4 +1,4 @@
-"""Job events for any number of watchers; one task polls the store for all of them."""
+"""Job events for any number of watchers; one task polls the database for all of them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from service.store import Store
 from service.store.states import ENDED
 from service.store.tables import EventRow
 
-#: Seconds between polls of the store; a watcher gets an event after half of it on average.
+#: Seconds between polls of the database. On average, watchers receive an event after half of this time.
 _POLL_SECONDS = 0.3
-#: Seconds of silence before a comment is sent, so that proxies do not drop the connection as idle.
+#: Seconds without an event after which a comment is sent, so that proxies do not drop the connection as idle.
 HEARTBEAT_SECONDS = 15.0
-#: Number of events that are buffered per watched job; a watcher that is farther behind reads the store.
+#: Number of events that are buffered per watched job. A watcher that is farther behind reads the database.
 _KEPT = 300
 
 _log = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ class _Channel:
 
 
 class Hub:
-    """Poller of job events that wakes the watchers of each job."""
+    """Poller of job events that notifies the watchers of each job."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -70,7 +70,7 @@ class Hub:
             self._task.cancel()
 
     async def ended(self, job_id: str, after: int) -> bool:
-        """Return whether the job has ended and has no events after this one."""
+        """Return whether the job has ended and has no events after the one with id `after`."""
         last = (await asyncio.to_thread(self._store.jobs.last_events, [job_id])).get(job_id)
         if last is None or last > after:
             return False
@@ -78,7 +78,7 @@ class Hub:
         return bool(rows) and _to_item(rows[0]).ends
 
     async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
-        """Yield the events of a job after the given one, as text, until the job has ended."""
+        """Yield the encoded events of a job after the one with id `after`, until the job has ended."""
         channel = self._channels.get(job_id)
         if channel is None:
             channel = self._channels.setdefault(job_id, _Channel(0, 0))
@@ -157,7 +157,7 @@ def _wake_watchers(channel: _Channel) -> None:
 
 def _to_item(row: EventRow) -> Item:
     data = row.data
-    if row.kind == "progress":  # the same format as in the job itself
+    if row.kind == "progress":  # same format as in responses that show the job
         data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
     text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
     return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in ENDED)

@@ -1,4 +1,4 @@
-"""Memory budget for request bytes that have arrived but are not used yet, over all connections of a process."""
+"""Memory budget of all connections of a process, for request bytes that are received but not processed yet."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _TOTAL, _MOST, _LEAST = 8 << 20, 1 << 17, 1 << 13
 class RequestMemory:
     """Memory of one process for the heads and bodies of requests.
 
-    Each connection may hold an equal share. It covers its head, the part of its body that is not read yet, and the
-    block that is written next. JSON bodies must be complete before they can be parsed, so they may exceed the share as
-    long as all JSON bodies together stay within the total.
+    Each connection may hold an equal fraction of the total. It covers the head, the part of the body that the app has
+    not read yet, and the block that is written to disk next. A JSON body must be complete before it can be parsed. It
+    may exceed this fraction as long as all JSON bodies together stay within the total.
 
     Attributes:
         connections: Number of open connections.
@@ -32,10 +32,10 @@ class RequestMemory:
 
         Args:
             size: Number of bytes to add.
-            held: Number of bytes that this body already has.
+            held: Number of bytes of this body that were counted before.
 
         Raises:
-            BusyError: If all JSON bodies together exceed the total, and this one exceeds its share.
+            BusyError: If all JSON bodies together exceed the total, and this one exceeds the limit of one connection.
         """
         if self._json_bytes + size > _TOTAL and held + size > self.share():
             raise BusyError("Too many large requests are arriving. Try again later.", retry_after=5)

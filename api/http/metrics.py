@@ -1,4 +1,4 @@
-"""Prometheus metrics: requests of this process, and jobs from the store."""
+"""Prometheus metrics: requests of this process, and jobs from the database."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.store.states import AttemptOutcome, JobStatus
 
 
 class _Counter(NamedTuple):
-    """Help text of a counter, and its label with all its values. Each value is exported from the start, as 0."""
+    """Help text of a counter, and its label with all possible values. Values without events are exported as 0."""
 
     help: str
     label: str | None = None
@@ -70,7 +70,7 @@ class Metrics:
 
 
 class _StoreCollector(Collector):
-    """Collector of counts that outlive processes; it reads the store at each scrape."""
+    """Collector of metrics that survive restarts, because they are read from the database at each scrape."""
 
     def __init__(self, store: Store, folder: Path) -> None:
         self._store, self._folder = store, folder
@@ -117,7 +117,7 @@ class _StoreCollector(Collector):
 
 
 def _cumulative(buckets: dict[str, float], number: float) -> list[tuple[str, float]]:
-    """Return histogram buckets as Prometheus expects them: each includes those below it."""
+    """Return histogram buckets as Prometheus expects them: each count includes all lower buckets."""
     below, rows = 0.0, []
     for bound in BUCKETS:
         below += buckets.get(str(bound), 0.0)

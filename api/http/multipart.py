@@ -1,4 +1,4 @@
-"""Files of a job in one multipart request, written to disk as they arrive, in constant memory."""
+"""Receiver of multipart requests: the files of a job are written to disk as they arrive, in constant memory."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _MAX_TEXT = 1 << 16
 _TEXT_FIELDS = ("parameters", "webhook")
 #: Maximum number of headers of a part, and bytes of each. They hold the file's role and name.
 _MAX_HEADERS, _MAX_HEADER = 8, 4224
-#: Minimum bytes per second of a body, once it takes longer than the time a body may stall.
+#: Minimum rate of a body in bytes per second, averaged from its start, after the first `receive_seconds`.
 _LEAST_RATE = 1000
-#: Limits in bytes and seconds for reading and discarding the rest of a refused body. A client that is still sending
-#: would not see the answer otherwise.
+#: Limits in bytes and seconds for reading and discarding the rest of a refused body. Otherwise, a client that is still
+#: sending would not see the response.
 _DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
 
 
@@ -63,7 +63,8 @@ class Received:
 
     Attributes:
         files: `role`, `name`, `sha256`, `size` of each file.
-        uploads: Uploads that are named in place of files: index among files and uploads, role, id.
+        uploads: Index, role and id of each upload that is given instead of a file. The index counts files and uploads
+            together.
         texts: Text fields by name.
     """
 
@@ -73,7 +74,7 @@ class Received:
 
 
 async def body_parts(request: Request, settings: ServiceSettings, limit: int, advice: str) -> AsyncIterator[bytes]:
-    """Yield a body in parts as they arrive.
+    """Yield a body in chunks as they arrive.
 
     Args:
         limit: Maximum number of bytes.
@@ -81,7 +82,7 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
 
     Raises:
         MediaTypeError: If the body is compressed.
-        TooLargeError: If the body is too long. A declared length is checked before anything is read.
+        TooLargeError: If the body is too long. A declared length is checked before the body is read.
         TooSlowError: If the body stalls or arrives too slowly.
         BadRequestError: If the body is cut off.
     """
@@ -110,7 +111,7 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
 
 
 async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncIterator[bytes]:
-    """Yield a body of files in blocks. Each block costs one switch to another thread and back.
+    """Yield a body of files in large blocks, because each block costs a switch to another thread and back.
 
     Raises:
         ServiceError: Same errors as `body_parts`.
@@ -125,7 +126,7 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
                 yield full
     except (TooSlowError, BadRequestError):
         if block:
-            yield bytes(block)  # an upload keeps the bytes that have arrived
+            yield bytes(block)  # resumable uploads keep the bytes that have arrived
         raise
     if block:
         yield bytes(block)
@@ -149,11 +150,12 @@ def declared_bytes(request: Request, limit: int, advice: str = "Use uploads.") -
 async def receive(
     request: Request, blobs: Blobs, settings: ServiceSettings, receipt: Receipt, threads: OwnerThreads
 ) -> Received:
-    """Read a multipart request to its end. On return, its files are blobs that belong to the receipt.
+    """Read a multipart request to its end, and store its files as blobs, which the receipt protects from deletion.
 
     Raises:
-        QuotaError: If the owner would have too many bytes. A declared length is checked before the first byte is read.
-        ServiceError: If the request is invalid. The end of the receipt deletes what has arrived.
+        QuotaError: If the owner's quota of bytes would be exceeded. A declared length is checked before the body is
+            read.
+        ServiceError: If the request is invalid. The files that have arrived are deleted at the end of the receipt.
     """
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
@@ -193,7 +195,7 @@ async def _drain(blocks: AsyncIterator[bytes]) -> None:
 
 
 class _Form:
-    """Callbacks of the multipart parser; they route the bytes of the open part to a file or a text."""
+    """Callbacks of the multipart parser, which write the bytes of the current part to a file or a text field."""
 
     def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings, receipt: Receipt) -> None:
         self.received = Received()
@@ -245,7 +247,7 @@ class _Form:
             raise BadRequestError("The multipart body ends before its last boundary: it was cut off.")
 
     def discard(self) -> None:
-        """Delete the received bytes of the open file."""
+        """Delete the received bytes of a file that is not complete."""
         if self._file is not None:
             self._file.discard()
             self._file = None
@@ -316,7 +318,7 @@ class _Form:
 
 
 def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSettings) -> None:
-    """Check a file as far as possible without its reader; the inspection process does the rest.
+    """Check the size and header of a file; the inspection process reads the file and checks the rest.
 
     Raises:
         RefusedInputError: If the file cannot be used.
@@ -382,7 +384,7 @@ def parse_json(text: str, what: str) -> Any:
     Raises:
         RefusedInputError: If the text is not JSON.
     """
-    gc.disable()  # Otherwise garbage collections while a megabyte of lists is parsed take it from 0.04 s to 0.2 s.
+    gc.disable()  # Garbage collections would slow the parsing of a megabyte of lists from 0.04 s to 0.2 s.
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:

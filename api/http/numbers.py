@@ -12,8 +12,8 @@ def _digits(text: object) -> object:
     """Check that a text has decimal digits only, and return it.
 
     Raises:
-        ValueError: If the text has anything else: a sign, spaces, underscores, or digits of another script. `int`
-            accepts all of these, and other servers in front of this one may read them as another number.
+        ValueError: If the text contains anything else, such as a sign, spaces, underscores, or digits of another
+            script. `int` accepts all of these, but a proxy in front of the service may read them as another number.
     """
     if isinstance(text, str) and not re.fullmatch("[0-9]+", text):
         raise ValueError("Input should be decimal digits")

@@ -1,4 +1,4 @@
-"""Answers to dry runs: the plan as JSON, or progress events followed by the plan."""
+"""Responses to dry runs: the plan as JSON, or progress events followed by the plan."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from api.http.schemas import PlanView
 from service.errors import ServiceError
 
 _EVENTS = "text/event-stream"
-#: Status for the log only, as nginx has it: the client has closed the connection.
+#: Status in the log if the client has closed the connection, as in nginx. It is never sent.
 _NOBODY_LISTENS = 499
 _EVENT = {
     "type": "object",
@@ -28,7 +28,7 @@ _EVENT = {
     },
 }
 _PLANNING = {"step": 5, "total": 24, "fraction": 0.208, "eta_s": 31.5}
-#: Documentation of the answer for the OpenAPI document.
+#: Documentation of the response for the OpenAPI document.
 DRY_RUN: dict[str, Any] = {
     "model": PlanView,
     "description": "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: "
@@ -53,14 +53,15 @@ class Planning(Protocol):
 
 
 async def answer_plan(request: Request, plan: Planning, workers: int | None) -> Response:
-    """Return the plan as JSON once it is made, or immediately a stream of events if the request accepts one.
+    """Return the plan as JSON, or a stream of events if the request accepts one.
 
-    If the client closes the connection, planning stops.
+    JSON is returned when the plan is complete; a stream is returned immediately. If the client closes the connection,
+    planning stops.
     """
     if _EVENTS in request.headers.get("accept", ""):
         sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         told: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
-        # Started here so that the plan releases its resources even if nobody reads the first event.
+        # Started here rather than in `_events`, so that the plan releases its resources even if no event is read.
         task = asyncio.create_task(plan(told.put_nowait))
         task.add_done_callback(lambda _: told.put_nowait(None))
         return StreamingResponse(_events(task, told, workers), 200, sent, _EVENTS)

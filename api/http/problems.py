@@ -18,10 +18,10 @@ from sgsst_core.errors import InvalidInputError
 from sgsst_core.options import renamed_hint
 
 MEDIA_TYPE = "application/problem+json"
-#: Names of statuses that HTTPStatus lacks; 460 is the tus protocol's own.
+#: Names of statuses that HTTPStatus lacks; 460 is defined by the tus protocol.
 _TITLES = {460: "Checksum Mismatch"}
 METHODS = ("GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS")
-#: Maximum number of characters of an input that a problem document repeats.
+#: Maximum number of characters of an input that a problem document quotes.
 _SHOWN = 100
 
 _log = logging.getLogger(__name__)

@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 from service.errors import RateLimitError
 
-#: Seconds' worth of requests that may arrive at once.
+#: Capacity of the token bucket, as the number of seconds of requests at the average rate that may arrive at once.
 _BURST_SECONDS = 10.0
-#: Maximum number of remembered owners. A forgotten owner starts with a full allowance again.
+#: Maximum number of remembered owners. A forgotten owner starts again with a full bucket.
 _REMEMBERED = 10_000
 
 
@@ -29,7 +29,7 @@ class Rates:
             a_second: Requests per second that the owner may send on average; None for no limit.
 
         Raises:
-            RateLimitError: If the owner has used up its allowance.
+            RateLimitError: If the owner's bucket is empty.
         """
         if a_second is None:
             return
@@ -40,7 +40,7 @@ class Rates:
         allowed = left >= 1
         self._left[owner] = (left - 1 if allowed else left), now
         if len(self._left) > _REMEMBERED:
-            del self._left[next(iter(self._left))]  # the owner that has been silent for longest
+            del self._left[next(iter(self._left))]  # the owner with the oldest last request
         if not allowed:
             raise RateLimitError(
                 f"This key may send {a_second:g} requests a second on average. Wait, and ask less often: jobs tell of "

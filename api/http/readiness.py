@@ -1,4 +1,4 @@
-"""Health checks that answer within a second, even if a check hangs."""
+"""Health checks that return within a second, even if a check hangs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Check = Callable[[], object]
 
 
 class Readiness:
-    """Health checks, run in threads of their own that requests cannot occupy.
+    """Health checks, which run in separate threads that requests cannot occupy.
 
     A check that hangs is not started again until it has returned, so it never takes more than one thread.
 
@@ -40,7 +40,7 @@ class Readiness:
         return running
 
     def close(self) -> None:
-        """Cancel waiting checks, without waiting for those that run."""
+        """Cancel checks that have not started, without waiting for running ones."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
 

@@ -1,6 +1,6 @@
-"""Quota charges for the bytes of running requests.
+"""Quota charges for the bytes of running requests, called receipts.
 
-The owner is charged from the first byte until a job takes the files over, or until they are deleted.
+The owner is charged from the first byte until a job takes over the files, or until the files are deleted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 class Receipts:
-    """Receipts of this process. A task renews them until their requests have ended."""
+    """Receipts of this process. A background task renews each one until its request has ended."""
 
     def __init__(self, inputs: Inputs, blobs: Blobs) -> None:
         self.inputs, self.blobs = inputs, blobs
@@ -48,18 +48,19 @@ class Receipts:
             if self.active:
                 try:
                     await asyncio.to_thread(self.inputs.renew_receipts, list(self.active))
-                except DatabaseUnavailableError:  # receipts last for several renewals
+                except DatabaseUnavailableError:  # receipts survive several missed renewals
                     _log.warning("receipts could not be renewed; retrying")
 
 
 class Receipt:
-    """Charge of one request, which also protects its files from deletion.
+    """Quota charge of one request, which also protects the request's files from deletion.
 
-    At the end of the `async with` block, files that no job has taken over are deleted unless others use them.
+    At the end of the `async with` block, files that no job has taken over are deleted, unless other jobs or uploads use
+    them.
 
     Attributes:
         owner: Owner of the request.
-        id: Id in the store; None until something is charged.
+        id: Id in the database; None until something is charged.
     """
 
     def __init__(self, receipts: Receipts, owner: str, quotas: Quotas) -> None:
@@ -96,7 +97,7 @@ class Receipt:
             self.id = None
 
     def end(self) -> None:
-        """Release the charge, and delete the request's files unless others use them."""
+        """Release the charge, and delete the request's files unless other jobs or uploads use them."""
         receipt = self.id
         if receipt is not None:
             self.hand_over()

@@ -1,4 +1,4 @@
-"""Bytes of resumable uploads: appended by one request at a time, and saved as they arrive."""
+"""Receiver of resumable uploads: one request at a time appends bytes, which are saved as they arrive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.store.tables import UploadRow
 
 #: Digest algorithms of `Upload-Checksum`.
 ALGORITHMS = ("sha256", "sha1", "md5")
-#: Bytes after which an upload's state is saved; a crash loses at most these.
+#: Number of bytes after which an upload's state is saved. A crash loses at most this many bytes.
 _SAVE_BYTES = 64 << 20
 
 
@@ -34,7 +34,7 @@ async def append_body(request: Request, context: Context, row: UploadRow, wanted
                 await context.threads.run(row.owner, writer.write, block)
         except ServiceError:
             if wanted is None:
-                await context.threads.run(row.owner, writer.save)  # the received bytes are valid
+                await context.threads.run(row.owner, writer.save)  # no checksum can contradict them
             raise
         return await context.threads.run(row.owner, writer.finish)
     finally:
@@ -65,12 +65,12 @@ class _Writer:
             self.save()
 
     def save(self) -> float:
-        """Make the received bytes durable, then update the store."""
+        """Make the received bytes durable, then update the database. Return the upload's new expiry time."""
         self._saved = self._offset
         return self._part.save()
 
     def finish(self) -> float:
-        """Verify and save the bytes of the request; if the upload is complete, make it a blob."""
+        """Verify and save the bytes of the request. Store the file as a blob if the upload is complete."""
         if self._digest is not None and self._wanted is not None and self._digest.digest() != self._wanted[1]:
             self._part.discard()
             raise ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again.")

@@ -1,4 +1,4 @@
-"""Models of the API's answers."""
+"""Models of the API's responses."""
 
 from __future__ import annotations
 
@@ -388,7 +388,7 @@ def _utc_or_none(seconds: float | None) -> datetime | None:
 
 
 def job_view(job: JobRow, queue_position: int | None, preview: str | None) -> JobView:
-    """Return a job as the API shows it; `preview` is the name of its newest image."""
+    """Return a job as the API shows it; `preview` is the file name of its newest preview image."""
     return JobView(**_job_fields(job, queue_position, preview))
 
 

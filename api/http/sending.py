@@ -19,8 +19,8 @@ from api.http.documentation import Responses, headers
 from api.http.schemas import SHA256
 from service.errors import NotFoundError, ServiceError
 
-#: Size in bytes above which a file is large, and the limit of two concurrent checks of large files. Small files and
-#: other requests do not wait for them.
+#: Size in bytes above which a file counts as large, and limiter of concurrent checks of large files. It keeps checks of
+#: small files and other requests from waiting for them.
 _LARGE_BYTES, _LARGE_CHECKS = 64 << 20, anyio.CapacityLimiter(2)
 #: Maximum number of characters of a suggested file name.
 _MAX_NAME = 120
@@ -37,12 +37,12 @@ IfRange = Annotated[
 
 
 class RangeError(ServiceError):
-    """A range that the file does not have."""
+    """A requested range that starts after the end of the file."""
 
     code, status = "range-not-satisfiable", 416
 
 
-#: Headers of every answer with a file, and examples of errors.
+#: Headers of every response with a file, and examples of errors.
 _SENT = ("ETag", "Accept-Ranges", "Cache-Control", "Content-Disposition", "X-Content-Type-Options")
 JUST_REMOVED = NotFoundError("The file has just been removed.")
 NO_SUCH_RANGE = RangeError("The file has 42301 bytes.", headers={"Content-Range": "bytes */42301"})
@@ -58,8 +58,8 @@ class SentFile:
         kind: Media type.
         inline: Whether a browser may show the file inline.
         policy: Content-Security-Policy; None for none.
-        check: Check that the stored file has this content. Fast if it was checked recently.
-        read: Function that yields the bytes from one offset up to another, in pieces.
+        check: Function that checks that the stored file has this content. It is fast if the file was checked recently.
+        read: Function that yields the bytes from one offset up to another, in blocks.
     """
 
     sha256: str
@@ -108,7 +108,7 @@ async def send_file(
     Raises:
         RangeError: If the range starts after the end of the file.
         NotFoundError: If the file has just been deleted.
-        LostFileError, DamagedFileError: If the stored file does not match its row. Nothing of it is sent.
+        LostFileError, DamagedFileError: If the stored file does not match its database row. No byte of it is sent.
     """
     tag = f'"{file.sha256}"'
     sent = _headers(file, tag)
@@ -124,12 +124,12 @@ async def send_file(
         return Response(status_code=status, headers=sent, media_type=file.kind)
     await anyio.to_thread.run_sync(file.check, limiter=_LARGE_CHECKS if file.size > _LARGE_BYTES else None)
     body = file.read(start, stop)
-    first = await asyncio.to_thread(_first, body)  # an error at this point can still be answered
+    first = await asyncio.to_thread(_first, body)  # an error at this point can still be sent as a response
     return StreamingResponse(chain(first, body), status, sent, file.kind)
 
 
 def _first(body: Iterator[bytes]) -> list[bytes]:
-    """Return the first piece of a body, or nothing if it is empty."""
+    """Return a list with the first block of a body; empty if the body is empty."""
     try:
         return [piece for piece in (next(body, None),) if piece is not None]
     except FileNotFoundError as error:
@@ -152,8 +152,8 @@ def _headers(file: SentFile, tag: str) -> dict[str, str]:
 def disposition(name: str, *, inline: bool) -> str:
     """Return a Content-Disposition header with a safe file name.
 
-    `filename` has ASCII letters, digits and a few signs; other names follow in `filename*` (RFC 6266, RFC 8187).
-    Folders are removed.
+    `filename` contains only ASCII letters, digits and some punctuation. Names with other characters are also sent as
+    `filename*` (RFC 6266, RFC 8187). Folders are removed.
     """
     last = re.sub(r"[\x00-\x1f\x7f-\x9f\"*:<>?|\u202a-\u202e\u2066-\u2069]+", "_", re.split(r"[/\\]", name)[-1])
     last = last[-_MAX_NAME:].strip(" .")
@@ -165,7 +165,7 @@ def disposition(name: str, *, inline: bool) -> str:
 
 
 def _parse_range(text: str, size: int) -> tuple[int, int] | None:
-    """Return the first byte and the one after the last; None if the header is malformed or has several ranges.
+    """Return start and end (exclusive) of a byte range; None if the header is malformed or has several ranges.
 
     Raises:
         RangeError: If the range starts after the end of the file.

@@ -1,4 +1,4 @@
-"""The API's process: `python -m api.http.server [--fd N]`."""
+"""Server process of the API: `python -m api.http.server [--fd N]`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _GRACE = 10
 
 
 def main() -> None:
-    """Serve until SIGTERM, on the socket of the parent process or on the address of the settings."""
+    """Serve until SIGTERM, on a socket inherited from the parent process (`--fd`) or on the configured address."""
     if os.environ.get("SGSST_DIE_WITH_PARENT"):
         from worker.processes import die_with_parent
 
@@ -29,8 +29,8 @@ def main() -> None:
     settings = ServiceSettings()
     set_up(settings.log_format)
     keep_private(settings)
-    # A socket object has a known family. uvicorn takes a bare descriptor for a Unix socket and leaves Nagle's algorithm
-    # on, so that every answer waits 40 ms for the client's acknowledgment of its head.
+    # uvicorn gets a socket object rather than a descriptor. It would take a descriptor for a Unix socket and leave
+    # Nagle's algorithm on, so that every response waits 40 ms until the client acknowledges its head.
     listeners = [socket.socket(fileno=int(sys.argv[2]))] if sys.argv[1:2] == ["--fd"] else None
     Connection.head_seconds = settings.receive_seconds
     Connection.most = min(settings.max_connections, _affordable_connections())
@@ -56,9 +56,9 @@ def main() -> None:
 
 
 def _affordable_connections() -> int:
-    """Raise the limit of open files as far as the system allows; return how many connections it is enough for.
+    """Raise the limit of open files as far as the system allows; return the number of connections it suffices for.
 
-    A quarter is reserved for files, the database, and connections that are being refused.
+    A quarter of the limit is reserved for files, the database, and connections that are being refused.
     """
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(ValueError, OSError):  # the limit on macOS is not the one that getrlimit reports

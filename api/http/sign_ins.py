@@ -10,7 +10,7 @@ from service.errors import ServiceError
 
 #: Maximum number of failed attempts from one address, and the seconds within which they count.
 MOST_FAILURES, WITHIN_SECONDS = 10, 60.0
-#: Maximum number of remembered addresses; beyond it, the one whose last failure is oldest is forgotten.
+#: Maximum number of remembered addresses. Beyond it, the address with the oldest last failure is forgotten.
 _MOST_ADDRESSES = 10_000
 
 
@@ -23,7 +23,8 @@ class TooManyTriesError(ServiceError):
 class SignIns:
     """Counter of failed sign-ins by address, in the memory of this process.
 
-    It is not in the store: keys of 256 bits cannot be guessed, and a row for each attempt would itself be an attack.
+    Failures are not stored in the database. Keys of 256 bits cannot be guessed anyway, and attackers could fill the
+    database with rows of failed attempts.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

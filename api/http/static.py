@@ -1,8 +1,8 @@
 """Static files of `api/static`: the page at `/` and the API's documentation at `/docs`.
 
-They are read and compressed once, and served from memory. Their address, `/static/DIGEST/NAME`, has one digest over all
-files, so that browsers can cache them forever. JavaScript modules import each other by relative paths, so all of them
-are of the same version.
+The files are read and compressed once, and served from memory. Their URLs, `/static/DIGEST/NAME`, contain a digest of
+all files, so that browsers can cache them forever. JavaScript modules import each other by relative paths, so a page
+always loads modules of the same version.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from fastapi import FastAPI, Request, Response
 from service.errors import NotFoundError
 
 FOLDER = Path(__file__).parents[1] / "static"
-#: Placeholder in pages for the address of the files.
+#: Placeholder in pages for the URL prefix of the files.
 _PLACE = b"{{static}}"
 _DIGEST_LETTERS = 16
-#: Minimum bytes of a file that is compressed: a smaller one fits in one packet anyway.
+#: Minimum size in bytes of files to compress. Smaller files fit in one packet anyway.
 _LEAST_PACKED = 1000
 _TEXTS = (".css", ".html", ".js", ".json", ".map", ".md", ".svg", ".txt")
 _KINDS = {
@@ -36,7 +36,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-#: Swagger UI's style sheet has inline icons.
+#: Content-Security-Policy of `/docs`. Swagger UI's style sheet has inline icons.
 DOCS_POLICY = POLICY.replace("img-src 'self' blob:", "img-src 'self' data:")
 _PAGES = {"/": ("index.html", POLICY), "/docs": ("docs.html", DOCS_POLICY)}
 _FOR_EVER = "public, max-age=31536000, immutable"
@@ -64,9 +64,9 @@ class StaticFiles:
     """All static files.
 
     Attributes:
-        digest: Digest of all names and contents, as used in addresses.
+        digest: Digest of all names and contents, as used in URLs.
         files: Files by name below `/static/DIGEST`.
-        pages: Pages by name, with the address of the files filled in.
+        pages: Pages by name, with the URL prefix of the files filled in.
     """
 
     digest: str

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 from weakref import WeakValueDictionary
 
-#: Maximum number of simultaneous threads of one owner. They wait for the disk to make files durable.
+#: Maximum number of threads that one owner occupies at once, mostly to wait for the disk.
 _OF_AN_OWNER = 2
 
 Arguments = ParamSpec("Arguments")
@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 
 
 class OwnerThreads:
-    """Access to the threads of the event loop's executor, a few at a time for each owner."""
+    """Access to the threads of the event loop's executor, which limits how many each owner occupies at once."""
 
     def __init__(self) -> None:
         self._free: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()

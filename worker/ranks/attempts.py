@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 #: Seconds that an interrupted job has to finish its step and save a checkpoint.
 STOP_SECONDS = 10.0
-#: Seconds that the other ranks have to end after rank 0 is done.
+#: Seconds that the other ranks have to exit after rank 0 is done.
 _LAST_WORDS = 5.0
 
 
@@ -41,12 +41,12 @@ class WorkerOptions:
     """Options of running and watching ranks.
 
     Attributes:
-        rank_timeout: Seconds without an answer after which a rank counts as lost.
+        rank_timeout: Seconds without a response to a poll after which a rank counts as lost.
         checkpoint_seconds: Seconds between checkpoints.
         preview_folder: Folder of preview images on rank 0's machine; None writes no previews.
         preview_seconds: Minimum seconds between two previews.
         actor: Class of the Ray actor that runs a rank.
-        resume_required: Whether it is an error if the job is to be resumed but no checkpoint can be used.
+        resume_required: Whether resuming a job fails if no checkpoint can be used.
         workplace: Workplace for ranks on machines without a shared folder; None for this process's working folder.
     """
 
@@ -61,11 +61,11 @@ class WorkerOptions:
 
 @dataclass
 class LostAttempt:
-    """Lost attempt, as the report lists it.
+    """Lost attempt, as listed in the report.
 
     Attributes:
         ranks: Number of ranks.
-        first_step: Step at which the attempt started; None if it failed before.
+        first_step: Step at which the attempt started; None if it was lost before its first step.
         last_step: Last completed step.
         saved_step: Step of the checkpoint that the next attempt resumes from.
         reason: Reason of the loss.
@@ -118,9 +118,10 @@ def stylize_on_ranks(
     Args:
         request: Job to run.
         workers: Maximum number of ranks.
-        listener: Callbacks for the events of the job; None for none.
+        listener: Callbacks for the events of the job; None ignores all events.
         options: Options of running and watching ranks; None for the defaults.
-        cluster: Open cluster, which stays open. None opens one for this job, which requires the main thread.
+        cluster: Open cluster, which is not closed. None opens a cluster for this job, which must be done on the main
+            thread.
 
     Raises:
         SgsstError: If the job itself fails, as it would on one rank.
@@ -146,7 +147,7 @@ class _Attempts:
         self._lost: list[LostAttempt] = []
         self._relay = Relay(listener, self._tell_resumed)
         self._group = RankGroup(self._leave_out)
-        self._let_go = False  # whether GPUs were released that this Ray still counts as its own
+        self._let_go = False  # whether GPUs were released that the local Ray would still assign to ranks
         self._lost_at = time.monotonic()
 
     def run(self) -> RanksResult:
@@ -188,7 +189,7 @@ class _Attempts:
         """Start ranks and watch them until they end. Return None if they had to be killed after an interruption.
 
         Raises:
-            AttemptFailedError: If the attempt ends before the job.
+            AttemptFailedError: If the attempt ends before the job is done.
         """
         import ray
 
@@ -249,7 +250,7 @@ class _Attempts:
         )
 
     def _scene_bytes(self) -> int:
-        """Return the estimated bytes of the refined scene in memory; 0 if its file is not visible from here."""
+        """Return the estimated bytes of the refined scene in memory; 0 if this machine cannot access its file."""
         workplace, scene = self._options.workplace, self._request.source.scene
         try:
             size = workplace.scene_bytes if workplace else scene_bytes(scene.name, scene.stat().st_size)
@@ -258,7 +259,7 @@ class _Attempts:
         return int(size * self._request.settings.refine)
 
     def _resume(self) -> Resume:
-        """Return the checkpoint to resume from: the user's choice for the first attempt, then the job's own."""
+        """Return which checkpoint to resume from: the user's choice at first, then only checkpoints of this run."""
         from worker.request import Resume
 
         if not self._lost:
@@ -279,13 +280,13 @@ class _Attempts:
         others = [other for other in self._group.handles if other.place and not other.left_out]
         kept = [gpu for other in others if other.place for gpu in other.place.gpus]
         self._workers = len(kept)
-        if self._cluster.local:  # another process may use the GPU from now on, but this Ray would assign it again
+        if self._cluster.local:  # another process may use the GPU now, so the next attempt needs a new local Ray
             self._let_go = True
             os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(kept)
         self._listener.left_out(rank.place.gpus)
 
     def _tell_resumed(self) -> None:
-        """Report the first step after a loss, and record how long the recovery took."""
+        """Report that the job has resumed after a loss, and record how long the recovery took."""
         if not self._lost or self._lost[-1].seconds_to_resume:
             return
         now = time.monotonic()

@@ -1,7 +1,7 @@
 """Context manager that starts a local Ray instance or joins an existing Ray cluster.
 
-A local instance listens on loopback and requires a secret token. Its processes and files are removed when it is
-closed, and also when the process that started it is killed.
+A local instance listens on loopback and requires a secret token. Its processes are ended and its files are deleted when
+it is closed, and also when the process that started it is killed.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from worker.ranks.failure_policy import first_line
 #: Size of Ray's object store in bytes. The default is 30 % of all memory, but the store holds almost nothing here:
 #: torch.distributed exchanges tensors, and scenes are read from files.
 OBJECT_STORE_BYTES = 512 << 20
-#: Maximum length of the folder's path, so that the paths of Ray's sockets stay within the system's limit of 107 bytes.
+#: Maximum length of the path of Ray's temporary folder. It keeps the paths of Ray's sockets within the system's limit
+#: of 107 bytes.
 _LONGEST_FOLDER = 40
 #: Token of every Ray instance that this process starts. Ray reads the token only once.
 _SECRET = secrets.token_hex(32)
-#: Processes that a local Ray instance cannot lose.
+#: Ray processes without which a local instance does not work.
 _DAEMONS = ("raylet", "gcs_server")
 
 
@@ -81,7 +82,7 @@ class Cluster:
             else:
                 self._join()
         finally:
-            for number, handler in before.items():  # Ray replaces the signal handlers
+            for number, handler in before.items():  # restore the handlers that Ray has replaced
                 signal.signal(number, handler)
 
     def _join(self) -> None:
@@ -90,7 +91,7 @@ class Cluster:
         _silence_ray()
         try:
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
-        except Exception as error:  # Ray raises many types here, some of them built-in ones
+        except Exception as error:  # Ray raises errors of many types here, some of them built-in
             raise ClusterAwayError(
                 f"The Ray cluster at {self.address} cannot be reached: {first_line(error)}. Check RAY_ADDRESS, or "
                 "leave it out for workers on this machine."
@@ -103,7 +104,7 @@ class Cluster:
         # machines can reach. Ray reads the variable when it is imported.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_worker_niceness", "0")  # ranks are not background work
+        os.environ.setdefault("RAY_worker_niceness", "0")  # run ranks at normal priority
         import ray
 
         _silence_ray()
@@ -135,7 +136,7 @@ class Cluster:
         self._daemons = [process for process in started if process.name() in _DAEMONS]
 
     def alive(self) -> bool:
-        """Return whether the daemons of a local instance run. Always True for a cluster, whose state is unknown."""
+        """Return whether the daemons of a local instance run. Always True for a cluster, which is not checked."""
         return all(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in self._daemons)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Termination of ranks in any state: Ray alone cannot end a suspended process."""
+"""Termination of ranks in any state, including suspended processes, which Ray alone cannot end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def end_ranks(group: RankGroup, cluster: Cluster, workplace: Workplace | None = 
     """End all ranks of an attempt, release their resources, and delete the folders that they leave in a workplace."""
     kill([rank.place.process for rank in group.handles if rank.place and rank.place.process.home == home()])
     if cluster.alive():
-        # A rank that cannot be reached cannot be ended from here; the daemon of its node ends it.
+        # If a rank cannot be reached, the Ray daemon of its node ends it.
         with contextlib.suppress(Exception):
             _end_remote(group, workplace)
     if workplace is not None:

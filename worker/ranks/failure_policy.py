@@ -22,7 +22,7 @@ class Failure:
     """Cause of a failed attempt.
 
     Attributes:
-        kind: "job" for an error of the job itself; "loss" for ranks that died, stopped answering or failed for another
+        kind: "job" for an error of the job itself; "loss" for ranks that died, stopped responding or failed for another
             reason.
         reason: Short description without a full stop.
         error: Error that a rank raised; None if it died before it raised.
@@ -40,7 +40,7 @@ class FailedAttempt:
     Attributes:
         failure: Cause of the failure.
         last_step: Last completed step, or the step that the attempt started from.
-        progressed: Whether it completed a step or saved a checkpoint beyond those of all earlier attempts.
+        progressed: Whether the attempt completed a step or saved a checkpoint that no earlier attempt had reached.
     """
 
     failure: Failure

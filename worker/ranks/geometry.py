@@ -2,7 +2,7 @@
 
 The lowest rank of a machine reads the scene and copies its arrays to an anonymous memory file (memfd). The other ranks
 open that file through the /proc entry of the reader and map it copy-on-write: ranks share the pages, but cannot change
-each other's data. The system frees the memory with the last process that uses it, so nothing can leak.
+each other's data. The system frees the memory when the last process that uses it ends, so it cannot leak.
 
 The spherical harmonics of a large scene stay in its file, which every rank opens. The system's page cache holds them
 once for all ranks.
@@ -31,8 +31,8 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from worker.processes import home
 
-#: Bytes per Gaussian that a rank needs beside the scene and the optimizer: projection to a view (center, conic, depth,
-#: extent, sorting keys), color in the view, and gradients of both colors.
+#: Bytes per Gaussian that a rank needs in addition to the scene and the optimizer: projection to a view (center, conic,
+#: depth, extent, sorting keys), color in the view, and gradients of the view's color and of the optimized color.
 VIEW_BYTES = 96
 #: Arrays start at multiples of this many bytes, so that every dtype is aligned.
 _ALIGNMENT = 64
@@ -48,8 +48,8 @@ class _Shared:
     descriptor: int
     size: int
     layout: _Layout
-    file: SceneFile  # without its arrays
-    harmonics: tuple[Any, ...] | None  # arguments of StoredHarmonics, since other machines must not open the file
+    file: SceneFile  # with empty arrays
+    harmonics: tuple[Any, ...] | None  # arguments of StoredHarmonics, whose file must not be opened on other machines
 
 
 def read_shared_scene(
@@ -65,7 +65,7 @@ def read_shared_scene(
             lowers the size up to which spherical harmonics are loaded into memory.
 
     Returns:
-        The scene, and whether this rank read it itself. One rank of each machine does.
+        The scene, and whether this rank read the file itself. Exactly one rank of each machine does.
 
     Raises:
         SceneError: If the scene cannot be read; see `read_scene`. Every rank raises the same error.
@@ -149,7 +149,7 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
 
 
 def _check_room(path: Path, collectives: Collectives, sharing: int, growth: float) -> None:
-    """Compare the memory that the scene needs, by its header, with the free memory of each rank's machine and GPU.
+    """Check that a scene, by the size in its header, fits into the free memory of each rank's machine and GPU.
 
     Args:
         path: Scene file.
@@ -170,7 +170,8 @@ def _check_room(path: Path, collectives: Collectives, sharing: int, growth: floa
 def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
     """Return the number of Gaussians that a file declares, and their bytes in memory and on a GPU.
 
-    Memory excludes spherical harmonics that stay in the file. All values are 0 for a file that `read_scene` refuses.
+    The bytes in memory exclude spherical harmonics that stay in the file. All values are 0 for a file that `read_scene`
+    refuses.
     """
     declared = read_scene_header(path)
     if declared.form != "ply":
@@ -179,7 +180,7 @@ def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
     header = declared.ply
     if header is None or "vertex" not in header.names:
         return 0, 0, 0
-    # A header may declare any count, so it is limited by the size of the file.
+    # A wrong header may declare any count, so the file's size limits it.
     count = min(header.vertex.count, path.stat().st_size // max(header.vertex.least_row_bytes(header.text), 1))
     rest = sum(prop.name.startswith("f_rest_") for prop in header.vertex.properties)
     held = 0 if stays_in_file(header, _held_bytes(growth)) else rest

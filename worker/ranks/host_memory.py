@@ -4,12 +4,12 @@ from __future__ import annotations
 
 #: Bytes of a Gaussian of SH degree 3 in memory: 62 float32 values.
 GAUSSIAN_BYTES = 248
-#: Bytes of a Gaussian in the other file formats, by the ending of the file name: compressed PLY has 16 bytes and one
-#: byte per SH coefficient, .splat has 32 bytes, and SPZ is additionally compressed.
+#: Bytes of a Gaussian in compressed files, by the ending of the file name. Compressed PLY has 16 bytes and one byte per
+#: SH coefficient, .splat has 32 bytes, and SPZ has about 25 after entropy coding.
 _PACKED_BYTES = ((".compressed.ply", 61), (".splat", 32), (".spz", 25))
-#: Bytes that a rank needs beside the scene: libraries of CUDA and PyTorch, and pinned buffers.
+#: Bytes that a rank needs in addition to the scene: libraries of CUDA and PyTorch, and pinned buffers.
 _RANK_BYTES = 3_000_000_000
-#: Copies of the scene on a machine: the arrays that were read, and those that its ranks share.
+#: Copies of the scene on a machine while it is loaded: the arrays read from the file, and the shared memory.
 _SCENE_COPIES = 2
 
 

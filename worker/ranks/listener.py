@@ -1,4 +1,4 @@
-"""Callbacks of a job on ranks, and the relay that calls them with the news from rank 0."""
+"""Callbacks of a distributed job, and the relay that calls them with new events of rank 0."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Listener:
         left_out: Called with the GPUs that the job released because the plan does not use them, by their names in
             CUDA_VISIBLE_DEVICES on their machine.
         stored: Called with the workplace's description of each stored file, in order.
-        planning: Called with the progress of the survey of the views, a few times per second. A later attempt repeats
-            the survey if a lost one had not saved its plan.
+        planning: Called with the progress of the survey of the views, a few times per second. An attempt repeats the
+            survey if no earlier attempt has saved its plan.
     """
 
     prepared: Callable[[Prepared], None] = lambda prepared: None
@@ -46,7 +46,7 @@ class Listener:
 
 
 class Relay:
-    """Relay from rank 0 to a listener, which passes on each event once and tracks the progress of the job.
+    """Relay that passes each event of rank 0 to a listener once, and tracks the progress of the job.
 
     Args:
         listener: Callbacks of the job.
@@ -75,7 +75,7 @@ class Relay:
 
     @property
     def farthest(self) -> tuple[int, int | None]:
-        """Return the highest step and the step of the last checkpoint, which change with progress."""
+        """Return the highest step and the step of the last checkpoint. One of them changes with any progress."""
         return self.step, self.saved
 
     def begin_attempt(self) -> None:
@@ -85,7 +85,7 @@ class Relay:
         self._planned = -1
 
     def pass_on(self, status: RankStatus) -> None:
-        """Notify the listener of everything that is new in the last answer of rank 0."""
+        """Notify the listener of everything that is new in the latest status of rank 0."""
         for line in status.warnings[self._warned :]:
             self._listener.warn(line)
         self._warned = len(status.warnings)

@@ -52,7 +52,10 @@ def decode(message: Tensor) -> Any:
 
 
 def _to_json(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """Convert a value to JSON. Scalars and lists stay as they are; others become objects with one key, their kind."""
+    """Convert a value to JSON.
+
+    Scalars and lists stay as they are. Any other value becomes an object whose only key is the kind of the value.
+    """
 
     def each(values: Any) -> list[Any]:
         return [_to_json(item, tensors) for item in values]

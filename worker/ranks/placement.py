@@ -65,7 +65,7 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
     """Reserve resources for as many ranks as the cluster can run now.
 
     If the cluster has GPUs, every rank gets one, together with the host memory that it needs, on as few machines as
-    possible. Otherwise ranks are spread over the machines and share their cores.
+    possible. Otherwise ranks are spread over the machines, and the cores are divided among them.
 
     Args:
         workers: Maximum number of ranks.
@@ -85,7 +85,7 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
         groups = _places(wanted, _bundle(nodes, wanted, threads, scene), deadline)
         if groups:
             return Reservation(groups, threads, 1 if gpus else 0)
-        if threads > 1 and not gpus:  # other work may use some of the cores
+        if threads > 1 and not gpus:  # other jobs may use some of the cores
             threads = 1
         else:
             wanted -= 1
@@ -121,7 +121,7 @@ def _bundle(nodes: list[dict[str, float]], ranks: int, threads: int, scene: int)
     if not with_gpus:
         return {"CPU": threads}
     sharing = min(ranks, max(int(node["GPU"]) for node in with_gpus))  # ranks of a machine share the scene
-    # If a job needs more than any machine has, it gets all memory of the largest one and may still succeed there.
+    # A job that needs more memory than any machine has gets all of the largest machine's, and may still succeed there.
     most = max(int(node.get("memory", 0)) for node in with_gpus)
     memory = min(memory_beside_gpus(sharing, scene), most) // sharing
     return {"CPU": threads, "GPU": 1, **({"memory": memory} if memory else {})}

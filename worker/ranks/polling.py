@@ -12,14 +12,14 @@ from worker.ranks.rank_group import AttemptFailedError, RankGroup, RankHandle
 
 #: Seconds between two polls of a rank.
 POLL_SECONDS = 0.25
-#: Seconds to wait for an answer that Ray reports as ready.
+#: Seconds to wait for a response that Ray reports as ready.
 _FETCH_SECONDS = 60.0
-#: Seconds to wait for the cause to show after a rank has lost its connection to another rank.
+#: Seconds to wait for the root cause after a rank has lost its connection to another rank.
 _GRACE = 3.0
 
 
 def poll_ranks(group: RankGroup) -> None:
-    """Poll every rank, and store the answers that have arrived.
+    """Poll every rank, and store the responses that have arrived.
 
     Raises:
         AttemptFailedError: If the process of a rank has ended.
@@ -57,15 +57,15 @@ def _take_answer(group: RankGroup, rank: RankHandle, poll: Any) -> None:
 
 
 def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> None:
-    """Raise an error if a rank has failed or was lost, with the original cause.
+    """Raise an error with the root cause if a rank has failed or was lost.
 
     Args:
         group: Ranks of the attempt.
         cluster: Ray cluster that runs them.
-        rank_timeout: Seconds without an answer after which a rank counts as lost.
+        rank_timeout: Seconds without a response after which a rank counts as lost.
 
     Raises:
-        AttemptFailedError: If a rank has failed, does not answer, or Ray has ended.
+        AttemptFailedError: If a rank has failed or does not respond, or if Ray has ended.
     """
     _look_for_reasons(group, cluster)
     silent = max(group.handles, key=lambda rank: rank.silence)
@@ -95,7 +95,7 @@ def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle)
 
 
 def _look_for_reasons(group: RankGroup, cluster: Cluster) -> None:
-    """Raise an error that is not a consequence of another rank's end: the loss of Ray, or an error of a rank's own."""
+    """Raise an error if Ray has ended, or if a rank has failed for a reason other than the loss of another rank."""
     if not cluster.alive():
         raise _lost("Ray's own processes on this machine were lost")
     for rank in group.handles:

@@ -1,7 +1,7 @@
 """Collectives over torch.distributed: NCCL between GPUs, gloo between CPUs.
 
-torch.distributed does not authenticate its peers. Ranks therefore listen on one interface only, which is loopback for a
-job of one machine, and never unpickle what they receive (see `messages`).
+torch.distributed does not authenticate its peers. Ranks therefore listen on one interface only, which is loopback if
+all ranks run on one machine, and never unpickle what they receive (see `messages`).
 
 The order of a sum depends only on the number of ranks and the size of the tensors. All ranks therefore receive the
 same bits, and repeated runs are bit-identical.
@@ -36,7 +36,7 @@ T = TypeVar("T")
 DEFAULT_TIMEOUT = timedelta(seconds=120)
 #: Timeout during preparation, when one rank may read or plan for a long time while the others wait.
 PREPARING = timedelta(minutes=30)
-#: Timeout in iterations, if these are slow. Ranks never differ by that many iterations.
+#: Timeout as a number of iterations, used if it is longer than the minimum. Ranks are never that far apart.
 ITERATIONS = 5
 
 
@@ -54,7 +54,7 @@ def process_group(
 
     Args:
         rank: Rank of this process, 0 to size - 1.
-        size: Number of ranks; with 1 there is no group.
+        size: Number of ranks; for a single rank, no group is formed.
         address: Address "host:port" at which rank 0 listens.
         device: Device of this rank, which holds the tensors of all exchanges.
         timeout: Timeout of each exchange after `Collectives.set_timeout_for` was called.
@@ -86,7 +86,7 @@ def process_group(
 def _stay_on_interface(address: str) -> None:
     """Restrict gloo and NCCL to the interface that leads to rank 0's "host:port".
 
-    Operators can choose another interface by the libraries' own variables, except for a job of one machine.
+    Operators can choose another interface by the libraries' own variables, unless all ranks run on one machine.
     """
     host, _ = split_address(address)
     interface = interface_towards(host)
@@ -103,10 +103,10 @@ def _meet(
     timeout: timedelta,
     listener: socket.socket | None = None,
 ) -> tuple[torch.device, Any]:
-    """Return the device of this rank's tensors, and the ranks' store.
+    """Return the device of this rank's tensors, and the key-value store of the ranks.
 
-    The device is a GPU if every rank has one, else the CPU. Ranks exchange this before they form a group, because all
-    of them must form it for the same back ends.
+    The device is a GPU if every rank has one, else the CPU. Ranks agree on this before they form a group, because all
+    of them must form it with the same back ends.
     """
     host, port = split_address(address)
     # Without an explicit socket, the store listens on all interfaces.
@@ -128,15 +128,15 @@ def _backend(device: torch.device) -> str:
 
 
 def _named(device: torch.device) -> torch.device | None:
-    """Return the device to bind a group to, so that NCCL connects at once rather than in the first exchange.
+    """Return the device to bind a group to; None for gloo, which does not accept a device.
 
-    Return None for gloo, which does not accept a device.
+    With a bound device, NCCL connects at once rather than in the first exchange.
     """
     return device if "nccl" in _backend(device) else None
 
 
 def with_index(device: torch.device | str) -> torch.device:
-    """Return the device, a GPU with its index. Both `torch.cuda.set_device` and NCCL require the index."""
+    """Return the device, and add the current index to a GPU without one. `torch.cuda.set_device` and NCCL need it."""
     found = torch.device(device)
     if found.type == "cuda" and found.index is None:
         return torch.device("cuda", torch.cuda.current_device())
@@ -165,14 +165,14 @@ class ProcessGroupCollectives:
         self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
         self._subgroups: list[ProcessGroupCollectives] = []
         self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
-        # Statistics are exchanged while the next scale is computed: on a separate stream of a GPU, or in one thread on
-        # a CPU. More threads would be wrong, because ranks match exchanges by their order.
+        # Statistics are exchanged while the next scale is computed: on a separate stream of a GPU, or in a thread on a
+        # CPU. It must be a single thread, because exchanges are matched by their order.
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._background = ThreadPoolExecutor(1, thread_name_prefix="collectives")
         self.local_size = self.all_gather(_machine()).count(_machine())
 
     def close(self) -> None:
-        """Finish pending exchanges, and start no more."""
+        """Finish pending exchanges. No exchange may be started afterwards."""
         for subgroup in self._subgroups:
             subgroup.close()
         self._background.shutdown(cancel_futures=True)
@@ -236,9 +236,9 @@ class ProcessGroupCollectives:
     def _merge(self, parts: list[LayerStatistics], numbers: Tensor) -> tuple[list[LayerStatistics], Tensor]:
         """Merge the statistics of all ranks: first the means, then the second moments about the common mean.
 
-        C of all positions is the sum over ranks of C_r + n_r (mean_r - mean)(mean_r - mean)^T. This is the pairwise
-        update of Chan et al. (1979) for many parts at once. It adds positive semidefinite terms only, so no digits
-        cancel.
+        The second moment C of all positions is the sum over ranks r of C_r + n_r (mean_r - mean)(mean_r - mean)^T. This
+        generalizes the pairwise update of Chan et al. (1979) to many parts. All terms are positive semidefinite, so
+        there is no cancellation.
         """
         if not parts:
             return [], self.all_reduce(numbers.clone(), "statistics")
@@ -250,7 +250,7 @@ class ProcessGroupCollectives:
         for part, mean in zip(parts, means, strict=True):
             away = part.mean - mean
             moment = part.centered + torch.outer(away, away) * part.count
-            moments.append(moment[self._half(moment)])  # symmetric: one half is enough
+            moments.append(moment[self._half(moment)])  # symmetric: one triangle is enough
         halves = self.all_reduce(torch.cat(moments), "statistics").split([len(moment) for moment in moments])
         merged = [
             LayerStatistics(total[0], mean, self._symmetric(half, len(mean)))
@@ -259,7 +259,7 @@ class ProcessGroupCollectives:
         return merged, added
 
     def _half(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rows [n] and columns [n] of a symmetric matrix's upper half with its diagonal, cached."""
+        """Return the row indices [n] and column indices [n] of a matrix's upper triangle with diagonal, cached."""
         key = len(matrix), matrix.device
         if key not in self._halves:
             rows, columns = torch.triu_indices(len(matrix), len(matrix), device=matrix.device).unbind()
@@ -267,7 +267,7 @@ class ProcessGroupCollectives:
         return self._halves[key]
 
     def _symmetric(self, half: Tensor, channels: int) -> Tensor:
-        """Return the symmetric matrix [channels, channels] that has this upper half."""
+        """Return the symmetric matrix [channels, channels] that has this upper triangle."""
         matrix = half.new_empty((channels, channels))
         rows, columns = self._half(matrix)
         matrix[rows, columns] = half
@@ -322,7 +322,10 @@ class ProcessGroupCollectives:
         return own
 
     def _own_group(self, all_ranks: list[list[int]]) -> Collectives | None:
-        """Create all of these groups, as torch.distributed requires of every rank, and return the one of this rank."""
+        """Create groups, and return the one that this rank is in; None if it is in none.
+
+        Every rank must create all groups, because torch.distributed requires it.
+        """
         own: Collectives | None = None
         for ranks in all_ranks:
             members = [dist.get_global_rank(self._group, rank) for rank in ranks]
@@ -338,11 +341,11 @@ class ProcessGroupCollectives:
 
 
 def _machine() -> tuple[str, str]:
-    """Return an identifier of the machine, by which containers count as machines: each has its own memory limit."""
+    """Return an identifier of the machine. A container counts as a machine, because it has its own memory limit."""
     return socket.gethostname(), os.environ.get("HOSTNAME", "")
 
 
 def _keep_for(stream: torch.cuda.Stream, parts: Sequence[LayerStatistics], numbers: Tensor) -> None:
-    """Keep the memory of these tensors, which belong to another stream, until this stream has finished with it."""
+    """Prevent reuse of the memory of these tensors, which another stream owns, until `stream` has used them."""
     for tensor in (numbers, *(tensor for part in parts for tensor in (part.count, part.mean, part.centered))):
         tensor.record_stream(stream)

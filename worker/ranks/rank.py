@@ -1,6 +1,6 @@
 """Process of one rank: a Ray actor that runs the job in a thread and reports its status to the driver.
 
-PyTorch is imported in that thread, after the numbers of threads and the GPU are set in the environment.
+PyTorch is imported in that thread, after the environment variables for thread counts and GPUs are set.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from worker.request import Resume, StylizeRequest
     from worker.workplace import OpenWorkplace, Workplace
 
-#: Seconds that an exchange between ranks waits longer than the driver. The driver should time out first, because it
-#: knows which rank does not answer.
+#: Seconds by which the timeout of an exchange between ranks exceeds the driver's. The driver should time out first,
+#: because it knows which rank does not respond.
 _PATIENCE = 15.0
 
 
@@ -62,7 +62,7 @@ class RankTask:
         rank, size: Number of this rank, and number of ranks.
         address: Address "host:port" at which rank 0 listens.
         threads: Number of threads for computation.
-        timeout: Seconds without an answer after which a rank counts as lost.
+        timeout: Seconds without a response after which a rank counts as lost.
         folder: Base folder of relative paths on every machine; unused with a workplace.
         resume: Choice of the checkpoint to resume from.
         run_id: Identifier of this run of the program.
@@ -101,7 +101,8 @@ class Outcome:
         result: Result of the job if the rank is done.
         error: Error if the rank failed.
         trace: Text of the error's traceback.
-        echo: Whether the error occurred in an exchange between ranks, as it does when another rank is lost.
+        echo: Whether the error occurred in an exchange between ranks. The root cause may then be the loss of another
+            rank.
     """
 
     kind: Literal["done", "left-out", "failed"]
@@ -116,7 +117,7 @@ class RankStatus:
     """Status of a rank, which it returns when it is polled.
 
     Attributes:
-        planning: Progress of the survey of the views; None if there was none yet.
+        planning: Progress of the survey of the views; None before it starts.
         prepared: Summary of the prepared job; set on rank 0 only.
         progress: Progress of the last step; set on rank 0 only.
         saved: Step of the last checkpoint. With a workplace, a checkpoint counts once it is stored.
@@ -144,7 +145,7 @@ class RankProcess:
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._listener: socket.socket | None = None
-        die_with_parent()  # the parent is Ray's daemon; a suspended process would not notice that it has ended
+        die_with_parent()  # a suspended process would not notice the end of its parent, Ray's daemon
 
     def place(self) -> RankPlace:
         """Return the location of this process."""
@@ -168,12 +169,12 @@ class RankProcess:
         threading.Thread(target=self._run, args=(task,), daemon=True, name="job").start()
 
     def poll(self) -> RankStatus:
-        """Return the current status. The driver takes the answer as a sign of life."""
+        """Return the current status. Any response shows the driver that this process is alive."""
         with self._lock:
             return self._status
 
     def stop(self) -> None:
-        """Ask the job to end after the current step. Only rank 0 is asked."""
+        """Make the job end after the current step. The driver calls this on rank 0 only."""
         self._stop.set()
 
     def _update(self, **changes: Any) -> None:
@@ -214,7 +215,7 @@ class RankProcess:
         with process_group(
             task.rank, task.size, task.address, device=device, timeout=timeout, listener=self._listener
         ) as collectives:
-            # The outcome is set inside the block, because leaving the group may wait for lost ranks.
+            # The outcome is set before the process group is left, because leaving it may wait for lost ranks.
             try:
                 result = self._job(task, collectives)
                 if place is not None:
@@ -278,11 +279,11 @@ class RankProcess:
 
 
 def _set_environment(task: RankTask) -> None:
-    """Set the variables for threads and GPU before libraries are imported that read them."""
+    """Set the environment variables for thread counts and GPUs, before the libraries that read them are imported."""
     set_thread_variables(task.threads)
     import ray
 
-    # Without the variable, a process without an assigned GPU would see all of them.
+    # If the variable is not set, a process without an assigned GPU sees all GPUs.
     os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(str(number) for number in ray.get_gpu_ids())
 
 

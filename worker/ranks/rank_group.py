@@ -1,4 +1,4 @@
-"""State of an attempt's ranks in the driver: their actors, locations and last answers."""
+"""State of an attempt's ranks in the driver: their actors, locations and latest statuses."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class RankHandle:
 
     Attributes:
         actor: Ray actor of the rank.
-        group: Ray placement group that it runs in.
-        place: Location of its process; None until the rank has reported it.
-        pending_poll: Ray reference to a pending answer; None if no poll is pending.
-        polled_at, answered_at: Times of the last poll and the last answer, in monotonic seconds.
-        status: Last answer.
+        group: Ray placement group that the actor runs in.
+        place: Location of the rank's process; None until the rank has reported it.
+        pending_poll: Ray reference to the response to a pending poll; None if no poll is pending.
+        polled_at, answered_at: Times of the last poll and the last response, in monotonic seconds.
+        status: Latest status that the rank has returned.
     """
 
     actor: Any
@@ -53,7 +53,7 @@ class RankHandle:
 
     @property
     def silence(self) -> float:
-        """Return the seconds since the last answer; 0 for a rank that was left out."""
+        """Return the seconds since the last response; 0 for a rank that was left out."""
         return 0.0 if self.left_out else time.monotonic() - self.answered_at
 
 

@@ -25,7 +25,7 @@ def start_ranks(group: RankGroup, workers: int, scene: int, actor: type[RankProc
     Args:
         group: Empty group to fill. If an error is raised, it holds the ranks that were started.
         workers: Maximum number of ranks.
-        scene: Bytes of the job's scene, which machines with GPUs need as host memory.
+        scene: Bytes of the job's scene, for the host memory to reserve on machines with GPUs.
         actor: Class of the Ray actor that runs a rank.
         make_task: Function that creates the task of a rank.
 
@@ -62,9 +62,10 @@ def _from_all(group: RankGroup, method: str, arguments: list[tuple[Any, ...]] | 
 
 
 def _numbered(handles: list[RankHandle], here: str) -> list[RankHandle]:
-    """Order the ranks by number. Rank 0 writes the files, so it runs on the driver's machine if one does.
+    """Return the ranks in the order of their numbers.
 
-    Ranks of one machine get consecutive numbers.
+    Rank 0 writes the files, so it is a rank on the driver's machine if there is one. Ranks of one machine get
+    consecutive numbers.
     """
 
     def order(rank: RankHandle) -> tuple[bool, str]:

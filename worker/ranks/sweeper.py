@@ -1,7 +1,7 @@
-"""Watchdog process that cleans up after a killed process: the folder of a local Ray instance or of a rank.
+"""Watchdog process that deletes the folder of a local Ray instance or of a rank if its owner is killed.
 
-It runs beside the owner of the folder and reads from a pipe. If the pipe closes without a message, the owner was
-killed. It imports the standard library only, so that it starts quickly and needs little memory.
+The owner is the process that starts the watchdog. The watchdog reads from a pipe: if the pipe closes without a message,
+the owner was killed. It imports the standard library only, so that it starts quickly and needs little memory.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ def beside(folder: Path, *, users: bool = False) -> subprocess.Popen[bytes]:
 
     Args:
         folder: Folder to delete.
-        users: Whether to end the processes that still use the folder first.
+        users: Whether to end processes that still use the folder before it is deleted.
     """
     return subprocess.Popen(
         [sys.executable, "-I", "-S", __file__, str(folder), *(["users"] if users else [])],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C is for the owner
+        start_new_session=True,  # only the owner handles Ctrl-C
     )
 
 
@@ -43,9 +43,9 @@ def dismiss(process: subprocess.Popen[bytes]) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Wait until no other process uses a folder, kill those that still do after a moment, and delete the folder.
+    """Delete a folder once no other process uses it. Processes that use it for too long are killed.
 
-    A process uses the folder if it has a file in it open or names it in its command line.
+    A process uses the folder if it has a file of the folder open, or if its command line contains the folder's path.
     """
     started = time.monotonic()
     while users := _users(folder):

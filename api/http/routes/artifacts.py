@@ -43,7 +43,7 @@ Form = Literal["ply", "compressed.ply", "spz"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
 
-#: Media types that a browser may show inline. A page of results may run its own script, and nothing else of this site.
+#: Media types that a browser may show inline. The HTML report may run its own script, but is isolated from this site.
 _INLINE = ("image/", "text/html", "application/json", "text/plain")
 _SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
@@ -149,7 +149,7 @@ async def get_artifact(
 
 
 async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | None) -> ArtifactRow:
-    """Return the row of a published file, or of the result in another format."""
+    """Return the database row of a published file, or of the result in another format."""
     if form is not None and form != "ply":
         if name != RESULT:
             raise RefusedInputError(f"Only {RESULT} has other forms. Leave 'format' out.", "invalid-request")
@@ -161,11 +161,11 @@ async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | 
 
 
 def _check(context: Context, row: ArtifactRow) -> None:
-    """Check that a stored result matches its row.
+    """Check that a stored result matches its database row.
 
     Raises:
         LostFileError, DamagedFileError: If the file is missing or damaged.
-        NotFoundError: If another file has just taken its name, or its job was deleted.
+        NotFoundError: If the file has just been replaced by another one, or its job has been deleted.
     """
     try:
         context.artifacts.check(row.location, row.sha256)
@@ -177,6 +177,6 @@ def _check(context: Context, row: ArtifactRow) -> None:
 
 
 def _file_name(job_name: str, name: str) -> str:
-    """Return the file name for saving a result. It includes the job's name, to distinguish results of several jobs."""
+    """Return the file name to suggest for a result. It includes the job's name, so that results of jobs differ."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", job_name).strip("._")[:60]
     return f"{plain}-{PurePosixPath(name).name}" if plain else PurePosixPath(name).name

@@ -18,7 +18,7 @@ from service.errors import NotFoundError
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
-#: Schema of one event: OpenAPI 3.1 has no way to describe a stream.
+#: Schema of a single event, because OpenAPI 3.1 cannot describe a stream.
 _EVENT = {
     "type": "object",
     "required": ["id", "event", "data"],

@@ -40,7 +40,7 @@ _KINDS = {
     ".webp": "image/webp",
     ".json": "application/json",
 }
-#: Inputs are files of users: nothing in them may run.
+#: Content-Security-Policy of inputs. Users provide these files, so no script in them may run.
 _POLICY = "sandbox; default-src 'none'"
 
 _NO_JOB = NotFoundError(f"There is no job {JOB_ID}.")
@@ -116,7 +116,7 @@ async def get_input(
 
 
 def _check(context: Context, row: BlobRow) -> None:
-    """Check that a stored input matches its row.
+    """Check that a stored input matches its database row.
 
     Raises:
         LostFileError, DamagedFileError: If the file is missing or damaged.
@@ -131,7 +131,7 @@ def _check(context: Context, row: BlobRow) -> None:
 
 
 def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tuple[dict[str, Any], BlobRow]:
-    """Return the job's entry for a file, and the row of its blob.
+    """Return the job's entry for an input file, and the database row of its blob.
 
     Raises:
         NotFoundError: If the job has no such input, or has expired and released its inputs.

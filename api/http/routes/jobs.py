@@ -50,7 +50,7 @@ from service.store.tables import BlobRow, JobRow, UploadRow
 from service.weights import check_weights
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
-#: Maximum bytes of a JSON body, which only names uploads.
+#: Maximum bytes of a JSON body. Such a body contains no files, only the ids of uploads.
 _MAX_JSON = 1 << 20
 
 IdempotencyHeader = Annotated[
@@ -66,10 +66,10 @@ IdempotencyHeader = Annotated[
 
 
 JobId = Annotated[str, Path(description="Of a job.", examples=[JOB_ID])]
-#: Headers of an answer that shows a job.
+#: Headers of a response that shows a job.
 _SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
 _NOT_THERE = NotFoundError(f"There is no job {JOB_ID}.")
-#: Operations that follow on a job.
+#: Operations that a client may call next on a job.
 _FOLLOWING_OPERATIONS = (
     "get_job",
     "cancel_job",
@@ -117,7 +117,7 @@ async def create_job(
             await context.inspector.inspect("validate", caller.owner, wanted.inputs, wanted.rows, wanted.parameters)
         if not dry_run:
             return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key, receipt)
-        stack.pop_all()  # planning needs the files for longer than this function runs
+        stack.pop_all()  # keep the files, which planning needs after this function returns
 
     async def plan(show: Show) -> dict[str, Any]:
         async with receipt:
@@ -148,7 +148,7 @@ Parts = tuple[Received, JobParameters, str | None]
 
 
 def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
-    """Find the files of a job, and make all checks that need no inspection process."""
+    """Find the files of a job, and run all checks that need no inspection process."""
     received, parameters, webhook = parts
     check_weights()
     inputs, rows = _resolve_inputs(context, caller, received)
@@ -167,7 +167,7 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
 def _queue_job(
     context: Context, caller: Caller, wanted: _JobRequest, idempotency_key: str | None, receipt: Receipt
 ) -> Response:
-    """Queue a checked job, and return the answer."""
+    """Queue a checked job, and return the response."""
     parameters, webhook = wanted.parameters, wanted.webhook
     idempotency = _idempotency(idempotency_key, wanted.inputs, parameters, webhook)
     values = parameters.model_dump(mode="json", exclude_unset=True)
@@ -216,7 +216,7 @@ def _resolve_inputs(
 ) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
     """Return the entries of all files of a job, and their blobs by digest.
 
-    They are the files of the request and of earlier uploads. The store does not delete the blobs for now.
+    The files come from the request and from earlier uploads. Their blobs are protected from deletion for some time.
     """
     inputs = list(received.files)
     ids = [upload_id for _, _, upload_id in received.uploads if is_id(upload_id)]
@@ -243,7 +243,7 @@ def _resolve_inputs(
 def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
     """Return the SHA-256 of an upload, which must be complete."""
     sha256 = upload.sha256
-    if sha256 is None and upload.offset == upload.length:  # the service died before it recorded the end
+    if sha256 is None and upload.offset == upload.length:  # the service died before it recorded the upload as complete
         sha256 = context.blobs.finish_upload(upload, context.settings.upload_hours * 3600)
     if sha256 is None:
         raise RefusedInputError(
@@ -259,7 +259,8 @@ def _idempotency(
 ) -> Idempotency | None:
     if key is None:
         return None
-    told = parameters.model_dump(mode="json", exclude_defaults=True)  # unchanged if a later version adds parameters
+    # Defaults are excluded so that the digest stays the same if a later version adds parameters.
+    told = parameters.model_dump(mode="json", exclude_defaults=True)
     text = json.dumps([list(inputs), told, webhook], sort_keys=True)
     return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())
 

@@ -1,4 +1,4 @@
-"""`/livez`, `/readyz`, `/metrics`: for operators."""
+"""`/livez`, `/readyz`, `/metrics`: health and metrics for operators."""
 
 from __future__ import annotations
 

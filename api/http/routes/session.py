@@ -109,9 +109,9 @@ async def _end(request: Request, context: Context) -> None:
 
 
 def _answer(request: Request, text: str, seconds: int) -> Response:
-    """Return 204 with the cookie.
+    """Return a response with status 204 that sets the session cookie.
 
-    Behind a proxy that terminates TLS, the request itself arrives by HTTP; `Origin` has the browser's scheme.
+    The scheme comes from `Origin`: behind a proxy that terminates TLS, the request itself arrives over plain HTTP.
     """
     secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
     response = Response(status_code=204, headers={"Cache-Control": "no-store"})

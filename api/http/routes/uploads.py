@@ -65,7 +65,7 @@ _NOT_THERE = NotFoundError(f"There is no upload {UPLOAD_ID}, or it has expired."
 
 
 def check_version(tus: Tus = "") -> None:
-    """Refuse a request without the protocol's version, which tus requires of all methods but OPTIONS.
+    """Refuse a request that does not state the protocol version. tus requires it for all methods except OPTIONS.
 
     Raises:
         WrongVersionError: If the version is missing or not supported.
@@ -83,7 +83,7 @@ _SPEAKS_TUS = [Depends(check_version)]
 
 
 def _following_operations(**parameters: str) -> dict[str, Any]:
-    """Return OpenAPI links to the operations that follow on an upload."""
+    """Return OpenAPI links to the operations that a client may call next on an upload."""
     found = links("get_upload", "head_upload", "delete_upload", **parameters)
     return found | links("append_upload", **parameters, **{"Upload-Offset": "0"})
 
@@ -174,7 +174,7 @@ def create_upload(
     row = context.store.inputs.create_upload(
         caller.owner, length, name, metadata, seconds, idempotency_key, caller.quotas
     )
-    if row.sha256 is None:  # a repeated request may name an upload that is already complete
+    if row.sha256 is None:  # a repeated request may refer to an upload that is already complete
         context.blobs.begin_upload(row.id)
     sent = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
     return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")
@@ -285,7 +285,7 @@ async def append_upload(
         raise ConflictError(f"The upload is complete with {row.length} bytes.", offset=row.length)
     check_offset(row, offset)
     expires = row.expires_at
-    if row.sha256 is None and row.offset == row.length:  # the service died before it recorded the end
+    if row.sha256 is None and row.offset == row.length:  # the service died before it recorded the upload as complete
         await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
     elif row.sha256 is None:
         expires = await append_body(request, context, row, wanted)
@@ -325,7 +325,7 @@ def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
 
 
 def _file_name(metadata: str) -> str:
-    """Return the value of `filename` from the pairs `key base64, key base64`."""
+    """Return the decoded `filename` of an `Upload-Metadata` header, which has the format `key base64, key base64`."""
     for pair in metadata.split(","):
         key, _, value = pair.strip().partition(" ")
         if key in ("filename", "name"):
