@@ -20,10 +20,10 @@ _FEATURE_UNITS = 255 * 0.226
 #: w_n for `nnfm`. With content_weight 1, the nearest-neighbor and content terms are balanced as in ARF for 360-degree
 #: scenes (content weight 5e-3 in units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
 NNFM_WEIGHT = _FEATURE_UNITS**2 / 5e-3
-#: w_n for `mixed`. Within 20 to 30 steps, the color gradient of the statistics terms falls to a tenth. With this weight,
-#: the color gradient of the nearest-neighbor term then has the same norm. Four pairs of scene and painting need 1.8e8 to
-#: 1.7e9; the constant is their geometric mean. It does not depend on the scene, so that a job has the same loss wherever
-#: it runs or resumes.
+#: w_n for `mixed`. Within 20 to 30 steps, the color gradient of the statistics terms falls to a tenth. With this
+#: weight, the color gradient of the nearest-neighbor term then has the same norm. Four pairs of scene and painting need
+#: 1.8e8 to 1.7e9; the constant is their geometric mean. It does not depend on the scene, so that a job has the same
+#: loss wherever it runs or resumes.
 MIXED_WEIGHT = 5e8
 #: w_n of each loss for features in units of a 0-255 input; 0 if the loss matches no features.
 NEAREST_WEIGHTS: dict[StyleLossName, float] = {"sos": 0.0, "nnfm": NNFM_WEIGHT, "mixed": MIXED_WEIGHT}
