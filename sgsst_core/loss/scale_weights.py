@@ -65,7 +65,8 @@ def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: 
         coarsest: Maximum shorter side of the coarsest scale in pixels.
 
     Raises:
-        SettingsError: If no view has some scale with a positive weight, or a view has no such scale.
+        SettingsError: If a scale with a positive weight exists in no view, or a view has no scale with a positive
+            weight.
     """
     asked = ScaleWeights(tuple(weights))
     if not asked.values:

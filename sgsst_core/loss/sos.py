@@ -330,7 +330,7 @@ class SosLoss:
         return {scale: ScaleTarget(layers.get(scale, {}), found) for scale, found in vectors.items()}
 
     def _style_pyramid(self, picture: Tensor, view_size: Size) -> dict[int, Tensor]:
-        """Return a style image by scale, for the scales of views of a given size, on the network's device."""
+        """Return a style image at the scales that are evaluated for views of a given size, on the network's device."""
         size = style_size(_size(picture), view_size, self.style_scale)
         image = resize_area(picture, size).to(self.network.device)
         return {scale: downscale(image, scale) for scale in self.scales(*view_size)}

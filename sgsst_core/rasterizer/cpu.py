@@ -160,7 +160,7 @@ class CpuRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N], in one pass.
 
-        The results are bit-identical to `coverage`, and to a column of `color_gradient` for an image gradient of ones.
+        Bit-identical to `coverage`, and to a column of `color_gradient` for an image gradient of ones.
         """
         isects = self.intersections(camera)
         slot_weights = np.empty(len(isects.ranks), dtype=np.float32)

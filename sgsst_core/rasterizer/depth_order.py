@@ -24,7 +24,7 @@ _INSERTED = 48
 
 
 def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> NDArray[np.int32]:
-    """Sort indices by depth; equal depths stay in index order.
+    """Sort the indices of visible Gaussians by depth; equal depths stay in index order.
 
     Args:
         depths: [N] float64; positive for visible Gaussians, because the near plane is at a positive depth.
