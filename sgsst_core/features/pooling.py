@@ -1,4 +1,4 @@
-"""2x2 max pooling of ReLU outputs, and its backward pass combined with that of the ReLU.
+"""2x2 max pooling of ReLU outputs, and a backward pass through both the pooling and the ReLU.
 
 The backward pass recomputes the positions of maxima instead of storing them. On a CPU, one kernel recomputes them and
 distributes the gradient, since both need the ReLU's output. `max_pool_backward_reference` is the reference.

@@ -22,7 +22,7 @@ BLOCK_VALUES = 1 << 18
 #: Positions per span. A span is summed in the features' precision; spans are added in float64. A float32 sum over so
 #: few positions is accurate to six digits, so accuracy does not depend on the size of the tile.
 SPAN_POSITIONS = 1 << 12
-#: Values per block on a GPU, which has no such cache and prefers few launches.
+#: Values per block on a GPU, where few kernel launches matter more than cached blocks.
 _GPU_BLOCK_VALUES = 1 << 21
 #: Minimum number of positions averaged for the shift, if there are that many.
 _SHIFT_POSITIONS = 1024

@@ -120,7 +120,7 @@ def has_tf32(device: torch.device | str) -> bool:
 def convolutions(device: torch.device, *, tf32: bool = False, search: bool = False) -> Iterator[None]:
     """Set the precision of float32 convolutions on a GPU inside a `with` block.
 
-    Settings are restored afterwards. On a CPU nothing changes.
+    Settings are restored afterwards. Do nothing if the device is not a GPU.
 
     Args:
         device: Device of the convolutions.
@@ -286,7 +286,7 @@ class FeatureNetwork:
         return F.conv2d(x, step.weight, step.bias, padding=1).relu_()
 
     def _convolve_back(self, gradient: Tensor, step: _Convolution) -> Tensor:
-        """Return the gradient [1, in, h, w] of a convolution's input, given that of its output before the ReLU."""
+        """Return the gradient [1, in, h, w] of a convolution's input, given the gradient of its output before ReLU."""
         return F.conv2d(gradient, step.backward_weight, padding=1)
 
     @torch.no_grad()

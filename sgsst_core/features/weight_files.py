@@ -112,7 +112,7 @@ def is_genuine(name: str, metadata: dict[str, str]) -> bool:
 
 
 def digest_of(stream: BinaryIO) -> tuple[str, dict[str, str]]:
-    """Compute the SHA-256 of a safetensors file: of its header without the digest in it, and of its tensors.
+    """Compute the SHA-256 of a safetensors file over its tensors and its header, excluding the recorded digest.
 
     Returns:
         The digest in hexadecimal and the metadata.

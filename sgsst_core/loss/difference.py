@@ -24,7 +24,7 @@ class Difference:
 
     @staticmethod
     def of(found: Tensor, exact: Tensor) -> Difference:
-        """Compare two gradients of the same shape in float64. Non-finite values give an infinite error."""
+        """Compare two gradients of the same shape in float64. If a value is not finite, the error is infinite."""
         error, length = (found - exact).double().norm(), exact.double().norm()
         product = float((found.double() * exact.double()).sum())
         lengths = float(found.double().norm() * length)

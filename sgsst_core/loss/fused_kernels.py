@@ -1,6 +1,6 @@
 """GPU kernels for the style loss of a layer and its gradient with respect to the features.
 
-They also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import).
+The kernels also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import).
 """
 
 # Arguments are untyped: Triton compiles one version per argument type.

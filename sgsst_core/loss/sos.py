@@ -370,7 +370,7 @@ class SosLoss:
         """Compute the style vectors of weighted images [h, w, 3] at one scale.
 
         The vectors of all images are pooled; if there are too many, each image contributes in proportion to its weight.
-        They are too large to send, so every rank computes all of them.
+        The vectors are too large to send, so every rank computes all of them.
 
         Returns:
             Style vectors; None if the loss matches no features, or the images are too small to have any.

@@ -250,7 +250,7 @@ class ContentDifference:
     def of(
         features: Tensor, content: Tensor, factor: Tensor, position_weights: Tensor | None = None
     ) -> ContentDifference:
-        """Compare features with content [h, w, c] at the same positions.
+        """Compare features of the image with those of the content image at the same positions.
 
         Args:
             features: [h, w, c].

@@ -1,7 +1,7 @@
 """Collective operations between the ranks of a job; `ALONE` implements them for a single rank.
 
 Every rank calls the same methods in the same order. Results that are "identical on all ranks" are bit-identical, so all
-ranks reach the same decisions from them without another message.
+ranks reach the same decisions based on such results without further messages.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Collectives(Protocol):
         ...
 
     def leading_group(self, count: int) -> Collectives | None:
-        """Return the group of the first `count` ranks; None on other ranks."""
+        """Return the group of the first `count` ranks; return None on ranks outside the group."""
         ...
 
     def split_group(self, groups: int) -> Collectives:

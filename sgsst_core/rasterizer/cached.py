@@ -188,7 +188,7 @@ class CachedRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N].
 
-        Caches nothing.
+        Does not cache any weights.
         """
         return self.uncached.survey(camera)
 

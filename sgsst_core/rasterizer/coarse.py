@@ -167,7 +167,7 @@ class CoarseRasterizer:
         self._operators: Cache[tuple[CameraKey, int], CoarseOperator] = Cache(max_bytes)
 
     def at(self, scale: int) -> CoarseRasterizer:
-        """Return the same rasterizer at another scale; both share the cache and its budget."""
+        """Return a rasterizer of the same scene at another scale, which shares this one's cache and memory budget."""
         other = CoarseRasterizer(self._cpu, scale, at_first_use=self._at_first_use)
         other._operators = self._operators
         return other
@@ -272,7 +272,7 @@ class CoarseRasterizer:
         return image_gradient.detach().to(device=_CPU, dtype=torch.float32).contiguous()
 
     def _whole(self, pixels: Tensor, grid: _Grid, band: Rows) -> Tensor:
-        """Return the image gradient of the whole view, given that of a band; it is zero outside the band."""
+        """Return the image gradient of the whole view, given the gradient of a band. It is zero outside the band."""
         size = grid.shape(self.scale)
         if band == (0, size[0]):
             return pixels

@@ -67,7 +67,7 @@ def _blend(block, alive, value, x, y, low, high, alpha_max):
     dx = x + 0.5 - value[0]
     top = y + 0.5 - value[1]
     skew, u_scale, w_scale, log2_opacity, extent_y = value[2], value[3], value[4], value[5], value[7]
-    # np, not math: in compiled code math.ceil returns int64, which overflows for extents beyond 9e18 pixels.
+    # Use np.ceil: in compiled code, math.ceil returns int64, which overflows for extents above 9e18 pixels.
     begin = max(np.float64(low), np.ceil(-extent_y - top))
     end = min(np.float64(high), np.floor(extent_y - top) + 1.0)
     first, stop = 0, 0

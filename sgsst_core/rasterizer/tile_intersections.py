@@ -174,7 +174,7 @@ def _refusal(total: int, gaussians: int, camera: Camera, reason: str) -> TooMany
 @compiled()
 def _tile_rows(value, height):
     """Return the pixel rows (first, last) of the image within a Gaussian's extents; last < first if there are none."""
-    # np, not math: in compiled code math.ceil returns int64, which overflows for extents beyond 9e18 pixels.
+    # Use np.ceil: in compiled code, math.ceil returns int64, which overflows for extents above 9e18 pixels.
     first = max(0.0, np.ceil(value[1] - value[7] - 0.5))
     last = min(height - 1.0, np.floor(value[1] + value[7] - 0.5))
     return int(first), int(max(last, -1.0))

@@ -24,7 +24,7 @@ from sgsst_core.scene.gaussians import Scene
 def drawing_problem(name: RasterizerName, device: torch.device | str = "cuda") -> str | None:
     """Return the reason why a rasterizer cannot render on a device, as a short text; None if it can.
 
-    Takes minutes if kernels have to be compiled, by this or another process. Afterwards they are cached.
+    Takes minutes if this or another process has to compile kernels. The compiled kernels are cached.
     """
     try:
         with one_at_a_time(build_folder()):

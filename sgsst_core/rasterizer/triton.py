@@ -32,7 +32,8 @@ from sgsst_core.scene.gaussians import Scene
 #: exp(-power) = 2^-(u^2 + w^2) if u and w are scaled by this factor, as in `projection`.
 _TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
 _SUPPORT_BITS = -math.log2(ALPHA_MIN)
-#: Default budget for tile intersections in bytes; they take some 80 per visible Gaussian and 8 per Gaussian-tile pair.
+#: Default budget for tile intersections in bytes. They take about 80 bytes per visible Gaussian and 8 bytes per pair of
+#: Gaussian and tile.
 DEFAULT_INTERSECTION_BYTES = 4 << 30
 
 

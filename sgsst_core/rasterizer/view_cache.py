@@ -121,7 +121,7 @@ class ViewCache(Generic[L]):
     def _bound(self) -> int:
         """Return the current budget in bytes.
 
-        If there is a host, it is the host's budget minus the data of the host and of other caches that share it.
+        If there is a host, return the host's budget minus the data of the host and of other caches that share it.
         """
         if self._host is None:
             return self._max_bytes
