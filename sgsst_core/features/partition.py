@@ -1,8 +1,8 @@
 """SPST partition: split a scaled view into tiles that go through VGG one at a time, with exact gradients.
 
 Each tile owns the features whose cells lie in its inner rectangle. Back-propagation starts from owned features only,
-and pixel gradients are added over the overlaps, so a halo of one receptive field is enough. (The published SPST instead
-keeps the inner part of each block's pixel gradient, which needs a margin several times as wide.)
+and pixel gradients are added where tiles overlap, so a halo of one receptive field is enough. (The published SPST
+instead keeps only the inner part of each block's pixel gradient, which needs a margin several times as wide.)
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class PartitionTile:
-    """Partition tile: it owns the rectangle `inner`; `outer` is inner plus halo, clipped to the view."""
+    """Partition tile, which owns the rectangle `inner`. `outer` is `inner` plus halo, clipped to the view."""
 
     inner: Rectangle
     outer: Rectangle
@@ -48,10 +48,10 @@ class PartitionTile:
 
         Args:
             layer: Layer name, such as "relu3_1".
-            size: (height, width) of the scaled view. Cells cut off by its border do not exist.
+            size: (height, width) of the scaled view. Incomplete cells at its border do not exist.
 
         Returns:
-            The cells as a rectangle in the view's feature map, and as one in the tile's feature map.
+            Owned cells as a rectangle in the view's feature map, and as a rectangle in the tile's feature map.
         """
         stride = layer_stride(layer)
         height, width = size[0] // stride, size[1] // stride
@@ -74,7 +74,7 @@ def partition(
         height: Height of the view in pixels.
         width: Width of the view in pixels.
         tile_size: Side of the inner rectangles, a multiple of 16; None for one tile that covers the whole region.
-        halo: Pixels around the inner rectangle: a multiple of 16, at least the radius of the receptive field.
+        halo: Width in pixels of the halo: a multiple of 16, at least the radius of the receptive field.
         region: Result of `covered_region`; None for the whole view.
     """
     region = region or Rectangle(0, 0, height, width)
@@ -130,7 +130,10 @@ def _aligned(region: Rectangle, size: tuple[int, int]) -> Rectangle:
 
 
 def _spans(first: int, last: int, tile_size: int) -> list[tuple[int, int]]:
-    """Return equal spans of at most tile_size at multiples of 16; equal spans balance better than a narrow last one."""
+    """Divide the range first..last into spans of nearly equal length, at most `tile_size`, at multiples of 16.
+
+    Equal spans balance the work better than full spans with a short remainder.
+    """
     if first >= last:
         return []
     count = math.ceil((last - first) / tile_size)
@@ -141,12 +144,12 @@ def _spans(first: int, last: int, tile_size: int) -> list[tuple[int, int]]:
 def kept_tiles(areas: Sequence[int], held: float, working: float) -> list[bool]:
     """Return which tiles cache their activations between the forward and the backward pass: the largest that fit.
 
-    Cached tiles must be back-propagated first, so that their memory is free when the others are recomputed.
+    Cached tiles must be back-propagated first, so that their memory is free when other tiles are recomputed.
 
     Args:
-        areas: Pixels of the tiles that are in memory at the same time.
+        areas: Pixel counts of the tiles that share the memory budget.
         held: Number of pixels whose activations fit in the memory budget.
-        working: Additional memory of a tile during back-propagation, as a fraction of its activations.
+        working: Additional memory of a tile during back-propagation, as a fraction of the memory of its activations.
     """
     kept = [False] * len(areas)
     room = held - working * max(areas, default=0)
@@ -158,7 +161,7 @@ def kept_tiles(areas: Sequence[int], held: float, working: float) -> list[bool]:
 
 
 def computed_twice(areas: Sequence[int], kept: Sequence[bool]) -> int:
-    """Return the number of pixels in tiles that are not cached and therefore go forward twice."""
+    """Return the number of pixels in tiles that are not cached, which need a second forward pass."""
     return sum(area for area, flag in zip(areas, kept, strict=True) if not flag)
 
 
@@ -171,15 +174,16 @@ def choose_tile_size(
 ) -> int | None:
     """Return the tile size with the least work for a view under a memory budget; None if it fits as one tile.
 
-    Work is counted in pixels through the network: forward and backward over every outer rectangle, and a second forward
-    over those without cached activations. Small tiles pay for their halo; large ones leave no memory for caching.
+    Work is the number of pixels that all passes process: a forward and a backward pass over every outer rectangle, and
+    a second forward pass if its activations are not cached. Small tiles have relatively large halos; large tiles leave
+    less memory for caching.
 
     Args:
         height: Height of the view in pixels.
         width: Width of the view in pixels.
-        halo: Pixels around the inner rectangle, a multiple of 16.
+        halo: Width in pixels of the halo, a multiple of 16.
         held: Number of pixels whose activations fit in the memory budget.
-        working: Additional memory of a tile during back-propagation, as a fraction of its activations.
+        working: Additional memory of a tile during back-propagation, as a fraction of the memory of its activations.
         region: Result of `covered_region`; None for the whole view.
     """
 

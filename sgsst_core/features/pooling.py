@@ -1,7 +1,7 @@
-"""2x2 max pooling of ReLU outputs, and its backward pass combined with that of the ReLU.
+"""2x2 max pooling of ReLU outputs, and a backward pass through both the pooling and the ReLU.
 
-Positions of maxima are not stored but recomputed; on a CPU the pass that distributes the gradient does so, because it
-reads the ReLU's output anyway. `max_pool_backward_reference` is the reference.
+The backward pass recomputes the positions of maxima instead of storing them. On a CPU, one kernel recomputes them and
+distributes the gradient, since both need the ReLU's output. `max_pool_backward_reference` is the reference.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
 
     Args:
         gradient: Gradient of the maxima, [1, c, h // 2, w // 2].
-        source: ReLU output, [1, c, h, w]. The gradient goes to the first of equal maxima in each window.
+        source: ReLU output, [1, c, h, w]. If a window has several equal maxima, the first one gets the gradient.
     """
     if not _is_compiled_for(source):
         return max_pool_backward_reference(gradient, source)
@@ -86,7 +86,7 @@ def _cells(values: Tensor) -> Tensor:
 
 
 def _integers(values: Tensor) -> Any:
-    """Return a NumPy array of integers with the same bits."""
+    """Reinterpret a tensor as a NumPy array of integers with the same bits."""
     return values.view(_INTEGERS[values.element_size()]).numpy()
 
 

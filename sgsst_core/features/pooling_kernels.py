@@ -36,8 +36,8 @@ def max_pool(source, mask, out):
 def max_pool_backward(gradient, source, nothing, mask, out):
     """Write the gradient with respect to the ReLU's input to out [h, w, c].
 
-    `gradient` is that of the maxima [h // 2, w // 2, c]. It goes to the first of equal maxima, and nowhere if they are
-    not above 0. `nothing` is the type's 0; `mask` is as in `max_pool`.
+    `gradient` [h // 2, w // 2, c] is the gradient of the maxima. In each window, the first maximum gets it if it is
+    above 0; all other values get 0. `nothing` is the type's 0; `mask` is as in `max_pool`.
     """
     rows, columns, channels = gradient.shape
     height, width = out.shape[0], out.shape[1]

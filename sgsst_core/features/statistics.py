@@ -19,10 +19,10 @@ from torch import Tensor
 
 #: Values per block. Centered values stay in the CPU cache until they have been multiplied.
 BLOCK_VALUES = 1 << 18
-#: Positions that are summed in the features' precision before float64 takes over. A float32 sum over so few keeps six
-#: digits, whatever the size of the tile.
+#: Positions per span. A span is summed in the features' precision; spans are added in float64. A float32 sum over so
+#: few positions is accurate to six digits, so accuracy does not depend on the size of the tile.
 SPAN_POSITIONS = 1 << 12
-#: Values per block on a GPU, which has no such cache and prefers few launches.
+#: Values per block on a GPU, where few kernel launches matter more than cached blocks.
 _GPU_BLOCK_VALUES = 1 << 21
 #: Minimum number of positions averaged for the shift, if there are that many.
 _SHIFT_POSITIONS = 1024
@@ -76,7 +76,8 @@ class LayerStatistics:
 def merge(first: LayerStatistics, second: LayerStatistics) -> LayerStatistics:
     """Return the combined statistics of two disjoint sets of positions (Chan et al. 1979).
 
-    An empty set consists of zeros and adds nothing, so no branch, which would synchronize with the device, is needed.
+    The statistics of an empty set are zeros and add nothing. Empty sets therefore need no branch, which would
+    synchronize with the device.
     """
     count = first.count + second.count
     share = second.count / torch.where(count > 0, count, 1.0)
@@ -94,10 +95,10 @@ def merge_all(parts: Iterable[LayerStatistics]) -> LayerStatistics:
 def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
     """Compute the statistics of features [h, w, c], with optional position weights [h, w] >= 0.
 
-    Products run on centered blocks in the features' precision (float32 for half-precision features); sums over spans of
-    blocks are kept in float64. Blocks are centered at a shift, the mean of some positions. On a CPU, if the shift turns
-    out to be far from the true mean, everything is recomputed about the true mean. On a GPU the shift is the mean of
-    all positions, because this check would synchronize with the device.
+    Products of centered blocks are computed in the features' precision (float32 for half-precision features), and spans
+    of blocks are added in float64. Blocks are centered about a shift. On a CPU, the shift is the mean of some
+    positions; if it turns out to be far from the true mean, all sums are recomputed about the true mean. On a GPU, the
+    shift is the mean of all positions, because this check would synchronize with the device.
     """
     height, width, channels = features.shape
     if height * width == 0:
@@ -112,9 +113,9 @@ def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -
 
 
 def blocks_of(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Yield the row slices of features [h, w, c] that form blocks, each with a buffer [rows, w, c].
+    """Yield the slice of rows of each block of features [h, w, c], and a buffer [rows, w, c] for the block.
 
-    The buffer is float32 or float64, and all blocks share it.
+    The buffer is float32 or float64. All blocks use the same memory for it.
     """
     height, width, channels = features.shape
     on_cpu = features.device.type == "cpu"
@@ -130,7 +131,8 @@ def blocks_of(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
 def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
     """Return a shift [c] near the mean: the mean of some positions, in float32 or float64.
 
-    Only positions with weight are used, if there are any. For a constant channel the shift is exactly that constant.
+    If any of these positions has a positive weight, only positions of positive weight are used. For a constant channel,
+    the shift is exactly that constant.
     """
     height, width = features.shape[:2]
     positions = height * width
@@ -147,7 +149,7 @@ def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
 
 
 def _is_far(shift: Tensor, found: LayerStatistics) -> bool:
-    """Return whether the shift is so far from the mean that digits canceled. Synchronizes with the device."""
+    """Return whether the shift is so far from the mean that cancellation lost digits. Synchronizes with the device."""
     offset = (found.mean - shift).abs()
     rounding = torch.finfo(shift.dtype).eps * shift.abs()
     return bool(((offset > _FAR * found.std()) & (offset > _FAR * rounding)).any())
@@ -182,8 +184,8 @@ class _ShiftedSums:
         self.total = LayerStatistics.zero(channels, shift.device)
         self._first = torch.zeros_like(shift)
         self._second = shift.new_zeros((channels, channels))
-        #: Channels per strip. Each strip is multiplied with itself and all later channels; the part below the diagonal
-        #: is skipped, except within the diagonal blocks.
+        #: Channels per strip. Each strip is multiplied by itself and all later channels. Below the diagonal, products
+        #: are computed only within diagonal blocks.
         self._strip = max(32, channels // 8) if shift.device.type == "cpu" else channels
         self._positions = 0
 
@@ -194,11 +196,11 @@ class _ShiftedSums:
             first = centered.sum(dim=0)
         else:
             self.total.count.add_(position_weights.sum(dtype=torch.float64))
-            # With the square root of the weights in both factors, the product is symmetric and half of it is enough.
+            # With the square root of the weights in both factors, the product is symmetric, so half of it suffices.
             roots = position_weights.sqrt()
             centered *= roots[:, None]
             first = (centered * roots[:, None]).sum(dim=0)
-        # Pairwise summation. A product with a vector may add the positions one by one and lose two more digits.
+        # `sum` adds pairwise. A matrix-vector product may add positions one by one, which loses two more digits.
         self._first.add_(first)
         for left in range(0, centered.shape[1], self._strip):
             strip = slice(left, left + self._strip)

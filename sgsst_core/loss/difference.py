@@ -13,9 +13,10 @@ class Difference:
     """Difference between two gradients.
 
     Attributes:
-        relative_error: |found - exact| / |exact| in the Euclidean norm. If the exact gradient is 0: 0 if the other is 0
-            too, else 1.
-        cosine: Cosine of the angle between the two. If either is 0: 1 if both are, else 0.
+        relative_error: |found - exact| / |exact| in the Euclidean norm. If the exact gradient is 0, the error is 0 if
+            the found gradient is also 0, and 1 otherwise.
+        cosine: Cosine of the angle between the gradients. If one gradient is 0, the cosine is 1 if both are 0, and 0
+            otherwise.
     """
 
     relative_error: float
@@ -23,7 +24,7 @@ class Difference:
 
     @staticmethod
     def of(found: Tensor, exact: Tensor) -> Difference:
-        """Compare two gradients of the same shape in float64. Non-finite values give an infinite error."""
+        """Compare two gradients of the same shape in float64. If a value is not finite, the error is infinite."""
         error, length = (found - exact).double().norm(), exact.double().norm()
         product = float((found.double() * exact.double()).sum())
         lengths = float(found.double().norm() * length)
@@ -38,6 +39,6 @@ class Difference:
 def psnr(error: float) -> float:
     """Return the PSNR in dB for a mean squared error of values in 0..1.
 
-    Errors are at least 1e-14, the float32 resolution.
+    Errors below 1e-14, the float32 resolution, count as 1e-14.
     """
     return -10 * math.log10(max(error, 1e-14))

@@ -26,20 +26,22 @@ from sgsst_core.features.vgg import PIXELS, FeatureNetwork
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.settings import FeatureScale, Settings
 
-#: Factor of every layer except the first for `even`. Gram matrix, mean and standard deviation then contribute about
-#: equally at the start.
+#: Factor of every layer except the first, for feature scale `even`. With this factor, Gram matrix, mean and standard
+#: deviation contribute about equally to the loss at the start of a job.
 EVEN_SCALE = 8.0
-#: Factor of the first layer for `even`. Only this layer sees color as such; with the factor of the others it would
-#: contribute less than a hundredth of the loss. This value brings colors closer to the style, and the style itself is
-#: no worse (docs/quality.md).
+#: Factor of the first layer, for `even`. Only this layer responds to color directly. With `EVEN_SCALE`, it would
+#: contribute less than 1 % of the loss. The larger factor brings colors closer to the style image without degrading the
+#: match of other style features (docs/quality.md).
 EVEN_COLOR_SCALE = 16.0
-#: Factor of the pixels for `even`. Without it, colors that start out like the style's are given up for strokes. On six
-#: pairs it brought colors closer by 3 to 16 levels, at a cost of up to 0.02 in style (docs/quality.md).
+#: Factor of the pixels, for `even`. Without it, colors that initially match the style drift away in favor of brush
+#: strokes. On six pairs of scene and style, it reduces the color distance by 3 to 16 levels of 8 bits, and degrades the
+#: style measure by up to 0.02 (docs/quality.md).
 EVEN_PIXEL_SCALE = 28.0
 #: Losses that the original VGG19 logs in the first iteration of a published run (installation guide of J. Johnson's
 #: "neural-style", default images at 512 pixels), divided by that run's weights of 100 and 5. The run starts from noise
-#: that the network hardly responds to. Style layers: mean squared difference of Gram / (c h w) from a painting's.
-#: Content layer: mean squared difference of features from a photo's.
+#: to which the network hardly responds. For style layers, the loss is the mean squared difference between Gram matrices
+#: / (c h w) of the noise and of a painting. For the content layer, it is the mean squared difference between features
+#: of the noise and of a photo.
 PUBLISHED = {
     "relu1_1": 300.2129,
     "relu2_1": 7003.4956,
@@ -49,7 +51,7 @@ PUBLISHED = {
     "relu5_1": 6.568603,
 }
 _CONTENT = "relu4_2"
-#: Longer side in pixels of the images of that run.
+#: Longer side in pixels of the images in the published run.
 _SIDE = 512
 
 
@@ -64,24 +66,33 @@ def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
 
 
 def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights:
-    """Return the network as a job uses it: at its feature scale, and for luminance alone if chroma is preserved."""
+    """Return the network for a job's settings.
+
+    Its features are scaled to the feature scale, and its input is luminance if the job preserves chroma.
+    """
     scaled = at_scale(weights, settings.feature_scale)
     return replace(scaled, gray=True) if settings.preserve_colors == "luminance" else scaled
 
 
 def even_scales(weights: BackboneWeights) -> dict[str, float]:
-    """Return the layer factors for `even`. Those of features are powers of two, so scaling adds no rounding error."""
+    """Return the layer factors for feature scale `even`.
+
+    Except for `PIXELS`, factors are powers of two, so scaling adds no rounding error.
+    """
     layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
     return {**dict.fromkeys(layers, EVEN_SCALE), layers[0]: EVEN_COLOR_SCALE, PIXELS: EVEN_PIXEL_SCALE}
 
 
 def is_original(weights: BackboneWeights) -> bool:
-    """Return whether the weights are those of the original network, whose input is 0 to 255 without normalization."""
+    """Return whether the weights are those of the original network.
+
+    They are identified by their input range, 0 to 255 without normalization.
+    """
     return bool((weights.input_scale == 255).all())
 
 
 def paper_scales(weights: BackboneWeights, picture: Path = STARRY_NIGHT) -> dict[str, float]:
-    """Return the layer factors at which an image, by default The Starry Night, has the published losses.
+    """Return the layer factors with which an image, by default The Starry Night, produces the published losses.
 
     Factors are rounded to two digits, which makes no visible difference. The published run used another painting; two
     other paintings give factors within 25 % of these (docs/quality.md).
@@ -106,8 +117,8 @@ def paper_scales(weights: BackboneWeights, picture: Path = STARRY_NIGHT) -> dict
 def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> BackboneWeights:
     """Return the network with the features of some layers multiplied by a factor.
 
-    Layers without a factor take that of the layer before them. `PIXELS` has no layer before it; it is compared only if
-    it has a factor.
+    A layer without a factor uses the factor of the preceding layer. `PIXELS` has no preceding layer, and is compared
+    only if it has a factor of its own.
     """
     convolutions: dict[str, tuple[Tensor, Tensor]] = {}
     before = 1.0

@@ -1,6 +1,6 @@
 """GPU kernels for the style loss of a layer and its gradient with respect to the features.
 
-They also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import).
+The kernels also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import).
 """
 
 # Arguments are untyped: Triton compiles one version per argument type.
@@ -20,7 +20,9 @@ def compare(
     GRAM: tl.constexpr, MEAN: tl.constexpr, STD: tl.constexpr, EPS: tl.constexpr, CHANNELS: tl.constexpr,
     ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Compute `terms.style_loss` in float64, for ROWS channels per program against all channels (at most COLUMNS).
+    """Compute `terms.style_loss` in float64.
+
+    Each program computes ROWS rows of the Gram matrix. COLUMNS must be at least CHANNELS.
 
     Args:
         count, mean, centered: Statistics of the view.
@@ -49,7 +51,7 @@ def compare(
     line = (4 * weight / (CHANNELS * CHANNELS)) * gram_error
     drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * share
     line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
-    # Features are centered about the float32 mean. Its rounding error goes into the offset.
+    # `add_style_gradient` centers features about the float32 mean; the offset compensates for its rounding error.
     drawn += tl.sum(line * (means.to(tl.float32).to(tl.float64) - means)[None, :], 1) * share
     tl.store(matrix + entry, (line * share).to(tl.float32), mask=both)
     tl.store(own_mean + i, own.to(tl.float32), mask=row)

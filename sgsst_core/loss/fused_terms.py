@@ -17,7 +17,7 @@ from sgsst_core.features.fused_statistics import (
 )
 from sgsst_core.features.statistics import LayerStatistics
 
-#: Positions per program of the gradient kernel, and channels per step. Larger values spill registers.
+#: Positions per program of the gradient kernel, and channels per step. Larger values would cause register spilling.
 POSITIONS, STEP = 64, 32
 
 

@@ -1,7 +1,7 @@
-"""CUDA graphs of the loss of a view: some 400 small kernels in one launch.
+"""CUDA graphs of the loss of a view, which combine about 400 small kernels in one launch.
 
-On small views, launching kernels one by one keeps the GPU waiting. A graph replays all of them on fixed memory
-addresses, so whatever differs between views is first copied to these addresses.
+For small views, the GPU would be idle between separate kernel launches. A graph replays all kernels on fixed memory
+addresses, so inputs that differ between views are first copied to these addresses.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from sgsst_core.loss.terms import TERMS
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.timing import Timer
 
-#: Maximum number of cached graphs. Each takes about a megabyte in addition to the memory that all of them share.
+#: Maximum number of cached graphs. Each takes about 1 MB, in addition to the memory pool that all graphs share.
 MOST_GRAPHS = 256
-#: Visits that are no faster: one warms up the kernels, and one is captured.
+#: Number of visits of a view before a graph speeds it up: the first visit warms up the kernels, the second is captured.
 FIRST_VISITS = 2
 
 
@@ -33,18 +33,19 @@ def has_graphs(device: torch.device | str) -> bool:
 def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
     """Return whether the loss of a view can be captured as a graph.
 
-    A graph reserves memory for its activations, so the same work without a graph must still fit in addition.
+    A graph reserves memory for its activations. The memory budget must have space for these and for the activations of
+    an evaluation in eager mode.
 
     Args:
         tiling: Partitioning rules of the loss.
-        areas: Pixels of the only partition tile of each scale.
+        areas: Pixel count of the single partition tile of each scale.
     """
     return tiling.keep_activations and 2 * max(areas, default=0) * (1 + tiling.working) <= tiling.held
 
 
 @dataclass(frozen=True)
 class _Key:
-    """Properties that all replays of a graph have in common, apart from the style targets themselves."""
+    """Cache key of a graph: all properties that must match for a replay. `style` is the `id` of the style targets."""
 
     size: tuple[int, ...]
     dtype: torch.dtype
@@ -61,8 +62,8 @@ class _Graph:
 
     Attributes:
         graph: The `torch.cuda.CUDAGraph`.
-        image, view: Inputs.
-        result: Output.
+        image, view: Static inputs; values are copied to them before a replay.
+        result: Output; a replay overwrites its tensors.
     """
 
     graph: Any
@@ -71,7 +72,7 @@ class _Graph:
     result: SosResult
 
     def replay(self, image: Tensor, view: ViewTarget) -> SosResult:
-        """Evaluate another image and view with the same key."""
+        """Evaluate an image and view whose key matches that of the graph."""
         scales = self.result.scales
         for place, value in zip(_inputs(self.image, self.view, scales), _inputs(image, view, scales), strict=True):
             place.copy_(value)
@@ -80,18 +81,18 @@ class _Graph:
 
 
 class LossGraphs:
-    """Evaluator of the SOS loss that replays CUDA graphs where it can, and otherwise calls `SosLoss.evaluate`.
+    """Evaluator of the SOS loss that replays CUDA graphs where possible, and otherwise calls `SosLoss.evaluate`.
 
     The first evaluation with a given key (size, scales, tiles, style) runs in eager mode, which compiles kernels and
-    lets cuDNN benchmark its algorithms. The second one is captured. If capturing fails, all evaluations fall back to
-    eager mode.
+    lets cuDNN benchmark its algorithms. The second evaluation is captured as a graph. If capturing fails, this and all
+    later evaluations run in eager mode.
 
     Args:
-        loss: Loss on one rank, on a device with `has_graphs`.
+        loss: Loss of a single rank, on a device that supports CUDA graphs (`has_graphs`).
         most: Maximum number of cached graphs.
 
     Attributes:
-        problem: Reason why capturing failed; None if it has not.
+        problem: Reason why capturing failed; None if it has not failed.
     """
 
     def __init__(self, loss: SosLoss, most: int = MOST_GRAPHS) -> None:
@@ -100,7 +101,7 @@ class LossGraphs:
         self.loss = loss
         self.problem: str | None = None
         self._most = most
-        #: Style targets by key. A key contains the targets' id; holding them here keeps the id from being reused.
+        #: Style targets by key. A key contains their `id`, which Python could reuse if they were not referenced here.
         self._visited: dict[_Key, Mapping[int, ScaleTarget]] = {}
         self._graphs: dict[_Key, _Graph] = {}
         self._static: dict[tuple[object, ...], Tensor] = {}
@@ -123,7 +124,7 @@ class LossGraphs:
     ) -> SosResult:
         """Evaluate the loss and its gradient, as `SosLoss.evaluate` does.
 
-        The image gradient is valid until the next evaluation. `style` must never be changed in place.
+        The next evaluation overwrites the image gradient of the result. `style` must never be changed in place.
         """
         key = self._key(image, style, view, scales, image_scale)
         graph = self._graphs.get(key) if key else None
@@ -145,7 +146,7 @@ class LossGraphs:
         scales: Sequence[int],
         image_scale: int,
     ) -> _Key | None:
-        """Return the key of an evaluation; None if it cannot be captured."""
+        """Return the graph key of an evaluation; None if the evaluation cannot be captured."""
         share = view.share
         if share is None or share.tiles.keys() != set(scales) or any(len(own) != 1 for own in share.tiles.values()):
             return None
@@ -159,7 +160,7 @@ class LossGraphs:
         return _Key(tuple(image.shape), image.dtype, image_scale, tiles, coverage, regions, id(style))
 
     def _captured(self, key: _Key, image: Tensor, style: Mapping[int, ScaleTarget], view: ViewTarget) -> _Graph | None:
-        """Return the graph for a key; None if capturing fails."""
+        """Capture, cache and return the graph for a key; return None if capturing fails."""
         try:
             found = self._graphs[key] = self._capture(key, image, style, view)
         except Exception as error:  # any failure falls back to eager mode
@@ -195,7 +196,7 @@ class LossGraphs:
         return _Graph(graph, own_image, own_view, SosResult(found.scales, values, gradient, found.weights))
 
     def _places(self, key: _Key, image: Tensor, view: ViewTarget) -> tuple[Tensor, ViewTarget]:
-        """Return the static tensors for an image and for the targets of its view."""
+        """Return static tensors in the formats of an image and of its view's targets; their values are not set."""
         content = {
             scale: {tile: self._place(("content", scale), view.content[scale][tile])}
             for scale, tile in key.tiles
@@ -210,7 +211,7 @@ class LossGraphs:
         return self._place("image", image), ViewTarget(None, content, coverage, Share({}, tiles), regions)
 
     def _place(self, name: object, like: Tensor) -> Tensor:
-        """Return a tensor at a fixed address. Graphs share it for the same purpose, shape and layout."""
+        """Return a tensor at a fixed address. Graphs share it if its name, shape, layout and dtype are the same."""
         key = (name, like.shape, like.stride(), like.dtype)
         if key not in self._static:
             self._static[key] = torch.empty_like(like, device=self.loss.network.device)
@@ -218,7 +219,7 @@ class LossGraphs:
 
 
 def _inputs(image: Tensor, view: ViewTarget, scales: Sequence[int]) -> list[Tensor]:
-    """Return all tensors that differ between evaluations with the same key, in a fixed order."""
+    """Return all input tensors whose values may differ between evaluations with the same key, in a fixed order."""
     features = [part for scale in scales if scale in view.content for part in view.content[scale].values()]
     regions = [level for pyramid in view.regions or [] for level in pyramid]
     return [image, *features, *(view.coverage or []), *regions]

@@ -1,11 +1,11 @@
 """Style mixtures: several weighted style images used as one style.
 
-The targets of a mixture are the moments of the features of all images together, each image weighted by its share:
+The targets of a mixture are the moments of the features of all its images, with weights w_i:
 
     G = sum_i w_i G_i,  mu = sum_i w_i mu_i,  sigma^2 = sum_i w_i (sigma_i^2 + (mu_i - mu)^2),  sum_i w_i = 1
 
-The variance is a sum of non-negative terms, so nothing cancels, as it would in diag(G) - mu^2. The mixture of a single
-image is bit-identical to the image.
+The variance is a sum of non-negative terms, which avoids the cancellation in diag(G) - mu^2. The targets of a mixture
+of one image are bit-identical to those of the image.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class StyleMixture:
         return StyleMixture(tuple(pictures), normalized(weights), tuple(names))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> StyleMixture:
-        """Apply a function to every image. Return `self` if no image changes."""
+        """Return the mixture with a function applied to every image, or `self` if no image changes."""
         pictures = tuple(change(picture) for picture in self.pictures)
         if all(new is old for new, old in zip(pictures, self.pictures, strict=True)):
             return self
@@ -86,7 +86,10 @@ def normalized(weights: Sequence[float]) -> tuple[float, ...]:
 
 
 def mixed_target(targets: Sequence[LayerTarget], weights: Sequence[float]) -> LayerTarget:
-    """Combine the layer targets of several images into that of their mixture. Weights may have any positive sum."""
+    """Combine the layer targets of several images into the target of their mixture.
+
+    The weights need not add up to 1.
+    """
     if len(targets) == 1:
         return targets[0]
     total = math.fsum(weights)
@@ -119,8 +122,8 @@ def mixed_moments(moments: Sequence[tuple[Tensor, Tensor]], weights: Sequence[fl
 def shares_of(counts: Sequence[int], weights: Sequence[float], most: int) -> list[int]:
     """Return how many positions to take from each image.
 
-    All are taken if they number at most `most`, otherwise a fraction by weight. At least one is taken from every image
-    that has any.
+    If there are at most `most` positions in total, all are taken. Otherwise each image contributes in proportion to its
+    weight, but at least one position if it has any.
     """
     if sum(counts) <= most:
         return list(counts)

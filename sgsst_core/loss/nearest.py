@@ -2,13 +2,14 @@
 
 E_nearest = w_n / n sum_p a_p (1 - max_k u_p . s_k)
 
-u_p: unit vector of the concatenated features of all layers of the third block at position p; s_k: the same for the
-style; a_p: position weights; n: their sum. The gradient treats the nearest style vector k(p) as constant:
+u_p: unit vector of the concatenated features of all layers of the third block at position p of the view; s_k: unit
+vector at position k of the style; a_p: position weights; n: their sum. The gradient treats the index k(p) of the
+nearest style vector as constant:
 
 dE/dF_p = -(w_n / n) a_p (s_k(p) - cos_p u_p) / |F_p|
 
-The term is a sum over positions, so partition tiles are independent and ranks add up their results. The search is a
-blocked matrix product. As in ARF, features are not centered.
+The term is a sum over positions, so partition tiles are independent, and the results of ranks are added. The search is
+a blocked matrix product. As in ARF, features are not centered.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from torch import Tensor
 
 from sgsst_core.features.partition import Rectangle
 
-#: Maximum number of style vectors that are searched. Styles larger than 360 x 360 pixels have more and are subsampled
-#: evenly: neighboring vectors see nearly the same pixels, and a larger search would take longer than the passes of the
-#: network.
+#: Maximum number of style vectors to search. Style images larger than 360 x 360 pixels have more vectors, and are
+#: subsampled evenly. Little is lost, because the receptive fields of neighboring vectors overlap almost completely. A
+#: larger search would take longer than the forward and backward passes of the network.
 MOST_VECTORS = 1 << 13
-#: Positions and style vectors per block of the search. Their similarities fit in a CPU cache; on a GPU they take a
-#: quarter of a gigabyte.
+#: Number of positions and number of style vectors per block of the search, by device. The similarities of a block fit
+#: in the CPU cache; on a GPU, they take a quarter of a gigabyte.
 _BLOCK = {"cpu": (1 << 10, 1 << 10), "cuda": (1 << 13, 1 << 13)}
 #: Bytes stored per matched position.
 MATCH_BYTES = 8 + 4 + 4
@@ -36,12 +37,12 @@ _GOLDEN = 0.6180339887498949
 
 @dataclass(frozen=True)
 class StyleVectors:
-    """Style vectors that positions of a view are matched with.
+    """Style vectors to match with the positions of a view.
 
     Attributes:
         units: Unit vectors [k, c], float32 or float64; 0 where the style's features are 0.
         parts: Slice of the c channels for each layer, in layer order.
-        length: Scalar, largest norm before normalization.
+        length: Scalar, largest norm of a vector before normalization.
     """
 
     units: Tensor
@@ -64,9 +65,9 @@ class StyleVectors:
 def chosen_places(count: int, most: int = MOST_VECTORS) -> Tensor:
     """Return at most `most` of `count` indices, evenly spread, int64 in ascending order.
 
-    All are returned if there are no more. Otherwise the range is divided into `most` equal parts, and one index is
-    taken from each, at an offset that varies. With a constant offset, a style with a regular pattern, such as stripes,
-    would be sampled at the same phase throughout. An index may appear twice.
+    If `count` is at most `most`, all indices are returned. Otherwise the range is divided into `most` equal intervals,
+    and one index is taken from each, at a varying offset. With a constant offset, a style with a regular pattern, such
+    as stripes, would be sampled at the same phase everywhere. An index may appear twice.
     """
     if count <= most:
         return torch.arange(count)
@@ -87,12 +88,12 @@ def places_in(places: Tensor, width: int, cells: Rectangle) -> tuple[Tensor, Ten
 
 @dataclass(frozen=True)
 class Matches:
-    """Positions [h, w] of a view and their nearest style vectors.
+    """Nearest style vectors of the positions [h, w] of a view.
 
     Attributes:
         nearest: Index of the nearest style vector, int64; the first one if several are equally near.
-        cosine: Cosine of the angle between the two; 0 where the features of the position are 0.
-        inverse: 1 / |F_p|; 0 where |F_p| is within the rounding error of the features, which avoids dividing by it.
+        cosine: Cosine of the angle between features and nearest style vector; 0 where the features are 0.
+        inverse: 1 / |F_p|; 0 where |F_p| is within the rounding error of the features, to avoid dividing by that error.
     """
 
     nearest: Tensor
@@ -103,13 +104,13 @@ class Matches:
     def of(
         features: Mapping[str, Tensor], style: StyleVectors, rounding: float, position_weights: Tensor | None = None
     ) -> Matches:
-        """Match features with the style.
+        """Find the nearest style vector of every position.
 
         Args:
             features: Features [h, w, c_l] by layer.
             style: Style vectors to search.
             rounding: Relative rounding error of the features (`FeatureNetwork.rounding`).
-            position_weights: [h, w]; positions of weight 0 are not searched on a CPU. None for equal weights.
+            position_weights: [h, w]; None for equal weights. On a CPU, positions of weight 0 are skipped.
         """
         height, width = next(iter(features.values())).shape[:2]
         units = style.units
@@ -146,13 +147,13 @@ class Matches:
         factor: Tensor,
         position_weights: Tensor | None = None,
     ) -> None:
-        """Add factor times the gradient of `distance` with respect to the features of a layer, in place.
+        """Add `factor` times the gradient of `distance` with respect to the features of a layer to `gradient` in place.
 
         Args:
             gradient: [h, w, c_l].
-            features: Features that were matched, [h, w, c_l].
-            layer: Name of their layer.
-            style: Style vectors that were searched.
+            features: Features of the layer that were passed to `of`, [h, w, c_l].
+            layer: Name of the layer.
+            style: Style vectors that were passed to `of`.
             factor: Scalar.
             position_weights: [h, w]; None for equal weights.
         """
@@ -171,7 +172,7 @@ class Matches:
 def search(units: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
     """Find the style vector [k, c] with the largest dot product for each unit vector [p, c].
 
-    Products are computed in blocks; the full p x k matrix never exists.
+    Products are computed in blocks, so the full p x k matrix is never stored.
 
     Returns:
         Largest product [p], and the first index that attains it [p] int64.
@@ -190,7 +191,7 @@ def search(units: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def working_bytes(channels: int, value: int, device: str) -> int:
-    """Return the peak memory of the search in bytes, not counting features and style vectors.
+    """Return the peak memory of the search in bytes, excluding features and style vectors.
 
     Args:
         channels: Length of a style vector.
@@ -204,11 +205,11 @@ def working_bytes(channels: int, value: int, device: str) -> int:
 def nearest_reference(features: Sequence[Tensor], style: Sequence[Tensor], weights: Tensor | None = None) -> Tensor:
     """Compute the mean distance to the nearest style vector from its definition.
 
-    Float64, unblocked and differentiable.
+    The computation is in float64, unblocked and differentiable.
 
     Args:
-        features: Features of each layer, [h, w, c_l].
-        style: Style features of each layer, [h', w', c_l]. No vector of either may be 0.
+        features: Features of each layer, [h, w, c_l]. The feature vector of a position must not be 0.
+        style: Style features of each layer, [h', w', c_l]. The feature vector of a position must not be 0.
         weights: [h, w]; None for equal weights.
     """
     own, other = (torch.cat([part.double() for part in parts], dim=2).flatten(0, 1) for parts in (features, style))

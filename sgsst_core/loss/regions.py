@@ -1,10 +1,10 @@
 """Regions of a scene, each with its own style or frozen.
 
-Every Gaussian belongs to one region; those without a selection form the rest. The loss of a view is the sum of the SOS
-losses of its regions, each with its own style. Within a region, a position weighs as much as the region's fraction of
-the blend weights there. Blending is linear in the colors, so this fraction is a rendering with color 1 for the region's
-Gaussians and 0 for all others. The statistics of a region contain nothing of another, except where receptive fields
-reach across the border.
+Every Gaussian belongs to exactly one region; Gaussians that no region selects form the rest. The loss of a view is the
+sum of the SOS losses of its regions, each with its own style. In the loss of a region, the weight of a position is the
+region's fraction of the blend weights there. Blending is linear in the colors, so this fraction is a rendering with
+color 1 for the region's Gaussians and 0 for all others. Other regions affect the statistics of a region only where
+receptive fields extend across the border.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class Region:
 
     Attributes:
         name: Display name.
-        select: Selection as text; empty for the rest.
+        select: Text of the selection; empty for the rest.
         style: Style of the region; None for the style of the job.
-        weight: Weight of its style in the loss, above 0.
-        freeze: Whether its Gaussians keep their colors.
-        selected: Number of Gaussians in its own selection, some of which later regions may have taken.
+        weight: Weight of the region's style loss, above 0.
+        freeze: Whether the colors of the region's Gaussians are frozen.
+        selected: Number of Gaussians that the selection matches. Later regions may have taken over some of them.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Regions:
     """All regions of a scene.
 
     Attributes:
-        every: The rest, followed by the other regions in the order given.
+        every: All regions: the rest, followed by the others in the order given by the user.
         labels: [N] uint8, index in `every` of each Gaussian's region.
         active: Indices of regions with a loss of their own; set by `resolved`.
         frozen_in_view: Whether some view sees frozen Gaussians; set by `resolved`.
@@ -66,25 +66,27 @@ class Regions:
     def mapped(self) -> bool:
         """Whether views need a weight map per active region.
 
-        A single region that covers everything is an ordinary job.
+        A job with a single active region of weight 1 and no visible frozen Gaussians needs none.
         """
         return len(self.active) > 1 or self.frozen_in_view or self.every[self.active[0]].weight != 1
 
     def members(self, place: int) -> Tensor:
-        """Return the mask [N] bool of the Gaussians in the region at an index."""
+        """Return the mask [N] bool of the Gaussians in the region with index `place`."""
         return self.labels == place
 
     def refined(self, refinement: Refinement | None) -> Regions:
-        """Return the regions after refinement: the parts of a split Gaussian stay in its region."""
+        """Return the regions after refinement: split Gaussians inherit the region of their parent."""
         if refinement is None:
             return self
         return replace(self, labels=self.labels[parents_of(refinement.pieces)])
 
     def resolved(self, weights: Tensor) -> Regions:
-        """Move the Gaussians of unseen regions to the rest, unless they are frozen.
+        """Return the regions with `active` and `frozen_in_view` set.
+
+        If no view sees a region, its Gaussians move to the rest, unless they are frozen.
 
         Args:
-            weights: [N] float64, total blend weights.
+            weights: [N] float64, blend weight of each Gaussian, summed over all views.
 
         Raises:
             SettingsError: If every Gaussian that a view sees is frozen.
@@ -105,7 +107,7 @@ class Regions:
 
 
 def check_regions(regions: Regions, sh_attenuation: float = 0.0) -> None:
-    """Check that there is something to stylize, as far as this is known without looking at the views.
+    """Check that the regions leave something to stylize, without rendering any view.
 
     Args:
         regions: Regions of the scene.

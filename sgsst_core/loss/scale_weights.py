@@ -1,6 +1,6 @@
 """Weights of the pyramid's scales: E = sum_s w_s E_transfer(s) / sum_s w_s over the scales of a view.
 
-By default all weights are equal, which is the paper's mean. A scale of weight 0 is not computed at all.
+By default all weights are equal, so E is the mean over scales, as in the paper. Scales of weight 0 are not computed.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ class ScaleWeights:
     """Weights of the scales of a pyramid.
 
     Attributes:
-        values: Weights from full size downwards, finite and non-negative; further scales have weight 0. Empty for equal
-            weights.
+        values: Weights from the finest scale (full size) to coarser ones, finite and non-negative. Scales beyond the
+            last value have weight 0. Empty for equal weights.
     """
 
     values: tuple[float, ...] = ()
@@ -47,7 +47,7 @@ class ScaleWeights:
         return {scale: weight / total for scale, weight in weights.items()}
 
     def mean(self, losses: Mapping[int, float]) -> float:
-        """Return E, the weighted mean of losses by scale. Only scales with a positive weight may be passed."""
+        """Return E, the weighted mean of losses by scale. Every scale in `losses` must have a positive weight."""
         total = sum(self.of(scale) for scale in losses)
         return sum(self.of(scale) * loss for scale, loss in losses.items()) / total
 
@@ -57,15 +57,16 @@ EVEN = ScaleWeights()
 
 
 def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: int) -> None:
-    """Check that the views have all requested scales, and that every view has at least one of them.
+    """Check that every scale with a positive weight exists, and that every view has at least one such scale.
 
     Args:
-        weights: Weights from full size downwards, at least one of them positive.
+        weights: Weights from the finest scale to coarser ones, at least one of them positive; empty for equal weights.
         cameras: Cameras at the sizes used for stylization.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
 
     Raises:
-        SettingsError: If a requested scale does not exist, or a view has none of them.
+        SettingsError: If a scale with a positive weight exists in no view, or a view has no scale with a positive
+            weight.
     """
     asked = ScaleWeights(tuple(weights))
     if not asked.values:

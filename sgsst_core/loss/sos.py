@@ -64,9 +64,10 @@ class ScaleTarget:
     """Style target of one scale.
 
     Attributes:
-        layers: Statistics by layer, for layers that are compared and have at least one cell at this scale.
-        vectors: Vectors that positions are matched with; None if nothing is matched.
-        regions: Targets of the scene's regions, which replace both of the above; empty if the scene has no regions.
+        layers: Statistics by layer, for compared layers with at least one cell at this scale.
+        vectors: Style vectors for nearest-neighbor matching; None if the loss matches no features.
+        regions: Targets of the scene's regions, which replace `layers` and `vectors`; empty if the scene has no
+            regions.
     """
 
     layers: Mapping[str, LayerTarget]
@@ -117,10 +118,10 @@ class SosResult:
 
 @dataclass(frozen=True)
 class Share:
-    """Distribution of some scales of a view over the ranks.
+    """Division of the work on some scales of a view among ranks.
 
     Attributes:
-        pieces: Pieces of every rank by scale; identical on all ranks.
+        pieces: For each scale, the pieces of every rank; identical on all ranks.
         tiles: Partition tiles of this rank by scale.
     """
 
@@ -141,12 +142,13 @@ class ViewTarget:
     """Targets of a view, apart from the style.
 
     Attributes:
-        content_image: Content image [H, W, 3], for recomputing features that are not cached.
+        content_image: Content image [H, W, 3] from which uncached content features are computed; None if they are not
+            needed.
         content: Cached content features by scale.
-        coverage: Position weights [H >> k, W >> k] for each power of two; None for equal weights.
-        share: Distribution for which the content was prepared; None for a single rank, which has everything.
-        regions: Position weights of each region, in the format of `coverage` and the order of `ScaleTarget.regions`:
-            the region's fraction of the blend weights. None if the scene has no regions.
+        coverage: Position weights [H >> k, W >> k] for each power of two 2^k; None for equal weights.
+        share: Division of work for which the content was prepared; None to divide the work in every evaluation.
+        regions: Position weights of each region (its fraction of the blend weights), in the format of `coverage` and
+            the order of `ScaleTarget.regions`. None if the scene has no regions.
     """
 
     content_image: Tensor | None = None
@@ -158,12 +160,12 @@ class ViewTarget:
 
 @dataclass(frozen=True)
 class _Part:
-    """Weighted set of positions of a scale, and the style they are compared with.
+    """Weighted set of positions of a scale, and the style to compare them with.
 
     Attributes:
-        weights: Position weights for each power of two; None for equal weights.
-        style: Target; None if only statistics are needed.
-        factor: Factor of the loss.
+        weights: Position weights in the format of `ViewTarget.coverage`; None for equal weights.
+        style: Style target; None if only statistics are needed.
+        factor: Factor of the part's loss.
     """
 
     weights: Sequence[Tensor] | None
@@ -172,7 +174,7 @@ class _Part:
 
     @staticmethod
     def of(view: ViewTarget, style: ScaleTarget) -> list[_Part]:
-        """Return one part for all positions of a view, or one per region."""
+        """Return one part per region; if there are no regions, return one part for the whole view."""
         if not style.regions:
             return [_Part(view.coverage, style)]
         if view.regions is None or len(view.regions) != len(style.regions):
@@ -185,23 +187,24 @@ class SosLoss:
     """SOS loss of views against one style.
 
     Args:
-        network: Feature network. It must report the style layers, and the content layer if that is used. Statistics are
-            compared on the style layers, and on `PIXELS`, as far as it reports them.
-        content_weight: lambda_c; 0 disables the content branch.
-        style_loss: Kind of comparison with the style; see `style_losses`.
+        network: Feature network. It must report the layers of `style_losses.layers_of`; statistics of style layers and
+            `PIXELS` are compared only if the network reports them.
+        content_weight: lambda_c; 0 disables the content term.
+        style_loss: Style loss; see `style_losses`.
         memory: Memory budget for activations in bytes.
         tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         style_scale: Magnification of the style image relative to its default size.
         scales: Weights of the pyramid's scales; those of weight 0 are not computed.
-        leave_out: Whether pixels without weight skip the network; False for comparison.
-        keep_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
-            twice, for comparison.
+        leave_out: Whether the network skips pixels of weight 0. False is meant for comparisons.
+        keep_activations: Whether to cache as many activations as fit between the two passes. False computes each tile
+            twice; it is meant for comparisons.
         timer: Timer for `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
-        collectives: Ranks that evaluate each view together; all must call the same methods with the same arguments.
+        collectives: Collectives of the ranks that evaluate each view together. All ranks must call the same methods
+            with the same arguments.
 
     Attributes:
-        speeds: Relative speeds of these ranks; work is divided in proportion.
+        speeds: Relative speeds of the ranks; work is divided in proportion to them.
     """
 
     def __init__(
@@ -248,7 +251,10 @@ class SosLoss:
         return self.tiling.scales((height, width))
 
     def tiles(self, height: int, width: int, coverage: Tensor | None = None) -> list[PartitionTile]:
-        """Return the partition of a scaled view. Pixels without coverage [h, w] may belong to no tile."""
+        """Return the partition tiles of a scaled view.
+
+        If `coverage` [h, w] is given, pixels with coverage 0 may not belong to any tile.
+        """
         return self._partition(self._piece(0, (height, width), coverage), coverage)
 
     def share(
@@ -262,8 +268,8 @@ class SosLoss:
         Args:
             sizes: (height, width) of each scale.
             coverage: Result of `position_weights`; None for equal weights.
-            region: Rectangle of the full-size view that contains every covered pixel. If given, the coverage is not
-                read, which avoids synchronizing with the device; regions of coarser scales may then be a few cells
+            region: Rectangle of the full-size view that contains every covered pixel. If it is given, `coverage` is not
+                read, which avoids synchronizing with the device. The pieces of coarser scales may then be a few cells
                 larger.
         """
         look = coverage if region is None else None
@@ -283,13 +289,13 @@ class SosLoss:
         )
 
     def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
-        """Return everything that has to go through the network at one scale."""
+        """Return the piece of one scale that contains all pixels that the network has to process."""
         if coverage is None or not self.leave_out:
             return Piece(scale, size, Rectangle(0, 0, *size))
         return Piece(scale, size, covered_region(coverage))
 
     def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
-        """Return the partition tiles of a piece, as large as the memory budget allows."""
+        """Return the covered partition tiles of a piece, as large as the memory budget allows."""
         tiles = self.tiling.tiles(piece.size, piece.region)
         if coverage is None or not self.leave_out:
             return tiles
@@ -298,15 +304,15 @@ class SosLoss:
     def style_targets(self, style: Tensor | StyleMixture, view_size: Size) -> dict[int, ScaleTarget]:
         """Compute the style targets of all scales with a positive weight.
 
-        If a very small style image has no cell of a layer at some scale, the layer is left out there. In a mixture, the
-        images that do have cells represent all.
+        If a style image is so small that a layer has no cell at some scale, the layer is not compared at that scale. In
+        a mixture, the layer's target is computed from the images that have cells.
 
         Args:
             style: Image [H, W, 3] in 0..1, or a mixture of images.
             view_size: (height, width) of the views.
 
         Raises:
-            ImageError: If features are to be matched and the style is too small to have any.
+            ImageError: If the loss matches features, and the style image is too small to have any.
         """
         mixture = StyleMixture.of(style)
         pyramids = [self._style_pyramid(picture, view_size) for picture in mixture.pictures]
@@ -324,7 +330,7 @@ class SosLoss:
         return {scale: ScaleTarget(layers.get(scale, {}), found) for scale, found in vectors.items()}
 
     def _style_pyramid(self, picture: Tensor, view_size: Size) -> dict[int, Tensor]:
-        """Return a style image at every scale of views of a size, on the network's device."""
+        """Return a style image at the scales that are evaluated for views of a given size, on the network's device."""
         size = style_size(_size(picture), view_size, self.style_scale)
         image = resize_area(picture, size).to(self.network.device)
         return {scale: downscale(image, scale) for scale in self.scales(*view_size)}
@@ -345,7 +351,10 @@ class SosLoss:
         return mixed
 
     def _style_statistics(self, scaled: Mapping[int, Tensor]) -> dict[int, dict[str, LayerTarget]]:
-        """Compute the layer targets of a style image [h, w, 3] given at some scales; ranks share the work."""
+        """Compute the layer targets of a style image, given as images [h, w, 3] by scale.
+
+        The work is divided among the ranks.
+        """
         share = self.share({scale: _size(picture) for scale, picture in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}
         for scales in rounds(list(scaled), self.collectives.size):
@@ -361,10 +370,10 @@ class SosLoss:
         """Compute the style vectors of weighted images [h, w, 3] at one scale.
 
         The vectors of all images are pooled; if there are too many, each image contributes in proportion to its weight.
-        They are too large to send, so every rank computes all of them.
+        The vectors are too large to send, so every rank computes all of them.
 
         Returns:
-            Style vectors; None if nothing is matched or the images are too small to have any.
+            Style vectors; None if the loss matches no features, or the images are too small to have any.
         """
         if not self.nearest_layers:
             return None
@@ -404,7 +413,7 @@ class SosLoss:
         Args:
             content: Content image [H, W, 3] in 0..1.
             coverage: [H, W] in 0..1; None for equal weights.
-            keep_content: Whether to compute the content features now and cache them.
+            keep_content: Whether to compute and cache the content features now, instead of in every evaluation.
         """
         weights = None if coverage is None else self.position_weights(coverage)
         share = self.share(self._sizes(_size(content)), weights)
@@ -431,7 +440,7 @@ class SosLoss:
         return coverage_pyramid(coverage.to(self.network.device, _gradient_dtype(self.network)), levels)
 
     def content_features(self, content: Tensor, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
-        """Compute the content layer on the cells owned by some tiles, for a content image [H, W, 3] at a scale."""
+        """Compute the content features of a content image [H, W, 3] at a scale, on the cells owned by some tiles."""
         image = downscale(content.to(self.network.device), scale)
         result = {}
         for tile in tiles:
@@ -441,7 +450,7 @@ class SosLoss:
         return result
 
     def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
-        """Return the size in bytes of `content_features` of a scale, on the rank that holds most.
+        """Return the maximum size over all ranks of the `content_features` of a scale, in bytes.
 
         Args:
             pieces: Pieces of the scale for every rank.
@@ -464,8 +473,8 @@ class SosLoss:
 
         Args:
             image: Image of the view at scale `image_scale`.
-            style: Targets by scale, from `style_targets`.
-            view: Targets from `view_target`.
+            style: Style targets by scale, from `style_targets`.
+            view: View targets from `view_target`.
             scales: Scales to evaluate, each with a positive weight and none finer than the image; phase 1 passes only
                 the coarsest. None for the full SOS loss of a full-size image.
             gradient: Whether to compute the gradient.
@@ -497,7 +506,11 @@ class SosLoss:
         share: Share,
         gradient: bool,
     ) -> Iterator[tuple[_ScalePass, Tensor | None]]:
-        """Yield the pass of each scale with its pixel gradient [h, w, 3]; statistics are exchanged together."""
+        """Evaluate some scales together; yield the pass of each scale and its pixel gradient [h, w, 3].
+
+        Ranks start merging the statistics of all these scales before the first backward pass. If `gradient` is False,
+        the pixel gradients are None.
+        """
         passes = [
             _ScalePass(
                 self,
@@ -525,7 +538,7 @@ class SosLoss:
             return merged()
 
     def _compare(self, pass_: _ScalePass, part: _Part, statistics: Mapping[str, LayerStatistics]) -> None:
-        """Add the style loss of one part, and its gradient maps, to the pass. Statistics cover the whole scale."""
+        """Add the style loss of a part and its gradient maps to the pass, given statistics of the whole scale."""
         style = part.style.layers if part.style else {}
         for layer, found in statistics.items():
             if layer in style:
@@ -541,7 +554,7 @@ class SosLoss:
     def _backward(self, passes: Sequence[_ScalePass], kept: list[dict[PartitionTile, Activations]]) -> list[Tensor]:
         """Return the pixel gradient [h, w, 3] of each scale.
 
-        Tiles with cached activations go first, which frees memory for those that have to be recomputed.
+        Tiles with cached activations are processed first, which frees memory for tiles that have to be recomputed.
         """
         dtype = _gradient_dtype(self.network)
         results = [torch.zeros(pass_.image.shape, dtype=dtype, device=pass_.image.device) for pass_ in passes]
@@ -597,7 +610,7 @@ class SosLoss:
         return merged, kept
 
     def _no_statistics(self, device: torch.device) -> list[LayerStatistics]:
-        """Return empty statistics, for a scale of which this rank has no tile."""
+        """Return empty statistics, for a scale in which this rank has no tile."""
         return [LayerStatistics.zero(self.network.channels(layer), device) for layer in self.style_layers]
 
     def _forward(self, image: Tensor, tile: PartitionTile, *, keep: bool = True) -> Activations:
@@ -606,9 +619,9 @@ class SosLoss:
 
 
 class _ScalePass:
-    """State shared by the tiles of one scale: pixels, weights, content, and later the loss and its gradient maps.
+    """State shared by the tiles of one scale: pixels, weights and content, then the loss and its gradient maps.
 
-    Each part is compared with its own style; the content term covers all positions.
+    Each part is compared with its own style. The content term covers all positions.
     """
 
     def __init__(
@@ -661,7 +674,7 @@ class _ScalePass:
         return pyramid[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
 
     def _is_nowhere(self, weights: Tensor | None) -> bool:
-        """Return whether a region is known to have no weight in some cells.
+        """Return whether the weights of a region in some cells are known to be all 0.
 
         Weights on a GPU count as unknown, because reading them would synchronize with the device.
         """
@@ -685,7 +698,7 @@ class _ScalePass:
     def tile_terms(self, tile: PartitionTile, activations: Activations) -> Tensor:
         """Return the tile's contribution [5] to terms that are sums over positions.
 
-        Other terms need the whole scale.
+        The other terms need statistics of the whole scale.
         """
         content = self._content_difference(tile, activations.features.get(CONTENT_LAYER))
         nothing = torch.zeros_like(self.terms)
@@ -700,7 +713,7 @@ class _ScalePass:
         The matches are stored for the second pass: they take a few bytes per cell, while the search is slow.
 
         Returns:
-            Float64 scalar; None if nothing is matched.
+            Float64 scalar; None if the loss matches no features.
         """
         if not self._matched:
             return None
@@ -717,7 +730,10 @@ class _ScalePass:
         return reduce(operator.add, sums)
 
     def _content_difference(self, tile: PartitionTile, features: Tensor | None) -> ContentDifference | None:
-        """Return the difference on owned cells, given features of the whole tile; None without a content term."""
+        """Return the content difference on the cells that a tile owns, given the features of the whole tile.
+
+        Return None if there is no content term.
+        """
         if self._content is None or features is None:
             return None
         view, own = tile.owned_cells(CONTENT_LAYER, self.size)
@@ -729,7 +745,7 @@ class _ScalePass:
         )
 
     def feature_gradient(self, tile: PartitionTile) -> FeatureGradient:
-        """Return a callback that adds dE/dfeatures of one tile, which is zero on cells that the tile does not own."""
+        """Return a callback that adds dE/dfeatures of a tile to a gradient, on the cells that the tile owns."""
 
         def add(layer: str, features: Tensor, gradient: Tensor) -> None:
             view, own = tile.owned_cells(layer, self.size)

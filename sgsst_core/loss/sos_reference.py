@@ -1,4 +1,4 @@
-"""Float64 reference of `sos.SosLoss`: the SOS loss as the paper writes it, untiled, with autograd. Used in tests."""
+"""Float64 reference of `sos.SosLoss` for tests: the SOS loss as defined in the paper, untiled, with autograd."""
 
 from __future__ import annotations
 
@@ -22,7 +22,13 @@ from sgsst_core.settings import StyleLossName
 
 @dataclass(frozen=True)
 class RegionReference:
-    """Region with its style [H', W', 3], its fraction [H, W] of a view (None: equal weights), and its loss weight."""
+    """Region of a view.
+
+    Attributes:
+        style: Style image [H', W', 3].
+        share: Position weights [H, W], the region's fraction of the blend weights; None for equal weights.
+        weight: Weight of the region's style loss.
+    """
 
     style: Tensor
     share: Tensor | None
@@ -63,7 +69,7 @@ def style_loss_reference(
 ) -> Tensor:
     """Compute the style loss of one layer from its definition; reference of `terms.style_loss`.
 
-    Float64 and differentiable.
+    The computation is in float64 and differentiable.
 
     Args:
         features: [h, w, c].
@@ -84,8 +90,8 @@ def _statistics(features: Tensor, position_weights: Tensor | None = None) -> Lay
     mean = (a[:, None] * flat).sum(0) / a.sum()
     gram = (a[:, None] * flat).T @ flat / a.sum()
     variance = (a[:, None] * (flat - mean) ** 2).sum(0) / a.sum()
-    # The square root of an exact zero (a dead channel) has no derivative, and that of a constant channel's rounding
-    # error has a huge one. Such a channel is excluded, as in the closed form.
+    # The derivative of the square root is infinite at 0 (a dead channel) and huge at the rounding error of a constant
+    # channel. Such channels are excluded, as in `terms.style_loss`.
     alive = variance > (1e-12 * mean).square()
     return LayerTarget(gram, mean, torch.where(alive, variance, 1.0).sqrt() * alive)
 
@@ -111,7 +117,7 @@ def sos_reference(
         content: [H, W, 3] in 0..1; None for no content term.
         content_weight: lambda_c.
         coverage: [H, W] position weights; None for equal weights.
-        style_loss: Kind of comparison; see `style_losses`. If features are matched, the style may have at most
+        style_loss: Style loss; see `style_losses`. If it matches features, the style may have at most
             `nearest.MOST_VECTORS` positions.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         scales: Weight of each scale from full size downwards; empty for equal weights.
@@ -145,7 +151,10 @@ def _part_reference(
     side: int,
     style_loss: StyleLossName,
 ) -> Tensor:
-    """Return the style terms of a region at the scale of side x side boxes, given the view's features at that scale."""
+    """Return the style terms of a region at one scale, given the view's features at that scale.
+
+    A pixel of the scale is the average of side x side full-size pixels.
+    """
     wanted = features_reference(network_weights, box_average_reference(part.style.double(), side))
     loss = torch.zeros((), dtype=torch.float64)
     for layer in statistics_layers(style_loss, network_weights):

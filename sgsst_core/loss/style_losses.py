@@ -15,24 +15,25 @@ from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS
 from sgsst_core.loss.terms import MEAN_WEIGHT, PAPERS_WEIGHTS, STD_WEIGHT, TermWeights
 from sgsst_core.settings import StyleLossName
 
-#: Converts features of ImageNet-normalized input, the units of ARF's weights, to units of a 0-255 input.
+#: Factor from features of ImageNet-normalized input, for which ARF's weights are meant, to features of a 0-255 input.
 _FEATURE_UNITS = 255 * 0.226
-#: w_n that, with content_weight 1, balances nearest neighbors and content as ARF does for scenes seen from all sides
-#: (content weight 5e-3 in units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
+#: w_n for `nnfm`. With content_weight 1, the nearest-neighbor and content terms are balanced as in ARF for 360-degree
+#: scenes (content weight 5e-3 in units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
 NNFM_WEIGHT = _FEATURE_UNITS**2 / 5e-3
-#: w_n next to the statistics, whose gradient falls to a tenth within 20 to 30 steps. With this weight, both gradients
-#: with respect to the colors then have the same length. Four pairs of scene and painting need 1.8e8 to 1.7e9; this is
-#: the geometric mean. It is a constant although scenes differ that much, so that a job has the same loss wherever it
-#: runs or resumes.
+#: w_n for `mixed`. Within 20 to 30 steps, the color gradient of the statistics terms falls to a tenth. With this
+#: weight, the color gradient of the nearest-neighbor term then has the same norm. Four pairs of scene and painting need
+#: 1.8e8 to 1.7e9; the constant is their geometric mean. It does not depend on the scene, so that a job has the same
+#: loss wherever it runs or resumes.
 MIXED_WEIGHT = 5e8
-#: w_n of each loss for features in units of a 0-255 input; 0 if nothing is matched.
+#: w_n of each loss for features in units of a 0-255 input; 0 if the loss matches no features.
 NEAREST_WEIGHTS: dict[StyleLossName, float] = {"sos": 0.0, "nnfm": NNFM_WEIGHT, "mixed": MIXED_WEIGHT}
 
 
 def nearest_weight(style_loss: StyleLossName, unit: float = 1.0) -> float:
-    """Return w_n.
+    """Return w_n, the weight of the nearest-neighbor term.
 
-    The terms that it is balanced against grow with the square of the features' unit (`FeatureNetwork.unit`).
+    It is scaled by the square of the feature unit (`FeatureNetwork.unit`), because the terms that it is balanced
+    against grow by this factor.
     """
     return NEAREST_WEIGHTS[style_loss] * unit**2
 
@@ -61,7 +62,11 @@ def statistics_layers(style_loss: StyleLossName, weights: BackboneWeights) -> tu
 
 
 def term_weights(layer: str, pixel_weight: float) -> TermWeights:
-    """Return the weights of a layer's terms: the paper's, except that `PIXELS` has no Gram term and its own factor."""
+    """Return the weights of a layer's terms.
+
+    They are the paper's weights, except that `PIXELS` has no Gram term, and its other terms are multiplied by
+    `pixel_weight`.
+    """
     if layer != PIXELS:
         return PAPERS_WEIGHTS
     return TermWeights(0.0, MEAN_WEIGHT * pixel_weight, STD_WEIGHT * pixel_weight)

@@ -4,8 +4,9 @@ E_style = sum over layers of w_G mean((G - G_v)^2) + w_m mean((mu - mu_v)^2) + w
 E_content = lambda_c mean((F_42 - F_42^content)^2)
 E_nearest: see `nearest`
 
-with w_G = 1e3 / c^2 and w_m = w_s = 1e4 (SGSST, CVPR 2025). Means are over the entries of each matrix or vector. With
-position weights a_p, n becomes their sum, and the content mean is weighted in the same way.
+with w_G = 1e3 / c^2 and w_m = w_s = 1e4 (SGSST, CVPR 2025). Means are over the entries of each matrix or vector. If
+there are position weights a_p, the statistics G, mu and sigma and the content mean are weighted by them, and n is their
+sum instead of the number of positions.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from sgsst_core.features.fused_statistics import can_be_fused, has_kernels
 from sgsst_core.features.statistics import LayerStatistics, blocks_of, center
 from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
 
-#: Terms whose sum is the loss of a scale: names in files and reports, and their display names. The order is that of
-#: summation, display and chart colors.
+#: Terms whose sum is the loss of a scale: name in files and reports, and display name. Summation, display and chart
+#: colors follow this order.
 TERMS = {
     "gram": "Gram matrix",
     "mean": "mean",
@@ -74,7 +75,7 @@ class LossTerms(Mapping[str, float]):
         values: Values by name; missing terms are 0.
 
     Raises:
-        TypeError: If there is no such term.
+        TypeError: If a name is not in `TERMS`.
     """
 
     __slots__ = ("_values",)
@@ -87,8 +88,8 @@ class LossTerms(Mapping[str, float]):
 
     @property
     def total(self) -> float:
-        """Sum of all terms, which is what is minimized."""
-        # From Python 3.12 on, `sum` rounds differently, so results would depend on the interpreter.
+        """Sum of all terms, the loss to minimize."""
+        # `sum` rounds differently from Python 3.12 on, so results would depend on the interpreter.
         return reduce(operator.add, self._values.values())
 
     def __getitem__(self, name: str) -> float:
@@ -149,7 +150,10 @@ class StyleGradient:
         return result
 
     def add_to(self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None) -> None:
-        """Add `apply` to a gradient [h, w, c] in place, in blocks; allocates nothing as large as the features."""
+        """Add the result of `apply` to a gradient [h, w, c] in place.
+
+        The computation runs in blocks, so no tensor as large as the features is allocated.
+        """
         if can_be_fused(features) and can_be_fused(gradient) and self.matrix.dtype == torch.float32:
             fused_add_style_gradient(gradient, features, self.matrix, self.mean, self.offset, position_weights)
             return
@@ -176,8 +180,9 @@ def style_loss(
 ) -> tuple[Tensor, StyleGradient]:
     """Compute the style loss of one layer and its gradient with respect to the features.
 
-    If sigma is zero, or within the rounding error of the mean, the channel is constant: its factor (F - mu)/sigma is
-    taken as 0. The loss keeps the term, and the gradient stays finite. Without any position, loss and gradient are 0.
+    A channel counts as constant if its sigma is 0 or within the rounding error of its mean. In the gradient, its factor
+    (F - mu)/sigma is then set to 0, so the gradient is finite; the loss still contains the sigma term. If there are no
+    positions, loss and gradient are 0.
 
     Args:
         statistics: Statistics of the view's features.
@@ -217,10 +222,10 @@ def style_loss(
 
 
 def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
-    """Return lambda_c / (n c) of a whole view, float64 scalar.
+    """Return lambda_c / (n c), the factor of the content term of a whole view, float64 scalar.
 
     Args:
-        count: n, float64 scalar: number of positions or sum of their weights. 0 gives no loss.
+        count: n, float64 scalar: number of positions or sum of their weights. If it is 0, the factor is 0.
         channels: c.
         weight: lambda_c.
     """
@@ -234,7 +239,7 @@ class ContentDifference:
     Attributes:
         difference: [h, w, c], float32 or float64.
         weighted: Difference times the position weights.
-        factor: lambda_c / (n c), float64. The loss is a mean over the n positions of the view, or over their weights.
+        factor: lambda_c / (n c), float64, where n is the number of positions of the view or the sum of their weights.
     """
 
     difference: Tensor
@@ -245,7 +250,7 @@ class ContentDifference:
     def of(
         features: Tensor, content: Tensor, factor: Tensor, position_weights: Tensor | None = None
     ) -> ContentDifference:
-        """Compare features with content [h, w, c] at the same positions.
+        """Compare features of the image with those of the content image at the same positions.
 
         Args:
             features: [h, w, c].

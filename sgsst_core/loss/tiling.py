@@ -16,9 +16,9 @@ class Tiling:
     """Rules for partitioning views.
 
     Attributes:
-        halo: Pixels around a partition tile.
+        halo: Width in pixels of the halo around a partition tile.
         held: Number of pixels whose activations fit in memory.
-        working: Additional memory of a tile during a pass, as a fraction of its activations.
+        working: Additional memory that a tile needs during a pass, as a fraction of the memory of its activations.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
         keep_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
@@ -55,7 +55,7 @@ class Tiling:
     def kept(self, areas: Sequence[int]) -> list[bool]:
         """Return which of the tiles with these pixel counts cache their activations.
 
-        All of them are assumed to be in memory at the same time.
+        The memory budget applies to the sum over all given tiles.
         """
         if not self.keep_activations:
             return [False] * len(areas)

@@ -1,7 +1,7 @@
 """Collective operations between the ranks of a job; `ALONE` implements them for a single rank.
 
 Every rank calls the same methods in the same order. Results that are "identical on all ranks" are bit-identical, so all
-ranks reach the same decisions from them without another message.
+ranks reach the same decisions based on such results without further messages.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from sgsst_core.rasterizer.arguments import Rows
 
 T = TypeVar("T")
 
-#: Waits for a pending merge of statistics. Returns the merged statistics of all ranks, and the sum [k] float64 of the
-#: numbers sent along. On a GPU the device waits, not the caller.
+#: Function that waits for a pending `all_reduce_statistics`. It returns the statistics merged over all ranks, and the
+#: sum [k] float64 of all ranks' numbers. On a GPU, only the device waits; the caller is not blocked.
 Merged = Callable[[], tuple[list[LayerStatistics], Tensor]]
 
 #: Purposes for which tensors are sent.
@@ -41,7 +41,7 @@ class Collectives(Protocol):
 
     @property
     def sent(self) -> Mapping[Traffic, int]:
-        """Bytes of tensors sent by this rank so far, assuming ring algorithms; other values are too small to count.
+        """Bytes of tensors sent by this rank so far, assuming ring algorithms; other messages are negligible.
 
         The count is shared between this group, its parent group and its subgroups.
         """
@@ -67,18 +67,18 @@ class Collectives(Protocol):
         ...
 
     def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
-        """Start merging the statistics of disjoint positions, layer by layer, and summing numbers [k] float64.
+        """Start merging the ranks' statistics of disjoint positions, by layer, and summing their numbers [k] float64.
 
-        Returns immediately. The returned function waits for the result, which is identical on all ranks. Until all
-        results have been waited for, no other kind of collective may be started.
+        Returns immediately. The returned function waits for the result, which is identical on all ranks. No other kind
+        of collective may be started before all pending functions have been called.
         """
         ...
 
     def all_gather(self, value: T) -> list[T]:
         """Return every rank's value in rank order, identical on all ranks.
 
-        Values are small: plain ones, lists, tuples, dicts, paths, arrays, tensors, and this project's dataclasses and
-        errors.
+        Values should be small. Allowed are scalars, strings, lists, tuples, dicts, paths, arrays, tensors, and this
+        project's dataclasses and errors.
         """
         ...
 
@@ -89,22 +89,22 @@ class Collectives(Protocol):
     def set_timeout_for(self, iteration_seconds: float) -> None:
         """Set the timeout of collectives for iterations of this length.
 
-        From this call on, ranks meet in every iteration, and a rank that keeps the others waiting for much longer is
-        given up. Until then, the timeout allows for the preparation of a job.
+        After this call, all ranks communicate in every iteration, and a rank that is late by much more than an
+        iteration counts as failed. Before this call, the timeout is long enough for the preparation of a job.
         """
         ...
 
     def leading_group(self, count: int) -> Collectives | None:
-        """Return the group of the first `count` ranks; None on other ranks."""
+        """Return the group of the first `count` ranks; return None on ranks outside the group."""
         ...
 
     def split_group(self, groups: int) -> Collectives:
-        """Return this rank's group after splitting the ranks into this many equal groups of neighbors."""
+        """Split the ranks into `groups` equal groups of consecutive ranks, and return this rank's group."""
         ...
 
 
 class RankLeftOut(Exception):  # noqa: N818 (not an error: the job continues without this rank)
-    """Raised on ranks that the plan leaves out because they would only add communication."""
+    """Exception on a rank that the plan does not use, because it would only add communication."""
 
 
 class _Alone:
@@ -148,5 +148,5 @@ ALONE: Collectives = _Alone()
 
 
 def same_on_all(collectives: Collectives, value: Any) -> bool:
-    """Return whether all ranks have equal values; the answer is identical on all ranks."""
+    """Return whether all ranks have equal values; the result is identical on all ranks."""
     return all(other == value for other in collectives.all_gather(value))

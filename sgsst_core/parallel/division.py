@@ -1,7 +1,7 @@
 """Division of work among ranks: rows of a view, and pixels of its scales, by estimated cost.
 
-Every rank computes the whole division from the same numbers, so no messages are needed. The division affects rounding
-only, because partition tiles are exact wherever they are split.
+Every rank computes the whole division from the same numbers, so no messages are needed. The division affects only the
+rounding of results, because partition tiles give exact gradients for any division.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Size = tuple[int, int]  # height, width in pixels
 
 @dataclass(frozen=True)
 class Piece:
-    """Part of one scale that one rank owns: only this rank passes the pixels of `region` through the network.
+    """Rectangle of one scale of a view, as a unit of work: one rank owns it and computes its features.
 
     Attributes:
         scale: Scale; 0 is full size.
         size: Size of the whole scaled view.
-        region: Owned rectangle; edges are multiples of 16 or the border of the view.
+        region: Rectangle; its edges are at multiples of 16 or at the border of the view.
     """
 
     scale: int
@@ -34,7 +34,7 @@ class Piece:
     region: Rectangle
 
     def cost(self, halo: int) -> int:
-        """Return the number of pixels through the network if the piece is processed as one tile."""
+        """Return the number of pixels, including the halo, that the network processes if the piece is one tile."""
         return self.tile(halo).outer.pixels if self.region.pixels else 0
 
     def cells(self, layer: str) -> int:
@@ -50,13 +50,13 @@ class Piece:
 def divide(pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...]) -> tuple[tuple[Piece, ...], ...]:
     """Divide pieces among ranks in proportion to their speeds.
 
-    Ranks are halved recursively, and the pieces with them: larger ones go to one half, smaller ones to the other, and
-    the one in between is split where the costs, including halos, match the speeds. Each halving therefore adds two
-    halos in total, not two per scale.
+    The ranks are recursively split into two halves, and the pieces are divided between the halves: larger pieces go to
+    one half, smaller pieces to the other, and the piece in between is split so that the costs, including halos, match
+    the speeds. Each split therefore adds two halos in total, instead of two per scale.
 
     Args:
         pieces: One piece per scale.
-        halo: Pixels around a tile.
+        halo: Width in pixels of the halo around a tile.
         speeds: Relative speeds of the ranks.
 
     Returns:
@@ -71,7 +71,7 @@ def divide(pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...]) -> t
 
 
 def _cut(pieces: tuple[Piece, ...], share: float, halo: int) -> tuple[tuple[Piece, ...], tuple[Piece, ...]]:
-    """Divide pieces into two sets, of which the first has a given fraction of the cost."""
+    """Divide pieces into two sets; the first set has a given fraction of the cost."""
     ordered = sorted(pieces, key=lambda piece: -piece.cost(halo))
     costs = [piece.cost(halo) for piece in ordered]
     total = sum(costs)
@@ -113,8 +113,9 @@ def _cuts(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
 def divide_rows(height: int, count: int, covered: Rows | None = None) -> list[Rows]:
     """Divide the rows of an image into one band per rank, in order. Bands may be empty.
 
-    Bands start at raster tile boundaries, because the Gaussians of a divided raster tile would be processed twice. The
-    covered rows are divided equally; empty rows above and below cost nothing and go to the first and last band.
+    Bands start at raster tile boundaries, because two ranks would have to process the Gaussians of a divided tile. The
+    covered rows are divided equally. Empty rows above and below them cost nothing, and belong to the first and last
+    band.
     """
     top, bottom = covered or (0, height)
     first, last = top // RASTER_TILE, -(-bottom // RASTER_TILE)
@@ -126,8 +127,9 @@ def divide_rows(height: int, count: int, covered: Rows | None = None) -> list[Ro
 def rounds(scales: Sequence[int], ranks: int) -> list[list[int]]:
     """Return groups of scales whose activations are in memory at the same time.
 
-    A single rank processes scales one by one, to hold the activations of only one. Several ranks process all scales at
-    once: their work is balanced over all scales together, not for each, so they would wait for each other in between.
+    A single rank processes one scale at a time, to store the activations of only one scale. Several ranks process all
+    scales together: work is balanced over all scales, not within each scale, so ranks that process one scale at a time
+    would wait for each other.
     """
     return [[scale] for scale in scales] if ranks == 1 else [list(scales)]
 

@@ -1,6 +1,6 @@
 """Sets of the Gaussians that a view shows; only their gradients need to be exchanged.
 
-Geometry is frozen, so these sets never change: ranks agree on them at the first visit of each view.
+Geometry is frozen, so the set of a view never changes. Ranks agree on it at their first visit of the view.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-#: Above this fraction of shown Gaussians, the whole gradient is sent: gathering and scattering values would take more
-#: time than sending fewer of them saves.
+#: If a view shows more than this fraction of all Gaussians, the whole gradient is sent: gathering and scattering values
+#: would take more time than sending fewer values saves.
 DENSE_SHARE = 0.7
 
 
@@ -41,17 +41,17 @@ class ShownGaussians:
 
     @staticmethod
     def nbytes(gaussians: int) -> int:
-        """Return the size in bytes of a set out of this many Gaussians."""
+        """Return the size in bytes of a set, for a scene with this many Gaussians."""
         return -(-gaussians // 8)
 
     @property
     def sparse(self) -> bool:
-        """Whether only the gradients of these Gaussians are sent."""
+        """Whether only the gradients of Gaussians in the set are sent, instead of all gradients."""
         return gaussians_sent(self.count, self.total) < self.total
 
     def indices(self) -> Tensor:
         """Return the indices [count] int64 in ascending order."""
-        if self._bits.device.type == "cpu":  # an order of magnitude faster on a CPU
+        if self._bits.device.type == "cpu":  # on a CPU, NumPy is an order of magnitude faster
             mask = np.unpackbits(self._bits.numpy(), count=self.total, bitorder="little")
             return torch.from_numpy(np.flatnonzero(mask))
         return self._device_indices()

@@ -1,7 +1,7 @@
 """Rasterizers: one small protocol and its implementations for CPU and GPU.
 
-Geometry is frozen, so the image of a view is linear in its colors: image = W c + T_final * background. The gradient
-with respect to the colors is W^T dL/dimage.
+Geometry is frozen, so the image of a view is linear in the colors c: image = W c + T_final * background, where W are
+the blend weights and T_final is the final transmittance. The gradient with respect to the colors is W^T dL/dimage.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Rasterizer(Protocol):
     view, after spherical harmonics and clamping. Arguments may have any floating dtype and be on any device; results
     are on `device`, in `dtype`. A wrong shape raises ValueError.
 
-    Images are at full size (`scale` 0), except those of `coarse`. Its images are 2^scale x 2^scale box averages of the
-    camera's, and heights, widths and rows refer to its scale.
+    Images have the full size of the camera (`scale` 0), except in `coarse`: there, they are box averages over
+    2^scale x 2^scale pixels, and heights, widths and rows refer to this scale.
     """
 
     name: str
@@ -72,12 +72,12 @@ def make_rasterizer(
         scene: Scene, whose geometry must not change during the rasterizer's lifetime.
         background: RGB color behind pixels that Gaussians leave uncovered.
         near: Near plane in world units.
-        device: Device for `cached`, `triton` and `cuda`. None is the CPU for `cached` (or the device of its option
-            `uncached`), and the current GPU for the others.
+        device: Device for `cached`, `triton` and `cuda`. None selects the CPU for `cached` (or the device of its option
+            `uncached`), and the current GPU for `triton` and `cuda`.
         options: Further arguments of the implementation's constructor.
 
     Raises:
-        SettingsError: If there is no such rasterizer, it cannot use the device, or `cuda` lacks gsplat or a GPU.
+        SettingsError: If the name is unknown, the rasterizer cannot use the device, or `cuda` lacks gsplat or a GPU.
     """
     settings: dict[str, Any] = {"background": background, "near": near, **options}
     if name in ("reference", "cpu"):

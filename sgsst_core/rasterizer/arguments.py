@@ -9,18 +9,19 @@ from sgsst_core.scene.camera import Camera
 
 Rows = tuple[int, int]
 
-#: Cameras with equal keys render equal images. The key contains everything that rendering depends on, so not the name.
+#: Cache key of a camera. It contains everything that rendering depends on, so cameras with equal keys render equal
+#: images. The camera's name is not part of it.
 CameraKey = tuple[int, int, float, float, float, float, bytes]
 
 
 def camera_key(camera: Camera) -> CameraKey:
-    """Return a hashable key of a camera's content."""
+    """Return the cache key of a camera."""
     pose = camera.world_to_camera.detach().cpu().double().contiguous().numpy().tobytes()
     return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose
 
 
 def check_rows(camera: Camera, rows: Rows | None) -> Rows:
-    """Return the band of rows as (start, stop); None is the whole view.
+    """Validate a band of rows and return it as (start, stop); None stands for the whole view.
 
     Raises:
         ValueError: If the band is empty or extends beyond the view.
@@ -32,7 +33,7 @@ def check_rows(camera: Camera, rows: Rows | None) -> Rows:
 
 
 def check_colors(colors: Tensor, gaussians: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return `colors` [N, 3], contiguous, in the dtype and on the device of the rasterizer.
+    """Validate `colors` [N, 3] and return them contiguous, in the given dtype and on the given device.
 
     Raises:
         ValueError: If there is not exactly one color per Gaussian.
@@ -45,7 +46,7 @@ def check_colors(colors: Tensor, gaussians: int, dtype: torch.dtype, device: tor
 def check_image_gradient(
     image_gradient: Tensor, camera: Camera, rows: Rows, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Return `image_gradient` [h, width, 3] of a band, contiguous, in the dtype and on the device of the rasterizer.
+    """Validate `image_gradient` [h, width, 3] of a band and return it contiguous, in the given dtype and on the device.
 
     Raises:
         ValueError: If the shape does not match the band.

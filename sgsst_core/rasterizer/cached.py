@@ -1,8 +1,8 @@
 """`cached`: rasterizer that stores the blend weights of a view and reapplies them in every step.
 
-Geometry is frozen, so a view's W never changes: an image is W c + T_final background, its gradient W^T dL/dimage, and
-rasterizing reduces to reading W from memory. Weights are stored on the device that applies them, in a layout made for
-it: `strips` on the CPU, `triton_cached` on GPUs.
+Geometry is frozen, so the blend weights W of a view never change: an image is W c + T_final background, the color
+gradient is W^T dL/dimage, and rasterization is reduced to reading W from memory. Weights are stored on the device that
+applies them, in a layout for this device: `strips` on the CPU, `triton_cached` on GPUs.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from sgsst_core.scene.gaussians import Scene
 
 @dataclass(frozen=True)
 class _CachedBand:
-    """Cached weights, and the band that they cover."""
+    """Cached weights of a band of rows."""
 
     band: Rows
     weights: CachedWeights
@@ -46,12 +46,14 @@ class _CachedBand:
 class CachedRasterizer:
     """Implementation of `sgsst_core.rasterizer.Rasterizer` with blend weights that are computed once per view.
 
-    Weights are cached in the order of the views' first use, or of the calls of `keep`, until the next ones would exceed
-    `max_bytes`. Nothing is ever evicted: views come round in turn, so evicted weights would be needed again before the
-    remaining ones. Views and bands without cached weights are computed in every call, on the same device, by `cpu` or
-    `triton`. On the CPU, images are then bit-identical to those from float32 weights and gradients equal up to
-    rounding; on a GPU, both are equal up to rounding. A band uses the whole view's weights if they are cached, else its
-    own. Color gradients are reproducible bit for bit.
+    Weights are cached in the order of the views' first use, or of the calls of `keep`, until the next weights would
+    exceed `max_bytes`. Nothing is ever evicted: views are visited in rounds, so evicted weights would be needed again
+    before the remaining ones.
+
+    If a view or band has no cached weights, `cpu` or `triton` computes it in every call, on the same device. Compared
+    with cached float32 weights, images are then bit-identical on the CPU and equal up to rounding on a GPU; gradients
+    are equal up to rounding on both. If the weights of a whole view are cached, they serve all of its bands. Color
+    gradients are reproducible bit for bit.
 
     Args:
         scene: Scene, whose geometry must not change during this object's lifetime.
@@ -60,15 +62,14 @@ class CachedRasterizer:
         alpha_max: Upper limit of alpha.
         precision: Precision of the cached weights. `half` takes half the memory, with a relative error of at most 2^-11
             per weight.
-        max_bytes: Memory budget for weights; None for no limit. On the CPU they share it with the tile intersections of
-            `uncached`, which get what the weights leave, and which are dropped for a view once its weights are cached.
-        least_intersection_bytes: Minimum budget for these tile intersections, however much the weights take.
-        at_first_use: Whether to cache weights at first use; if False, only by `keep`. Then rendering any number of
-            other views in between does not change later results by a single bit.
-        device: Device that stores and applies the weights and holds the results.
-        uncached: Rasterizer of the same scene that computes weights and everything without cached weights. Its tile
-            intersections, device, background, near plane and limit of alpha replace the arguments above. None to create
-            one.
+        max_bytes: Memory budget for weights; None for no limit. On the CPU, the tile intersections of `uncached` may
+            use the rest of this budget. Those of a view are dropped once the weights of the view are cached.
+        least_intersection_bytes: Minimum budget for these tile intersections, regardless of the size of the weights.
+        at_first_use: Whether to cache weights at first use. If False, only `keep` caches weights, and rendering other
+            views does not affect later results.
+        device: Device that stores and applies the weights, and on which results are returned.
+        uncached: Rasterizer of the same scene that computes the weights, and renders if there are no cached weights.
+            Its device, background, near plane and limit of alpha replace the arguments above. None to create one.
 
     Raises:
         SettingsError: If `device` is not the CPU and Triton cannot run on it.
@@ -113,20 +114,20 @@ class CachedRasterizer:
         return self._cached.used
 
     def count(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
-        """Count a band's weights without caching them; takes about as long as one render."""
+        """Count a band's weights without storing them; takes about as long as one render."""
         band = check_rows(camera, rows)
         if isinstance(self.uncached, CpuRasterizer):
             return CountedStrips(self.uncached, camera, band)
         return CountedPieces(self.uncached, camera, band)
 
     def operator_bytes(self, camera: Camera, rows: Rows | None = None) -> int:
-        """Return the size in bytes of a band's weights without caching them; takes about as long as one render."""
+        """Return the size in bytes that a band's cached weights would have; takes about as long as one render."""
         return self.count(camera, rows).nbytes(self.precision)
 
     def keep(self, camera: Camera, rows: Rows | None = None) -> bool:
         """Cache a band's weights if they fit, and return whether the band has cached weights.
 
-        Whether they fit is decided the first time that the band is named.
+        The first call for a band decides whether its weights fit; later calls do not reconsider this.
         """
         key, band = camera_key(camera), check_rows(camera, rows)
         with self._lock:
@@ -138,8 +139,8 @@ class CachedRasterizer:
     def lending(self, camera: Camera, rows: Rows | None = None) -> Iterator[None]:
         """Use temporary cached weights for a band inside a `with` block.
 
-        If the band already has cached weights, those are used. Weights that alone exceed `max_bytes`, which `keep`
-        would never cache, are not computed.
+        If the band already has cached weights, those are used. If the weights alone would exceed `max_bytes`, they are
+        not computed, and the band is rendered without them.
         """
         key, band = camera_key(camera), check_rows(camera, rows)
         counted = None if self._serving(key, band, camera) else self.count(camera, band)
@@ -178,7 +179,7 @@ class CachedRasterizer:
         cached = self._cached_for(camera, band)
         if cached is None:
             return self.uncached.color_gradient(pixels, camera, band)
-        if cached.band != band:  # weights of the whole view: zero gradient in the other rows
+        if cached.band != band:  # weights of the whole view: pad the gradient with zeros in all other rows
             whole = pixels.new_zeros((camera.height, camera.width, 3))
             whole[band[0] : band[1]] = pixels
             pixels = whole
@@ -187,7 +188,7 @@ class CachedRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N].
 
-        Caches nothing.
+        Does not cache any weights.
         """
         return self.uncached.survey(camera)
 
@@ -198,7 +199,10 @@ class CachedRasterizer:
         return self._serving(camera_key(camera), band, camera)
 
     def _serving(self, key: CameraKey, band: Rows, camera: Camera) -> _CachedBand | None:
-        """Return the present cached weights for a band: those of the whole view, else its own, else temporary ones."""
+        """Return the currently cached weights that serve a band; None if there are none.
+
+        Weights of the whole view take precedence over those of the band, and these over temporary weights.
+        """
         whole = self._cached.values.get((key, (0, camera.height)))
         return whole or self._cached.values.get((key, band)) or self._lent.get((key, band))
 
@@ -219,7 +223,8 @@ class CachedRasterizer:
 def repeatable(rasterizer: Rasterizer) -> Rasterizer:
     """Return a rasterizer whose images are bit-identical whether or not weights are cached.
 
-    This is `cached` itself only in float32 on the CPU; otherwise it is the rasterizer that computes its weights.
+    A `CachedRasterizer` has this property only in float32 on the CPU; otherwise return the rasterizer that computes its
+    weights. All other rasterizers cache no weights, and are returned unchanged.
     """
     if not isinstance(rasterizer, CachedRasterizer):
         return rasterizer

@@ -6,7 +6,7 @@ from typing import Literal, Protocol
 
 from torch import Tensor
 
-#: `half` is float16 times a power of two, with a relative error of at most 2^-11 per weight.
+#: `half` stores weights times a power of two as float16, with a relative error of at most 2^-11 per weight.
 Precision = Literal["float32", "half"]
 
 

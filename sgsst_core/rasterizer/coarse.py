@@ -1,8 +1,8 @@
 """`coarse`: box average and blend weights of a view, cached as a single operator for phase 1.
 
 At scale s the optimizer sees image_s = D (W c + T_final background), where D is the 2^s x 2^s box average
-(`pyramid.downscale`). Geometry is frozen, so D W never changes. The pixels of a square share one weight, so D W is much
-smaller than W and correspondingly faster to apply.
+(`pyramid.downscale`). Geometry is frozen, so D W never changes. It has one weight per Gaussian and square of 2^s x 2^s
+pixels, so it is much smaller than W and correspondingly faster to apply.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 
 _CPU = torch.device("cpu")
-#: Scale at which a raster tile is one pixel. Coarser pixels are averages of these.
+#: Scale at which a raster tile is one pixel. Images at coarser scales are averages of images at this scale.
 _LARGEST_PIECE_SCALE = RASTER_TILE.bit_length() - 1
 
 
@@ -78,7 +78,7 @@ class _Counts:
 
 
 def _count(isects: TileIntersections, grid: _Grid, alpha_max: float) -> _Counts:
-    """Count the sizes of a view's operator; takes about as long as one render."""
+    """Compute the sizes of a view's operator; takes about as long as one render."""
     counts = _Counts(np.zeros(len(isects.starts) - 1, dtype=np.int64), np.zeros(len(isects.ranks), dtype=np.bool_))
     tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values)
     with kernel_threads():
@@ -87,7 +87,7 @@ def _count(isects: TileIntersections, grid: _Grid, alpha_max: float) -> _Counts:
 
 
 class CoarseOperator:
-    """D W of one view, at most at the scale where a raster tile is a pixel. See `coarse_kernels` for the layout."""
+    """Operator D W of one view, at scale `_LARGEST_PIECE_SCALE` or finer. See `coarse_kernels` for the layout."""
 
     def __init__(self, isects: TileIntersections, counts: _Counts, grid: _Grid, alpha_max: float) -> None:
         self.scale, self.across = grid.piece_scale, grid.across
@@ -134,12 +134,12 @@ class CoarseRasterizer:
     """Implementation of `sgsst_core.rasterizer.Rasterizer` at a coarse scale, on the CPU.
 
     Operators are cached in the order of the views' first use, or of the calls of `keep`, until the next one would
-    exceed `max_bytes`; nothing is ever evicted. Views without a cached operator are rendered at full size by `cpu` and
-    averaged, with the same result up to rounding. Results are bit-identical for any number of threads.
+    exceed `max_bytes`; nothing is ever evicted. If a view has no cached operator, `cpu` renders it at full size and the
+    image is averaged, with the same result up to rounding. Results are bit-identical for any number of threads.
 
-    Cameras are those of full-size views. Rows and columns outside complete squares of 2^scale pixels are dropped, as in
-    `pyramid.downscale`. Every method raises ValueError for a view without a complete square, whose image would be
-    empty.
+    Methods take cameras of full-size views. Rows and columns outside complete squares of 2^scale pixels are dropped, as
+    in `pyramid.downscale`. If a view contains no complete square, its image would be empty, and methods raise
+    ValueError.
 
     Args:
         cpu: Rasterizer whose scene, tile intersections, background, near plane and limit of alpha this object shares.
@@ -167,7 +167,7 @@ class CoarseRasterizer:
         self._operators: Cache[tuple[CameraKey, int], CoarseOperator] = Cache(max_bytes)
 
     def at(self, scale: int) -> CoarseRasterizer:
-        """Return the same rasterizer at another scale; both share the cache and its budget."""
+        """Return a rasterizer of the same scene at another scale, which shares this one's cache and memory budget."""
         other = CoarseRasterizer(self._cpu, scale, at_first_use=self._at_first_use)
         other._operators = self._operators
         return other
@@ -178,13 +178,13 @@ class CoarseRasterizer:
         return self._operators.used
 
     def operator_bytes(self, camera: Camera) -> int:
-        """Return the size in bytes of a view's operator without caching it; takes about as long as one render."""
+        """Return the size in bytes that a view's operator would have; takes about as long as one render."""
         return self._counted(camera, _Grid.of(camera, self.scale))[0]
 
     def keep(self, camera: Camera) -> bool:
         """Cache a view's operator if it fits, and return whether it is cached.
 
-        Whether it fits is decided the first time that the view is named.
+        The first call for a view decides whether its operator fits; later calls do not reconsider this.
         """
         return self._operator(camera, _Grid.of(camera, self.scale), add=True) is not None
 
@@ -193,7 +193,10 @@ class CoarseRasterizer:
         return (camera_key(camera), self.scale) in self._operators
 
     def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return the float32 image [h, W >> scale, 3] of colors [N, 3] over the background, for rows at the scale."""
+        """Return the float32 image [h, W >> scale, 3] of colors [N, 3] over the background.
+
+        `rows` counts rows of this scale, not of the full-size view.
+        """
         grid = _Grid.of(camera, self.scale)
         band = self._band(camera, rows)
         values = check_colors(colors, len(self.scene), torch.float32, _CPU)
@@ -246,7 +249,7 @@ class CoarseRasterizer:
         return counts.nbytes(isects, grid), lambda: CoarseOperator(isects, counts, grid, alpha_max)
 
     def _band(self, camera: Camera, rows: Rows | None) -> Rows:
-        """Return the band of rows at the scale as (start, stop); None is the whole view."""
+        """Validate a band of rows of this scale and return it as (start, stop); None stands for the whole view."""
         height = camera.height >> self.scale
         start, stop = rows or (0, height)
         if not 0 <= start < stop <= height:
@@ -269,7 +272,7 @@ class CoarseRasterizer:
         return image_gradient.detach().to(device=_CPU, dtype=torch.float32).contiguous()
 
     def _whole(self, pixels: Tensor, grid: _Grid, band: Rows) -> Tensor:
-        """Return the gradient of the whole view, with zeros outside the band."""
+        """Return the image gradient of the whole view, given the gradient of a band. It is zero outside the band."""
         size = grid.shape(self.scale)
         if band == (0, size[0]):
             return pixels

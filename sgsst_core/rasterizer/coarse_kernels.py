@@ -1,9 +1,9 @@
 """Numba kernels of `coarse`: blend weights averaged over squares of 2^scale pixels, stored and applied.
 
 For scales 1 to 4, a square of 2^scale pixels lies in one raster tile. A piece is one Gaussian in one raster tile: all
-its (16 >> scale)^2 averaged weights in row-major order, including zeros. It therefore needs no index except those of
-its Gaussian and slot, and pieces that fill whole vectors all take the same instructions. The averaged weights are
-bit-identical to those of `kernels`. Slots make gradients independent of the number of threads, as they do there.
+its (16 >> scale)^2 averaged weights in row-major order, including zeros. It therefore needs only the indices of its
+Gaussian and slot, and all pieces that fill whole vectors take the same instructions. The weights before averaging are
+bit-identical to those of `kernels`. As in `kernels`, slots make gradients independent of the number of threads.
 
 Accuracy: averages are computed in float64 and rounded once. An image sums up to `_RUN` pieces in float32, and these
 partial sums in float64, because a coarse pixel may see thousands of Gaussians.
@@ -33,7 +33,7 @@ _RUN = 64
 class Pieces(NamedTuple):
     """Averaged weights of a view at one scale, with P pieces. Pieces of a raster tile are contiguous, front to back.
 
-    Kernels unpack it before their parallel loop, because Numba's parallel loops accept arrays but no tuple fields.
+    Kernels unpack this tuple before their parallel loop, because Numba's parallel loops do not support tuple fields.
     """
 
     starts: NDArray[np.int64]  # [raster tiles + 1]
@@ -54,9 +54,9 @@ def _has_weight(block, first, stop):
 
 @compiled()
 def _average(values, first, stop, scale, averages):
-    """Compute averages [16 >> scale, 16 >> scale] of |values| [16, 16], which are zero outside rows first..stop.
+    """Compute averages [16 >> scale, 16 >> scale] of |values| [16, 16]. Values outside rows first..stop count as 0.
 
-    Absolute values, because the transmittance of finished pixels is stored negated.
+    Absolute values are needed because the transmittance of finished pixels is stored negated.
     """
     averages[:] = 0.0
     for row in range(first, stop):
@@ -72,7 +72,7 @@ def _average(values, first, stop, scale, averages):
 def count_pieces(entries, slots, starts, values, size, across, alpha_max, tile_pieces, slot_used):
     """Count the pieces of every raster tile, and mark the slots that have one.
 
-    Only pixels within size = (height, width), the complete squares, are considered. `tile_pieces` [tiles] and
+    Only pixels within size = (height, width), the area of complete squares, are considered. `tile_pieces` [tiles] and
     `slot_used` [E] must be zero on entry.
     """
     height, width = size
@@ -181,7 +181,10 @@ def apply_pieces(pieces, colors, background, transmittance, across, scale, image
 
 @compiled(parallel=True)
 def apply_transposed_pieces(pieces, image_gradient, across, scale, slot_gradients):
-    """Write dL/dcolor of every piece to its slot [P, 3], given the gradient [h, w, 3] of the averaged image."""
+    """Write dL/dcolor of every piece to its slot in `slot_gradients` [P, 3].
+
+    `image_gradient` [h, w, 3] is the gradient of the averaged image.
+    """
     starts, _, slots, weights = pieces
     height, width = image_gradient.shape[0], image_gradient.shape[1]
     side = _TILE >> scale

@@ -1,4 +1,7 @@
-"""`cpu`: float32 on all cores. Tile intersections are cached per view; blend weights are recomputed in every call."""
+"""`cpu`: float32 rasterizer on all CPU cores.
+
+Tile intersections are cached per view; blend weights are recomputed in every call.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +37,9 @@ _CPU = torch.device("cpu")
 class CpuRasterizer:
     """Implementation of `sgsst_core.rasterizer.Rasterizer` in compiled float32 code.
 
-    The order of summation is fixed. Results are therefore bit-identical for any number of threads, and bands of rows
-    put together are bit-identical to the whole view. Tile intersections are cached within a budget (`ViewCache`).
+    The order of summation is fixed. Results are therefore bit-identical for any number of threads, and the concatenated
+    images of bands are bit-identical to that of the whole view. Tile intersections are cached within a budget
+    (`ViewCache`).
 
     Args:
         scene: Scene, whose geometry must not change during this object's lifetime.
@@ -43,8 +47,8 @@ class CpuRasterizer:
         near: Near plane in world units.
         alpha_max: Upper limit of alpha.
         max_intersection_bytes: Memory budget for tile intersections in bytes.
-        beside: Rasterizer whose budget for tile intersections this one shares, with lower priority, instead of
-            `max_intersection_bytes`; None for a budget of its own.
+        beside: Rasterizer whose budget for tile intersections is shared, with lower priority, instead of using
+            `max_intersection_bytes`; None for a separate budget.
     """
 
     name = "cpu"
@@ -75,8 +79,8 @@ class CpuRasterizer:
     ) -> CpuRasterizer:
         """Return a rasterizer of a subset of the Gaussians.
 
-        Cached tile intersections are handed over to it. They are restricted to the subset when their view is first
-        used.
+        The new rasterizer takes over the cached tile intersections. Those of a view are restricted to the subset when
+        the view is first used.
 
         Args:
             scene: Scene of the subset, with unchanged geometry.
@@ -117,7 +121,7 @@ class CpuRasterizer:
         return self._intersections.holds(camera)
 
     def drop_intersections(self, camera: Camera, left: int) -> None:
-        """Drop the view's tile intersections, and reduce the budget for all others to `left` bytes."""
+        """Drop the view's tile intersections, and set the budget for those of all other views to `left` bytes."""
         self._intersections.take(camera)
         self._intersections.limit(left)
 
@@ -156,7 +160,7 @@ class CpuRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N], in one pass.
 
-        Bit-identical to `coverage`, and to a column of `color_gradient` of ones.
+        Bit-identical to `coverage`, and to a column of `color_gradient` for an image gradient of ones.
         """
         isects = self.intersections(camera)
         slot_weights = np.empty(len(isects.ranks), dtype=np.float32)

@@ -1,9 +1,10 @@
 """`cuda`: rasterizer on gsplat's kernels (extra `[cuda]`), for gsplat 1.5.3 and 1.6.
 
 It calls the public stages of gsplat's `rasterization` separately. Geometry is frozen, so projection and tile
-intersections are computed once per view. Bands are exact, because the projection, whose slopes are clamped to the
-frustum of the whole view, does not depend on the band: projected centers are shifted up by its first row, and tiles
-outside the image are dropped.
+intersections are computed once per view.
+
+Bands of rows are exact, because Gaussians are always projected onto the whole view, to whose frustum slopes are
+clamped. For a band, the projected centers are then shifted up by its first row, and tiles outside the band are dropped.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def gsplat_alpha_max(version: str) -> float:
 
 @dataclass(frozen=True)
 class _Splats:
-    """Gaussians of a band in gsplat's format: one image, packed [1, N, ...]."""
+    """Projected Gaussians and tile intersections of a band in gsplat's format, with a batch dimension of 1."""
 
     means: Tensor
     conics: Tensor

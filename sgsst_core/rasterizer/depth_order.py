@@ -1,8 +1,8 @@
 """Depth sort of Gaussians on all cores: a stable sort of positive float64 numbers.
 
-Positive floats have the same order as their bits read as integers. The upper bits assign each Gaussian to one of many
-buckets, by a parallel counting sort; then each bucket is sorted on its own. Equal depths keep the order of the file, so
-the result is that of any stable sort, for any number of threads.
+Positive floats have the same order as their bits interpreted as integers. A parallel counting sort by the upper bits
+distributes the Gaussians over many buckets; then each bucket is sorted separately. Gaussians of equal depth keep the
+order of the file, so the result is that of any stable sort, for any number of threads.
 """
 
 # Arguments are untyped: Numba compiles one version per argument type.
@@ -24,14 +24,14 @@ _INSERTED = 48
 
 
 def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> NDArray[np.int32]:
-    """Sort indices by depth; equal depths stay in index order.
+    """Sort the indices of visible Gaussians by depth; equal depths stay in index order.
 
     Args:
-        depths: [N] float64; positive for the visible Gaussians, because the near plane is.
+        depths: [N] float64; positive for visible Gaussians, because the near plane is at a positive depth.
         visible: [V], ascending indices into `depths`.
 
     Returns:
-        Sorted `visible` as int32.
+        `visible` sorted by depth, int32.
     """
     count = len(visible)
     if not count:
@@ -47,8 +47,8 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
         parts = np.linspace(0, count, threads + 1).astype(np.int64)
         ends = np.zeros((threads, buckets), dtype=np.int64)
         _count(bits, lowest, shift, parts, ends)
-        # First position that each part writes to in each bucket: after all smaller buckets, and after the preceding
-        # parts.
+        # First position that each part writes to in each bucket: after all lower buckets, and after the entries of all
+        # preceding parts in the same bucket.
         totals = ends.sum(axis=0)
         starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(totals)])
         ends = starts[:-1] + np.cumsum(ends, axis=0) - ends

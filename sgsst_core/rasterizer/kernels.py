@@ -1,15 +1,15 @@
 """Numba kernels of the CPU rasterizers.
 
 All kernels traverse the Gaussians of one raster tile front to back, and compute the blend weights of one Gaussian in a
-16 x 16 block that stays in the L1 cache (`_blend`). They differ in what they do with the block: add it times a color to
-the image, multiply it with dL/dimage, or store it. Their weights are therefore bit-identical.
+16 x 16 block that stays in the L1 cache (`_blend`). They differ only in how they use this block: they add its product
+with a color to the image, multiply it by dL/dimage, or store it. All kernels therefore use bit-identical weights.
 
-Accuracy: the offset between a pixel and a Gaussian is computed in float64 once per row, and rounded after the large
-terms have canceled; within the row, at most 15 pixels are added in float32. Neither distant centers nor needle-shaped
-Gaussians lose digits.
+Accuracy: the offset between a pixel and a Gaussian is computed in float64 once per row, and rounded to float32 after
+large terms have canceled. Within the row, offsets of up to 15 pixels are added in float32. This preserves accuracy for
+distant centers and needle-shaped Gaussians.
 
-Determinism: each tile is processed by one thread. The gradient of each (Gaussian, tile) pair first goes to a slot of
-its own, and the slots of a Gaussian are contiguous. Each Gaussian's slots are then added in order.
+Determinism: each tile is processed by one thread. The gradient of each (Gaussian, tile) pair is written to a separate
+slot. The slots of a Gaussian are contiguous, and are then added in order.
 """
 
 # Arguments are untyped: Numba compiles one version per argument type.
@@ -47,7 +47,7 @@ _TILE = RASTER_TILE
 _LAST = RASTER_TILE - 1
 _PIXELS = RASTER_TILE**2
 _COLUMNS = 8
-#: Prefetch distance in entries; blending takes some 100 ns for that many.
+#: Prefetch distance in entries; blending this many entries takes about 100 ns.
 _AHEAD = 8
 #: Number of neighboring tiles that form a block, and a prime stride that scatters such blocks over the image. The prime
 #: is larger than the number of blocks.
@@ -58,16 +58,16 @@ _BLOCK_TILES, _STRIDE = 8, 1_000_003
 def _blend(block, alive, value, x, y, low, high, alpha_max):
     """Blend one Gaussian into rows low..high of the tile at pixel (x, y).
 
-    block[1, first:stop] then holds its weights. alive[row] is non-zero if the row has unfinished pixels; alive[16] is
-    the number of such rows.
+    The weights are written to block[1, first:stop]. alive[row] is non-zero if the row has unfinished pixels; alive[16]
+    is the number of such rows.
 
     Returns:
-        Rows (first, stop) that the Gaussian reached.
+        Range (first, stop) of the rows that the Gaussian reaches.
     """
     dx = x + 0.5 - value[0]
     top = y + 0.5 - value[1]
     skew, u_scale, w_scale, log2_opacity, extent_y = value[2], value[3], value[4], value[5], value[7]
-    # np, not math: in compiled code math.ceil returns int64, which overflows for extents beyond 9e18 pixels.
+    # Use np.ceil: in compiled code, math.ceil returns int64, which overflows for extents above 9e18 pixels.
     begin = max(np.float64(low), np.ceil(-extent_y - top))
     end = min(np.float64(high), np.floor(extent_y - top) + 1.0)
     first, stop = 0, 0
@@ -98,7 +98,7 @@ def _blend(block, alive, value, x, y, low, high, alpha_max):
 
 @compiled()
 def _start_tile(block, alive, columns, low, high):
-    """Reset the transmittance of a tile to 1. Pixels outside the image or the band start out finished."""
+    """Reset the transmittance of a tile to 1. Pixels outside the image or the band are marked as finished."""
     alive[:] = 0
     for row in range(_TILE):
         for i in range(_TILE):
@@ -149,8 +149,8 @@ def _scattered(step, tiles):
 
     Steps whose result is not below `tiles` have no tile and must be skipped.
 
-    Each thread gets a range of steps. Consecutive blocks are scattered over the image, so that no thread gets only sky
-    and another only dense areas. Tiles within a block are neighbors, which share Gaussians.
+    Each thread gets a range of steps. Consecutive blocks are scattered over the image to balance the load: no thread
+    gets only sky while another gets only dense areas. Tiles within a block are neighbors, which share Gaussians.
     """
     return step // _BLOCK_TILES * _STRIDE % _blocks(tiles) * _BLOCK_TILES + step % _BLOCK_TILES
 
@@ -240,7 +240,7 @@ def add_slots(slot_gradients, first_slots, gaussians, gradient):
 def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittance):
     """Compute the final transmittance [h, w] of a whole view, and the sum of weights of each (Gaussian, tile) pair [E].
 
-    Bit-identical to `render` and to `color_gradient` of ones, but in one pass.
+    Bit-identical to `render`, and to `color_gradient` for an image gradient of ones, but in one pass.
     """
     height, width = transmittance.shape
     across = (width + _LAST) // _TILE
@@ -281,9 +281,9 @@ def add_slot_weights(slot_weights, first_slots, gaussians, weights):
 
 
 # Layout of cached weights. A strip is half a raster tile, 8 columns by 16 rows, divided into 4 blocks of 4 rows. An
-# item is one Gaussian in one strip. A piece is one item in one block: 32 weights in row-major order. This stores little
-# outside a Gaussian's support, every piece takes the same instructions, and the values that a block accumulates (or is
-# multiplied with) stay in registers.
+# item is one Gaussian in one strip. A piece is one item in one block: 32 weights in row-major order. With this layout,
+# few zeros outside a Gaussian's support are stored, every piece takes the same instructions, and the pixels of a block
+# stay in registers.
 
 STRIP = LANES
 PIECE = LANES * BLOCK_ROWS
@@ -294,7 +294,7 @@ _STRIPS = RASTER_TILE // STRIP
 class Strips(NamedTuple):
     """Cached weights of a band with I items and P pieces. Strips are in the row-major order of raster tiles.
 
-    Kernels unpack it before their parallel loop, because Numba's parallel loops accept arrays but no tuple fields.
+    Kernels unpack this tuple before their parallel loop, because Numba's parallel loops do not support tuple fields.
     """
 
     item_starts: NDArray[np.int64]  # [strips + 1]
@@ -326,7 +326,7 @@ def _has_weight(block, row, column):
 
 @compiled(parallel=True)
 def count_weights(entries, slots, starts, values, band, width, alpha_max, items, pieces, slot_items):
-    """Count the items of every strip, the pieces of every block and the items of every slot, for allocating them."""
+    """Count the items of every strip, the pieces of every block and the items of every slot, to size their arrays."""
     across = (width + _LAST) // _TILE
     for tile in numba.prange(starts.size - 1):
         x, y = tile % across * _TILE, tile // across * _TILE

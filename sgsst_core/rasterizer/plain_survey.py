@@ -1,4 +1,4 @@
-"""`Rasterizer.survey` in terms of the other methods; reference for the fast implementations."""
+"""`Rasterizer.survey` based on `coverage` and `color_gradient`; reference for the fast implementations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from sgsst_core.scene.camera import Camera
 
 
 def plain_survey(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return coverage [h, width], and each Gaussian's blend weight summed over all pixels [N]: the gradient of ones."""
+    """Return coverage [h, width], and each Gaussian's blend weight summed over all pixels [N].
+
+    The latter is a column of the color gradient for an image gradient of ones.
+    """
     coverage = rasterizer.coverage(camera)
     ones = torch.ones((*coverage.shape, 3), dtype=rasterizer.dtype, device=coverage.device)
     return coverage, rasterizer.color_gradient(ones, camera)[:, 0]

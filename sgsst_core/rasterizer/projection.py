@@ -3,14 +3,16 @@
 Zwicker, Pfister, van Baar, Gross, "EWA Splatting", IEEE TVCG 2002: a Gaussian with covariance V becomes a 2D Gaussian
 with covariance J V J^T, where J is the Jacobian of the perspective at its center. For numerical accuracy:
 
-* The 2x3 factor M = J R_camera R_quaternion diag(scales) is computed, never the 3x3 covariance. With the blur e,
-  det(M M^T + e I) = (sum of the squared 2x2 minors of M) + e trace(M M^T) + e^2 (Cauchy-Binet): a sum of positive
-  terms, which cannot cancel. p r - q^2 has no correct digit left for a needle a million times longer than wide.
-* With the covariance [[p, q], [q, r]], the exponent is a sum of two squares, so it cannot become negative:
+* The 2x3 factor M = J R_camera R_quaternion diag(scales) is computed, never the 3x3 covariance. With the blur e, the
+  2D covariance is M M^T + e I = [[p, q], [q, r]].
+* Its determinant is (sum of the squared 2x2 minors of M) + e trace(M M^T) + e^2 (Cauchy-Binet), a sum of positive
+  terms, which cannot cancel. The formula p r - q^2 would have no correct digit for a Gaussian a million times longer
+  than wide.
+* The exponent is computed as a sum of two squares, so it cannot become negative:
   w = dy / sqrt(r), u = (dx - (q / r) dy) sqrt(r / det), power = (u^2 + w^2) / 2.
 * The support of a Gaussian is exactly the area where its alpha is at least ALPHA_MIN: half extents t sqrt(p) and
-  t sqrt(r) with t = sqrt(2 ln(opacity / ALPHA_MIN)). There is no other cutoff, so a renderer without any support
-  agrees.
+  t sqrt(r) with t = sqrt(2 ln(opacity / ALPHA_MIN)). There is no other cutoff, so a renderer that evaluates alpha at
+  every pixel gives the same image.
 """
 
 # Arguments are untyped: Numba compiles one version per argument type.
@@ -35,7 +37,7 @@ from sgsst_core.scene.gaussians import Scene
 _LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 #: exp(-power) = 2^-(u'^2 + w'^2) if u and w are scaled by this factor. The kernels use powers of two.
 _TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
-#: Upper bound of float64 rounding errors, in pixels of any image and relative to an extent.
+#: Upper bound of float64 rounding errors: in pixels for positions in an image, and relative for extents.
 _ROUNDING = 1e-6
 #: Number of parts of the scene that each thread projects, one after the other.
 _PARTS = 16
@@ -91,7 +93,7 @@ class Projection:
 
 @dataclass(frozen=True)
 class Shapes:
-    """View-independent values of a scene's Gaussians, in float64.
+    """Standard deviations and opacities of a scene's Gaussians, which do not depend on the view, in float64.
 
     Attributes:
         deviations: [N, 3], standard deviations in world units.
@@ -198,8 +200,8 @@ def _factor_row(row, rotation, deviation):
 def _surely_outside(center, size, row, deviation, support):
     """Return whether a Gaussian is certain to lie outside the image, whatever its orientation.
 
-    The bound on its extent is that of a ball with the largest deviation, for which a row of M is longest. The distance
-    must exceed any rounding error of the exact test that follows; otherwise return False.
+    Its extent is bounded by that of a ball whose standard deviation is the largest of the Gaussian's. Return True only
+    if the distance to the image exceeds this bound by more than the rounding error of the exact test that follows.
     """
     beside = max(0.5 - center, center - (size - 0.5)) - _ROUNDING
     if not beside > 0:
@@ -274,7 +276,10 @@ def _find_shapes(scales, logits, deviations, log2_opacities):
 def _project_parts(
     means, quats, deviations, opacities, pose, intrinsics, near, parts, threads, values, depths, gaussians, tallies
 ):
-    """Project each part of the scene, packing the visible Gaussians at its start, and count the outcomes."""
+    """Project each part of the scene, and count the outcomes.
+
+    Results of visible Gaussians are written contiguously from the start of each part.
+    """
     for step in numba.prange(parts.size - 1):
         part = step % _PARTS * threads + step // _PARTS  # gives every thread parts from all over the scene
         place = parts[part]

@@ -1,8 +1,7 @@
 """`reference`: plain PyTorch, float64 by default, written from the formulas and independent of the compiled code.
 
-The fast rasterizers are tested against it. In float32 it also shows what a vectorized PyTorch rasterizer can achieve,
-which is the benchmark's baseline: raster tiles are batched by the number of their Gaussians, and each batch takes a few
-tensor operations.
+The fast rasterizers are tested against it. In float32 it is also the benchmark's baseline, as a vectorized PyTorch
+rasterizer: raster tiles are batched by the number of their Gaussians, and each batch takes a few tensor operations.
 """
 
 from __future__ import annotations
@@ -67,7 +66,10 @@ def perspective_derivative(centers: Tensor, camera: Camera) -> Tensor:
 
 
 def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
-    """Project Gaussians (EWA, Zwicker et al. 2002) in float64, and drop those that reach no pixel."""
+    """Project Gaussians (EWA, Zwicker et al. 2002) in float64.
+
+    Gaussians closer than the near plane, with an opacity below ALPHA_MIN, or with non-finite values are dropped.
+    """
     pose = camera.world_to_camera.double()
     centers = scene.means.double() @ pose[:3, :3].T + pose[:3, 3]
     index = torch.nonzero(centers[:, 2] >= near)[:, 0]
@@ -94,7 +96,7 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
             reach * r.sqrt(),
         ]
     )
-    # An overflowing determinant would leave u_scale = 0: finite, but the fast projection drops this Gaussian.
+    # If the determinant overflows, u_scale is 0, which is finite. So test the determinant too, as `projection` does.
     usable = columns.isfinite().all(0) & det.isfinite()
     keep = torch.nonzero(usable & (opacity >= ALPHA_MIN))[:, 0]
     keep = keep[torch.sort(centers[keep, 2], stable=True).indices]
@@ -167,10 +169,10 @@ class ReferenceRasterizer:
         return plain_survey(self, camera)
 
     def near_cutoff(self, camera: Camera, tolerance: float, rows: Rows | None = None) -> Tensor:
-        """Return the mask [h, width] bool of pixels where a decision is close.
+        """Return the mask [h, width] bool of pixels with an alpha or a transmittance close to its cutoff.
 
-        There, an alpha or a transmittance is within a relative `tolerance` of its cutoff. Only in these pixels can
-        another rasterizer, because of its rounding, skip what this one blends, or the reverse.
+        Close means within a relative `tolerance`. Only in these pixels can a rasterizer with other rounding skip a
+        Gaussian that this rasterizer blends, or the reverse.
         """
         start, stop = check_rows(camera, rows)
         doubtful = torch.zeros((stop - start) * camera.width + 1, dtype=torch.bool)
@@ -193,7 +195,7 @@ class ReferenceRasterizer:
             going_on = after > TRANSMITTANCE_MIN
             before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
             weights = torch.where(going_on, alpha * before, 0)
-            # transmittance only decreases: its last value is its minimum
+            # transmittance only decreases, so its last value is its minimum
             left = torch.where(going_on, after, 1).amin(-1)
             yield pixels, splats.gaussians, weights, left
 
@@ -227,8 +229,8 @@ class ReferenceRasterizer:
         """Return the tile intersections of a camera.
 
         Returns:
-            Splats with an empty one appended, ranks by raster tile with the empty splat's rank last, and number of
-                ranks per tile.
+            Splats with an empty one appended; depth-order indices of the splats in each raster tile, followed by the
+                index of the empty splat; and number of splats per tile.
         """
         key = camera_key(camera)
         if self._prepared is None or self._prepared[0] != key:
@@ -244,9 +246,9 @@ class ReferenceRasterizer:
 
 
 def tile_intersections(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return the ranks of the splats in each raster tile, and their number per tile [tiles].
+    """Return the depth-order indices of the splats in each raster tile, and the number of splats per tile [tiles].
 
-    Extents are enlarged by one pixel.
+    Extents are enlarged by one pixel as a safety margin.
     """
     across, down = -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
 

@@ -59,8 +59,8 @@ class CountedStrips:
 class WeightStrips:
     """Cached blend weights of one band of a view.
 
-    Weights are stored for the rows that a Gaussian reaches in a strip of 8 columns by 16 rows: 8 values per row,
-    float32 or float16.
+    A strip is 8 columns by 16 rows. Weights are stored in float32 or float16, for those blocks of 4 rows of a strip in
+    which a Gaussian has weights.
     """
 
     def __init__(self, counted: CountedStrips, precision: Precision) -> None:
@@ -88,7 +88,7 @@ class WeightStrips:
         )
         transmittance = np.ones((band[1] - band[0], counted.camera.width), dtype=np.float32)
         self.transmittance = torch.from_numpy(transmittance)
-        # Used by one thread at a time: see `kernel_threads`.
+        # This buffer can be reused, because `kernel_threads` lets only one thread run kernels at a time.
         self._slot_gradients = np.empty((items, 3), dtype=np.float32)
         tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values, self.gaussians)
         with kernel_threads():

@@ -23,7 +23,7 @@ from sgsst_core.rasterizer.projection import Outcome, Projection, Shapes, projec
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Positions in the arrays are 32-bit integers.
+#: Maximum number of pairs of Gaussian and raster tile, since their positions are 32-bit integers.
 MAX_INTERSECTIONS = 2**31 - 1
 #: Bytes per pair of Gaussian and raster tile: rank, slot, and the slot's gradient in the backward pass.
 _PAIR_BYTES = 4 + 4 + 12
@@ -38,12 +38,13 @@ class TileIntersections:
     """Tile intersections of a view.
 
     A Gaussian intersects a raster tile if its support overlaps a pixel row of the tile within the tile's columns. Every
-    pair of Gaussian and tile has a *slot*; the slots of one Gaussian are contiguous.
+    pair of Gaussian and tile has an *entry*, its index in tile order, and a *slot*, its index in Gaussian order: the
+    slots of one Gaussian are contiguous.
 
     Attributes:
-        projection: V Gaussians, front to back. The index of a Gaussian in this order is its *rank*.
+        projection: V Gaussians, front to back. The index of a Gaussian in this depth order is its *rank*.
         starts: [tiles + 1] int64, first entry of each tile; tiles are in row-major order.
-        ranks: [E] int32, rank of each entry, front to back within a tile.
+        ranks: [E] int32, rank of each entry's Gaussian, front to back within a tile.
         slots: [E] int32, slot of each entry.
         first_slots: [V + 1] int64, first slot of each rank.
     """
@@ -76,7 +77,7 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
 def build_tile_intersections(
     scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes | None = None
 ) -> TileIntersections:
-    """Project a scene, sort it by depth, and compute the tile intersections.
+    """Project a scene, sort its Gaussians by depth, and compute the tile intersections.
 
     Args:
         scene: Scene to project.
@@ -86,7 +87,7 @@ def build_tile_intersections(
 
     Raises:
         TooManyIntersectionsError: If there are more pairs of Gaussian and tile than 32-bit positions can address or
-            free memory can hold. They are counted before they are allocated.
+            free memory can hold. The pairs are counted before memory for them is allocated.
     """
     projection = project(scene, camera, near=near, shapes=shapes)
     values, size = projection.values, (camera.width, camera.height)
@@ -111,7 +112,9 @@ def build_tile_intersections(
 
 
 def intersections_of_subset(isects: TileIntersections, places: NDArray[np.int32]) -> TileIntersections:
-    """Restrict tile intersections to a subset of the Gaussians; gives the same arrays as `build_tile_intersections`.
+    """Restrict tile intersections to a subset of the Gaussians.
+
+    The arrays are the same as those of `build_tile_intersections` for the subset.
 
     Args:
         isects: Intersections of the whole scene.
@@ -122,7 +125,7 @@ def intersections_of_subset(isects: TileIntersections, places: NDArray[np.int32]
         gaussians = np.empty(len(projection.gaussians), dtype=np.int32)
         take_places(places, projection.gaussians, gaussians)
         kept = gaussians >= 0
-        # For every rank: its new rank (-1 if removed), and the offset by which its slots move.
+        # For every rank: its new rank (-1 if removed), and the number of positions by which its slots move down.
         ranks = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
         first_slots = run_starts(np.where(kept, np.diff(isects.first_slots), 0))
         moves = (isects.first_slots - first_slots)[:-1]
@@ -151,7 +154,7 @@ def check_intersections(total: int, gaussians: int, camera: Camera) -> None:
 def _check_memory(total: int, gaussians: int, camera: Camera) -> None:
     """Raise TooManyIntersectionsError if `total` pairs do not fit in free memory.
 
-    Allocating them would succeed nonetheless, and the process would be killed when it writes to them.
+    Without this check, the allocation would succeed, and the process would be killed when it writes to the memory.
     """
     needed, free = total * _PAIR_BYTES, psutil.virtual_memory().available
     if needed > free:
@@ -171,7 +174,7 @@ def _refusal(total: int, gaussians: int, camera: Camera, reason: str) -> TooMany
 @compiled()
 def _tile_rows(value, height):
     """Return the pixel rows (first, last) of the image within a Gaussian's extents; last < first if there are none."""
-    # np, not math: in compiled code math.ceil returns int64, which overflows for extents beyond 9e18 pixels.
+    # Use np.ceil: in compiled code, math.ceil returns int64, which overflows for extents above 9e18 pixels.
     first = max(0.0, np.ceil(value[1] - value[7] - 0.5))
     last = min(height - 1.0, np.floor(value[1] + value[7] - 0.5))
     return int(first), int(max(last, -1.0))
@@ -179,10 +182,11 @@ def _tile_rows(value, height):
 
 @compiled()
 def _tile_span(value, first, last, width):
-    """Return the tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last within its extents.
+    """Return the range (begin, end) of tile columns that a Gaussian's support reaches in pixel rows first..last.
 
-    The right edge of an ellipse is concave in y, with its maximum at dy = SKEW * EXTENT_Y^2 / EXTENT_X; the left edge
-    is its point reflection. Over an interval, each edge is extreme there or at the nearer end.
+    These rows must be within the Gaussian's extents. The right edge of an ellipse is concave in y, with its maximum at
+    dy = SKEW * EXTENT_Y^2 / EXTENT_X; the left edge is its point reflection. In an interval of rows, an edge is extreme
+    at this point or, if it is outside the interval, at the nearer end.
     """
     top, bottom = first + 0.5 - value[1], last + 0.5 - value[1]
     widest = value[2] * value[7] * (value[7] / value[6]) if value[6] > 0 else 0.0
@@ -200,13 +204,16 @@ def _tile_span(value, first, last, width):
 
 @compiled()
 def _own_part(step, threads):
-    """Return the part for a step. Every thread gets parts from front to back, because nearer ones are more work."""
+    """Return the part of the Gaussians for a step of a parallel loop.
+
+    Every thread gets parts from all depths, because nearer parts take more work.
+    """
     return step % _PARTS * threads + step // _PARTS
 
 
 @compiled(parallel=True)
 def _count_tiles(values, width, height, parts, threads, counts, places):
-    """Count the tiles that each Gaussian intersects, and the Gaussians of each part that intersect each tile."""
+    """Count the tiles that each Gaussian intersects, and for each tile the Gaussians of each part that intersect it."""
     across = (width + _TILE - 1) // _TILE
     for step in numba.prange(parts.size - 1):
         part = _own_part(step, threads)
@@ -224,7 +231,10 @@ def _count_tiles(values, width, height, parts, threads, counts, places):
 
 @compiled(parallel=True)
 def _fill_tiles(values, width, height, parts, threads, first_slots, places, ranks, slots):
-    """Sort all pairs by tile (counting sort). Gaussians are processed in depth order, so every tile is depth-sorted."""
+    """Sort all pairs of Gaussian and tile by tile (counting sort).
+
+    Gaussians are processed in depth order, so the entries of every tile are sorted by depth.
+    """
     across = (width + _TILE - 1) // _TILE
     for step in numba.prange(parts.size - 1):
         part = _own_part(step, threads)

@@ -1,8 +1,8 @@
 """Test whether a GPU rasterizer works on this machine, by rendering a single Gaussian.
 
-A package that can be imported may still lack compiled kernels, or have those of another CUDA version. This shows only
-at their first use, which would otherwise be in the middle of a job. gsplat compiles its kernels at that point, and
-processes that do so at the same time delete each other's files, so they take turns.
+A package that can be imported may still lack compiled kernels, or contain kernels for another CUDA version. Such errors
+appear only when a kernel is first used, which would otherwise be in the middle of a job. gsplat compiles its kernels at
+first use. Processes that compile at the same time delete each other's files, so a lock serializes them.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from sgsst_core.scene.gaussians import Scene
 def drawing_problem(name: RasterizerName, device: torch.device | str = "cuda") -> str | None:
     """Return the reason why a rasterizer cannot render on a device, as a short text; None if it can.
 
-    Takes minutes if kernels have to be compiled, by this or another process. Afterwards they are cached.
+    Takes minutes if this or another process has to compile kernels. The compiled kernels are cached.
     """
     try:
         with one_at_a_time(build_folder()):
             drawn = _draws(name, device)
-    except Exception as error:  # whatever the exception, it cannot be used
+    except Exception as error:  # whatever the exception, the rasterizer is unusable
         return (str(error).strip().splitlines() or [type(error).__name__])[0]
     return None if drawn else "it draws nothing"
 
@@ -59,10 +59,10 @@ def build_folder() -> Path:
 
 @contextmanager
 def one_at_a_time(folder: Path) -> Iterator[None]:
-    """Hold an exclusive lock of a folder, across processes, inside a `with` block.
+    """Hold an exclusive lock of a folder, which all processes respect, inside a `with` block.
 
-    The operating system releases the lock of a process that dies. If the folder cannot be written, nothing can be
-    compiled there either, so nothing is locked.
+    The operating system releases the lock of a process that dies. If the folder is not writable, do not lock it:
+    nothing can be compiled there either.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

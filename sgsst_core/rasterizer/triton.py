@@ -1,11 +1,11 @@
-"""`triton`: float32 on a GPU, without requiring a compiler.
+"""`triton`: float32 rasterizer on a GPU, without requiring a compiler.
 
 The same source runs on the CPU in Triton's interpreter.
 
 Tile intersections are computed on the device: a projection kernel, a sort of the Gaussians by depth, and a sort of the
-(Gaussian, raster tile) pairs by tile. Both are PyTorch's radix sorts. The second sort is stable and its key is only the
-tile, because pairs are generated in depth order. This needs half the bits of a combined key, and Gaussians of equal
-float32 depth keep the order of their float64 depths.
+(Gaussian, raster tile) pairs by tile. Both sorts are PyTorch's radix sorts. The second sort is stable, so its key can
+be the tile alone, because pairs are generated in depth order. This takes half the bits of a combined key, and Gaussians
+of equal float32 depth keep the order of their float64 depths.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from sgsst_core.scene.gaussians import Scene
 #: exp(-power) = 2^-(u^2 + w^2) if u and w are scaled by this factor, as in `projection`.
 _TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
 _SUPPORT_BITS = -math.log2(ALPHA_MIN)
-#: Default budget for tile intersections in bytes; they take some 80 per visible Gaussian and 8 per Gaussian-tile pair.
+#: Default budget for tile intersections in bytes. They take about 80 bytes per visible Gaussian and 8 bytes per pair of
+#: Gaussian and tile.
 DEFAULT_INTERSECTION_BYTES = 4 << 30
 
 
@@ -44,7 +45,7 @@ class DeviceIntersections:
         gaussians: [V] int64, indices into the scene, front to back.
         values: [V, 8] float64, see `projection.Column`.
         starts: [tiles + 1] int64, first entry of each tile.
-        ranks: [E] int32, rank of each entry, front to back within a tile.
+        ranks: [E] int32, rank (index into `gaussians`) of each entry, front to back within a tile.
         slots: [E] int32, slot of each entry; the slots of one Gaussian are contiguous.
         first_slots: [V + 1] int64, first slot of each rank.
     """
@@ -68,19 +69,20 @@ class DeviceIntersections:
 class TritonRasterizer:
     """Implementation of `sgsst_core.rasterizer.Rasterizer` in Triton kernels.
 
-    Color gradients are reproducible bit for bit on one machine: every pair of Gaussian and tile has a slot of its own,
-    and slots are added in a fixed order. Bands of rows put together are bit-identical to the whole view. Tile
-    intersections are cached within a budget (`ViewCache`).
+    Color gradients are reproducible bit for bit on one machine: every pair of Gaussian and tile has a separate slot,
+    and slots are added in a fixed order. The concatenated images of bands are bit-identical to that of the whole view.
+    Tile intersections are cached within a budget (`ViewCache`).
 
     Args:
         scene: Scene, whose geometry must not change during this object's lifetime.
         background: RGB color behind pixels that Gaussians leave uncovered.
         near: Near plane in world units.
-        device: GPU, or the CPU if Triton's interpreter is on (TRITON_INTERPRET=1). None for the GPU if there is one.
+        device: GPU, or the CPU if Triton's interpreter is enabled (TRITON_INTERPRET=1). None for the current GPU; if
+            there is no GPU and the interpreter is enabled, the CPU.
         alpha_max: Upper limit of alpha.
         max_intersection_bytes: Memory budget for tile intersections in bytes.
-        beside: Rasterizer whose budget for tile intersections this one shares, with lower priority, instead of
-            `max_intersection_bytes`; None for a budget of its own.
+        beside: Rasterizer whose budget for tile intersections is shared, with lower priority, instead of using
+            `max_intersection_bytes`; None for a separate budget.
 
     Raises:
         SettingsError: If Triton is missing or cannot run on the device.
@@ -156,7 +158,7 @@ class TritonRasterizer:
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N], in one pass.
 
-        Bit-identical to `coverage`, and to a column of `color_gradient` of ones.
+        Bit-identical to `coverage`, and to a column of `color_gradient` for an image gradient of ones.
         """
         from sgsst_core.rasterizer import triton_kernels as kernels
 
@@ -206,7 +208,7 @@ class TritonRasterizer:
         }
 
     def _build(self, camera: Camera) -> DeviceIntersections:
-        """Project, sort by depth and compute tile intersections; synchronizes with the device once."""
+        """Project and sort the Gaussians and compute tile intersections; synchronizes with the device once."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         count, block = len(self.scene), kernels.PROJECTED.value
@@ -256,10 +258,10 @@ def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: 
 
 
 def _usable_device(device: torch.device | str | None) -> torch.device:
-    """Return the device with its index.
+    """Validate the device and return it; a GPU is returned with its index.
 
     Raises:
-        SettingsError: If Triton is missing or cannot run there.
+        SettingsError: If Triton is missing or cannot run on the device.
     """
     try:
         import triton
@@ -285,12 +287,12 @@ def _usable_device(device: torch.device | str | None) -> torch.device:
 
 
 def _numbers(camera: Camera, near: float) -> list[float]:
-    """Return the camera parameters of the projection kernel, in its order."""
+    """Return the camera parameters in the order that the projection kernel expects."""
     pose = camera.world_to_camera.double()[:3].flatten().tolist()
     return [*pose, camera.fx, camera.fy, camera.cx, camera.cy, float(camera.width), float(camera.height), near]
 
 
 def tiles_of(camera: Camera, band: Rows) -> tuple[int, int]:
-    """Return the number of raster tiles across the view, and in the tile rows that a band intersects."""
+    """Return the number of raster tiles per tile row, and in all tile rows that a band intersects."""
     across = tile_grid(camera)[0]
     return across, across * (-(-band[1] // RASTER_TILE) - band[0] // RASTER_TILE)

@@ -1,8 +1,8 @@
 """Cached blend weights on a GPU: pieces of 4 x 4 pixels, computed and applied by Triton kernels.
 
 See `triton_cached_kernels` for the layout. A piece takes 40 bytes in half precision and 72 in float32. Including data
-per tile, Gaussian and pixel, that is 3.0 to 3.4 and 5.3 to 6.1 bytes per weight for a scene of large Gaussians, and 7.1
-and 12.2 for one whose Gaussians cover few pixels.
+per tile, Gaussian and pixel, a weight takes 3.0 to 3.4 bytes in half precision and 5.3 to 6.1 bytes in float32 for a
+scene of large Gaussians, and 7.1 and 12.2 bytes for a scene whose Gaussians cover few pixels.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class CountedPieces:
         slot_pieces: [E] int32, pieces of every pair of Gaussian and raster tile.
         block_pieces: [16 tiles] int32, pieces of every block in the band's tiles.
         masks: [E] int32, bit mask of the blocks of its tile in which each pair has weights.
-        ends: [tiles] int64, entry at which each tile is finished.
+        ends: [tiles] int64, entry of each tile after which all of its pixels are finished.
     """
 
     def __init__(self, rasterizer: TritonRasterizer, camera: Camera, band: Rows) -> None:

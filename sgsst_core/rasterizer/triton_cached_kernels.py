@@ -1,14 +1,14 @@
 """GPU kernels for cached blend weights: count, store, apply, transpose.
 
 A raster tile is divided into 16 blocks of 4 x 4 pixels. A piece is one Gaussian in one block: 16 weights in row-major
-order, and two indices. The pieces of a block are contiguous, front to back, so a program reads only what it needs, as
-one stream, and accumulates in registers. Blocks of 4 x 4 have the least overhead of padding and indices: on trained
-scenes, larger blocks take up to a third more bytes, and smaller ones take no fewer.
+order, and two indices. The pieces of a block are contiguous, front to back, so a program reads only the pieces that it
+needs, as one stream, and accumulates in registers. Blocks of 4 x 4 have the least overhead of padding and indices: on
+trained scenes, larger blocks take up to a third more memory, and smaller blocks do not take less.
 
-Weights are those of `triton_kernels.blend_weights`. They are computed twice, by two kernels that the compiler may round
-differently. Which blocks have a weight is therefore decided once, by `count_pieces`, and `keep_pieces` follows its
-masks. In float16, weights are multiplied by `HALF_SCALE`, which makes even the smallest of them (4e-7) a normal number,
-with a relative error of at most 2^-11.
+Weights are those of `triton_kernels.blend_weights`. They are computed twice, by two kernels whose rounding may differ
+after compilation. Therefore only `count_pieces` decides which blocks have a weight, and `keep_pieces` uses its masks.
+In float16, weights are multiplied by `HALF_SCALE`, which makes even the smallest weight (4e-7) a normal number, with a
+relative error of at most 2^-11.
 
 There are no atomics, so results are reproducible bit for bit.
 """
@@ -25,7 +25,8 @@ from sgsst_core.rasterizer.triton_kernels import blend_weights
 
 #: Blocks per raster tile, weights per piece, and pieces that a program reads per step.
 BLOCKS, PIECE, PIECES = tl.constexpr(16), tl.constexpr(16), tl.constexpr(16)
-#: 0.99 times this is in the range of float16, and the smallest weight is a normal number.
+#: Factor of weights stored in float16. Products with the largest weight (0.99) are in the range of float16, and those
+#: with the smallest weight are normal numbers.
 HALF_SCALE = 2.0**14
 _TILE: tl.constexpr = tl.constexpr(16)
 _PIXELS: tl.constexpr = tl.constexpr(256)
@@ -71,7 +72,7 @@ def count_pieces(
         masks: Output [E] int32, one bit per block; zeros on entry.
         slot_pieces: Output [E] int32, pieces by the pair's slot; zeros on entry.
         block_pieces: Output [16 tiles] int32, pieces of every block in the band's tiles.
-        ends: Output [tiles] int64, entry at which each of the band's tiles is finished.
+        ends: Output [tiles] int64, entry of each of the band's tiles after which all pixels are finished.
     """
     tile = first_row // _TILE * across + tl.program_id(0)
     x0, y0, inside, _ = _tile_pixels(tile, width, first_row, last_row, across)
@@ -103,7 +104,7 @@ def keep_pieces(
     """Store the pieces counted by `count_pieces`, and the final transmittance [h, width] of the band.
 
     Args:
-        slot_starts: [E + 1], first piece of each pair among those of its Gaussian.
+        slot_starts: [E + 1], first piece slot of each pair; the piece slots of one Gaussian are contiguous.
         block_starts: [16 tiles + 1], first piece of each block of the band.
         piece_gaussians: Output [P] int32, indices into the scene.
         piece_slots: Output [P], slot of each piece's gradient.

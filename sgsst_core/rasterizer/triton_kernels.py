@@ -1,10 +1,10 @@
 """GPU kernels of the `triton` rasterizer: projection, tile intersections, compositing and its transpose.
 
 The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (set TRITON_INTERPRET=1 before the first
-import). Numerics follow `projection` and `vectors`: geometry is float64, down to the offset of a pixel row from a
-Gaussian's axis; alpha and everything after it is float32. Compositing and its transpose go front to back, so no
-transmittance is recovered by dividing by 1 - alpha of many Gaussians. There are no atomics, so results are reproducible
-bit for bit.
+import). Numerics follow `projection` and `vectors`: geometry, including the offset of a pixel row from a Gaussian's
+axis, is computed in float64; alpha and all later values in float32. Compositing and its transpose go front to back, so
+transmittance never has to be recovered by repeated division by 1 - alpha. There are no atomics, so results are
+reproducible bit for bit.
 """
 
 # Arguments are untyped: Triton compiles one version per argument type.
@@ -17,7 +17,7 @@ import triton.language as tl
 
 #: Gaussians projected per program, and Gaussians blended per step.
 PROJECTED, BLENDED = tl.constexpr(128), tl.constexpr(32)
-#: Gaussians per program of `add_slots`, and slots of each that it reads per step.
+#: Gaussians per program of `add_slots`, and slots per Gaussian that it reads per step.
 ADDED, SLOTS = tl.constexpr(32), tl.constexpr(16)
 _TILE: tl.constexpr = tl.constexpr(16)
 _PIXELS: tl.constexpr = tl.constexpr(256)
@@ -46,7 +46,7 @@ def _tile_rows(value_y, extent_y, height):
 
 @triton.jit
 def _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, first, last, width):
-    """Return the tiles (begin, end) that a Gaussian's support reaches in pixel rows first..last.
+    """Return the range (begin, end) of tile columns that a Gaussian's support reaches in pixel rows first..last.
 
     See `tile_intersections._tile_span`.
     """
@@ -66,9 +66,9 @@ def _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, first,
 
 @triton.jit
 def _span_of_row(down, first, last, x, y, skew, u_scale, w_scale, support, extent_x, extent_y, width):
-    """Return the tiles (begin, end) that Gaussians reach in tile row `down`.
+    """Return the range (begin, end) of tile columns that each Gaussian reaches in tile row `down`.
 
-    There are none outside their pixel rows first..last.
+    The range is empty if the tile row contains none of the Gaussian's pixel rows first..last.
     """
     top = tl.maximum(first, down * _TILE)
     bottom = tl.minimum(last, down * _TILE + _TILE - 1)
@@ -156,7 +156,7 @@ def project(
     tl.store(row + 6, extent_x, mask=visible)
     tl.store(row + 7, extent_y, mask=visible)
     tl.store(depths + p, tl.where(visible, z, float("inf")), mask=there)
-    # Values of invisible Gaussians may be NaN: replace them with numbers, and give them no rows.
+    # Values of invisible Gaussians may be NaN: replace them with numbers, and set their range of rows to empty.
     v, extent_y = tl.where(visible, v, 0.0), tl.where(visible, extent_y, 0.0)
     u, extent_x = tl.where(visible, u, 0.0), tl.where(visible, extent_x, 1.0)
     skew, u_scale, w_scale = (
@@ -230,7 +230,8 @@ def blend_weights(
 ):  # fmt: skip
     """Return the blend weights [K, 256] of the next K entries of a tile, and the transmittance [256] behind them.
 
-    A finished pixel has a transmittance of 0 or less: its final value, negated. `values` is indexed by rank.
+    A finished pixel has a transmittance of 0 or less, which is its negated final transmittance. `values` is indexed by
+    rank.
     """
     j = k + tl.arange(0, K)
     there = j < end
@@ -258,7 +259,7 @@ def blend_weights(
 
 @triton.jit
 def tile_pixels(tile, across, width, first_row, last_row):
-    """Return the corner (x0, y0) of a raster tile, x and y of its pixels [PIXELS], and which are in the band."""
+    """Return the corner (x0, y0) of a raster tile, x and y of its pixels [256], and which pixels are in the band."""
     x0, y0 = tile % across * _TILE, tile // across * _TILE
     pixel = tl.arange(0, _PIXELS)
     x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
@@ -355,8 +356,8 @@ def survey(
 ):  # fmt: skip
     """Compute the final transmittance [h, width] of a whole view, and the sum of weights of each pair in its slot [E].
 
-    Slots must be zero on entry. Equals `render` and `slot_gradients` of ones, but in one pass; one program per raster
-    tile.
+    Slots must be zero on entry. The results equal those of `render`, and of `slot_gradients` for an image gradient of
+    ones, but take only one pass. There is one program per raster tile.
     """
     tile = tl.program_id(0)
     x0, y0, x, y, inside = tile_pixels(tile, across, width, 0, height)

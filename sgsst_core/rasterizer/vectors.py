@@ -1,8 +1,9 @@
 """SIMD inner loops over pixels for the Numba kernels.
 
-Plain loops would be compiled for long arrays: four vectors at a time, with a scalar remainder. The weights of a
-Gaussian in a raster tile are only some twenty vectors, so much of the time would go into remainders. LLVM lowers these
-vector types to the processor's own (one 256-bit register, two of 128 bits, ...). Bounds are not checked.
+LLVM would optimize plain loops for long arrays: four vectors at a time, with a scalar remainder. The weights of a
+Gaussian in a raster tile are only some twenty vectors, so remainders would take much of the time. The explicit vector
+types used instead are lowered by LLVM to the processor's registers (one of 256 bits, two of 128 bits, ...). Array
+bounds are not checked.
 """
 
 # Arguments are untyped: Numba compiles one version per argument type.
@@ -35,9 +36,9 @@ _ROW_BITS = ir.VectorType(ir.IntType(32), RASTER_TILE)
 _EXP2_SERIES = (
     np.polynomial.Chebyshev.interpolate(np.exp2, 6, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
 )
-#: Adding 1.5 * 2^23 to a small float32 rounds it to an integer, which is then in the low bits.
+#: Adding 1.5 * 2^23 to a small float32 rounds it to an integer, which is then in the low bits of the sum.
 _ROUNDER = 12582912.0
-#: The only permitted relaxation of the arithmetic: a product and a sum may be rounded once.
+#: Only permitted relaxation of floating-point rules: a product and a sum may be fused, with a single rounding.
 _FUSED = ("contract",)
 
 #: Half precision stores weight * 2^HALF_EXPONENT. The smallest weight, ALPHA_MIN * TRANSMITTANCE_MIN, and the largest,
@@ -59,7 +60,7 @@ def _number(value: int) -> Any:
 
 
 def _lane_sum(builder: Any, lanes: Any) -> Any:
-    """Sum the lanes, folding the upper half onto the lower one until one is left."""
+    """Sum the lanes: add the upper half to the lower half until one lane is left."""
     half = LANES // 2
     while half:
         order = [(lane + half) % LANES for lane in range(LANES)]
@@ -79,7 +80,7 @@ def _load(builder: Any, pointer: Any, vector_type: Any = _VECTOR, align: int = 4
 
 
 def _load_weights(builder: Any, array_type: types.Array, pointer: Any) -> Any:
-    """Load 8 weights: float32 as they are; half-precision bits shifted into place, with the exponent scaled back."""
+    """Load 8 weights as float32; bits of half-precision weights are shifted, and the exponent is scaled back."""
     if array_type.dtype == types.float32:
         return _load(builder, pointer)
     wide = ir.VectorType(ir.IntType(32), LANES)
@@ -105,8 +106,8 @@ def blend_row(typingctx, block, row, u, u_scale, log2_alpha, alpha_max):
     """Blend one Gaussian into a row of 16 pixels. block [2, 16, 16] holds transmittances and receives weights.
 
     Pixel i: alpha = min(2^(log2_alpha - (u + i u_scale)^2), alpha_max), or 0 below ALPHA_MIN; weight = alpha T; T
-    becomes T (1 - alpha). If T would fall to TRANSMITTANCE_MIN, nothing is blended and the pixel is finished: its T is
-    stored negated, so it accepts no further weight, and a single comparison serves both the cutoff and its memory.
+    becomes T (1 - alpha). If T would fall to TRANSMITTANCE_MIN, the Gaussian is not blended and the pixel is finished:
+    its T is stored negated, so a single comparison rejects both this Gaussian and all later ones.
 
     Returns 1 if some pixel of the row is unfinished, else 0.
     """
@@ -124,7 +125,7 @@ def blend_row(typingctx, block, row, u, u_scale, log2_alpha, alpha_max):
         alpha = _exp2(builder, power)
         alpha = builder.select(builder.fcmp_ordered("<", alpha, alpha_max_), alpha, alpha_max_)
         seen = builder.fcmp_ordered(">=", power, _row([math.log2(ALPHA_MIN)]))
-        alpha = builder.select(seen, alpha, _row([0.0]))  # discards the result for powers far below the cutoff
+        alpha = builder.select(seen, alpha, _row([0.0]))  # also discards invalid results of `_exp2` for low powers
 
         before = _load(builder, held, _ROW)
         after = builder.fmul(before, builder.fsub(_row([1.0]), alpha))
@@ -163,7 +164,7 @@ def _exp2(builder: Any, power: Any) -> Any:
 
 @intrinsic
 def keep_vector(typingctx, source, begin, weights, target):
-    """Store weights[target + i] = source[begin + i] for 8 floats; half precision rounds to nearest even."""
+    """Store weights[target + i] = source[begin + i] for 8 floats, rounded to nearest even in half precision."""
     if not _is_weights(weights):
         return None
     signature = types.void(source, types.int64, weights, types.int64)
@@ -195,7 +196,7 @@ def keep_vector(typingctx, source, begin, weights, target):
 def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, blue):
     """Compute pixels[offset + v, c, i] += weights[begin + 8 v + i] * color[c] for v < vectors, 3 channels, 8 lanes.
 
-    `weights` is flat, float32 or half-precision bits (uint16); `pixels` is [P, 3, 8] float32. Nothing is checked.
+    `weights` is flat, float32 or half-precision bits (uint16); `pixels` is [P, 3, 8] float32. Bounds are not checked.
     """
     if not _is_weights(weights):
         return None
@@ -224,7 +225,7 @@ def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, b
 def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
     """Return the three sums over v < vectors and lanes i of weights[begin + 8 v + i] * pixels[offset + v, c, i].
 
-    Each lane is summed in order, then the lanes pairwise, so the result is deterministic. Arrays are as in
+    Each lane is summed in order, then the lanes are added pairwise, so the result is deterministic. Arrays are as in
     `add_scaled`.
     """
     if not _is_weights(weights):
@@ -256,7 +257,7 @@ def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
 def sum_weights(typingctx, weights, begin, vectors):
     """Return the sum over v < vectors and lanes i of weights[begin + 8 v + i].
 
-    Bit-identical to `dot_pixels` with pixels of 1. `weights` is flat, float32. Nothing is checked.
+    Bit-identical to `dot_pixels` with pixels of 1. `weights` is flat, float32. Bounds are not checked.
     """
     if not _is_weights(weights) or weights.dtype != types.float32:
         return None
@@ -277,7 +278,7 @@ def sum_weights(typingctx, weights, begin, vectors):
 
 @intrinsic
 def prefetch(typingctx, values, place):
-    """Prefetch the cache line of an element of the flat array `values`; only a hint, which cannot fail."""
+    """Prefetch the cache line of an element of the flat array `values`. This is only a hint and cannot fail."""
     if not isinstance(values, types.Array) or values.layout != "C":
         return None
     signature = types.void(values, types.int64)
@@ -301,7 +302,7 @@ def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
     """Compute pixels[offset + row, c, i] += sum of weights[32 piece + 8 row + i] * colors[items[piece], c].
 
     Sums over pieces first..first + count in order; 4 rows, 3 channels, 8 lanes. `weights` is flat, float32 or
-    half-precision bits (uint16); `items` is int32; `colors` [I, 3] and `pixels` [P, 3, 8] are float32. Nothing is
+    half-precision bits (uint16); `items` is int32; `colors` [I, 3] and `pixels` [P, 3, 8] are float32. Bounds are not
     checked.
     """
     if not _is_weights(weights):
@@ -340,7 +341,7 @@ def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
 def dot_pieces(typingctx, weights, items, first, count, pixels, offset, sums):
     """Compute sums[items[piece], c, i] += weights[32 piece + 8 row + i] * pixels[offset + row, c, i] for 4 rows.
 
-    Processes pieces first..first + count in order. `sums` is [I, 3, 8] float32; the others are as in `add_pieces`.
+    Processes pieces first..first + count in order. `sums` is [I, 3, 8] float32; other arrays are as in `add_pieces`.
     """
     if not _is_weights(weights):
         return None
@@ -371,7 +372,7 @@ def dot_pieces(typingctx, weights, items, first, count, pixels, offset, sums):
 
 @intrinsic
 def sum_lanes(typingctx, sums, vector):
-    """Return the sum of the 8 lanes of the vector with this index in an array, folded in halves."""
+    """Return the sum of the 8 lanes of the vector with index `vector` in an array, added as in `_lane_sum`."""
     signature = types.float32(sums, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:

@@ -24,18 +24,18 @@ L = TypeVar("L", bound=Sized)
 
 
 class ViewCache(Generic[L]):
-    """Cache of per-view data. Beyond the budget, only the data of the latest view are held.
+    """Cache of per-view data. Once its memory budget is used up, it stores only the latest view's data in addition.
 
-    Nothing is evicted: views are visited in rounds, so evicting the least recently used one would evict each just
-    before it is needed.
+    No data are evicted to store those of other views: views are visited in rounds, so evicting the least recently used
+    view would evict every view just before it is needed again.
 
     Args:
         build: Function that computes the data of a view.
-        max_bytes: Memory budget in bytes, including what is still in `before`.
-        before: Cache whose data are taken over instead of building new ones, view by view at first use. They count
-            toward the budget until then.
-        adapt: Function applied to data that are taken over; must not make them larger.
-        host: Cache whose budget this one shares, instead of `max_bytes`. The host has priority: it removes entries from
+        max_bytes: Memory budget in bytes, including the data that remain in `before`.
+        before: Earlier cache. At the first use of a view, its data are moved from `before` instead of being built. Data
+            that remain in `before` count toward the budget.
+        adapt: Function applied to data from `before`; must not make them larger.
+        host: Cache whose budget is shared, instead of using `max_bytes`. The host has priority: it removes entries from
             this cache if it needs the space.
     """
 
@@ -62,7 +62,7 @@ class ViewCache(Generic[L]):
 
     @property
     def cached_bytes(self) -> int:
-        """Size of the cached data in bytes, except those of the latest view beyond the budget."""
+        """Size in bytes of the data within the budget, including those in `before`."""
         return self._cached_bytes + (self._before.cached_bytes if self._before else 0)
 
     def of(self, camera: Camera) -> L:
@@ -92,7 +92,7 @@ class ViewCache(Generic[L]):
     def take(self, camera: Camera) -> L | None:
         """Remove the data of a view from the cache and return them; None if they are not cached.
 
-        Data of the latest view beyond the budget are dropped.
+        Data of the latest view that are stored beyond the budget are dropped, even if `camera` is another view.
         """
         with self._lock:
             latest, self._latest = self._latest, None
@@ -119,14 +119,17 @@ class ViewCache(Generic[L]):
             self._cached_bytes -= self._cached.popitem()[1].nbytes
 
     def _bound(self) -> int:
-        """Return the current budget in bytes: with a host, what the host and its other guests leave."""
+        """Return the current budget in bytes.
+
+        If there is a host, return the host's budget minus the data of the host and of other caches that share it.
+        """
         if self._host is None:
             return self._max_bytes
         others = sum(guest.cached_bytes for guest in self._host._guests if guest is not self)
         return self._host._max_bytes - self._host.cached_bytes - others
 
     def _make_room(self) -> None:
-        """Shrink the guests to the remaining budget."""
+        """Remove entries of caches that share this cache's budget until they fit in the rest of it."""
         for guest in list(self._guests):
             with guest._lock:
                 guest._let_go(max(guest._bound(), 0))
