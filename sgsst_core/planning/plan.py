@@ -75,12 +75,12 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Plan:
-    """Decisions for a scene. They are final.
+    """Final decisions for a job.
 
     Attributes:
         survey: Survey of the views.
         optimized: [N] bool, Gaussians whose colors are determined by the views.
-        seen: [N] bool, Gaussians that are rendered: the optimized ones, or all for comparison.
+        seen: [N] bool, Gaussians that are rendered: the optimized ones, or all if the settings ask for it.
         covered: Indices of the views that are stylized.
         weighted: Whether statistics are weighted by coverage.
         training_background: Background of the Gaussians in a step.

@@ -196,7 +196,7 @@ def _front(subject: Subject, up: Tensor) -> Tensor:
 
 
 def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: float) -> float:
-    """Return the smallest distance from the center at which every camera sees all points at offsets [D, 3]."""
+    """Return the smallest distance at which all cameras see all points, given their offsets [D, 3] from the center."""
     origin = torch.zeros(3, dtype=torch.float64)
     distance = 0.0
     for direction in directions:

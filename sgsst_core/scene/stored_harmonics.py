@@ -188,7 +188,7 @@ class StoredHarmonics:
         return self if torch.device(device).type == "cpu" else self.tensor(device)
 
     def tensor(self, device: torch.device | str = "cpu") -> Tensor:
-        """Load all coefficients, [N, K, 3]; without a second copy in CPU memory."""
+        """Load all coefficients, [N, K, 3], without a second copy in CPU memory."""
         values = torch.empty(self.shape, device=device)
 
         def copy(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
