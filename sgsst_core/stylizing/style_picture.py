@@ -19,7 +19,7 @@ from sgsst_core.stylizing.warm_start import in_colors_of, in_luminance_of
 
 
 def prepared_style(style: StyleMixture, settings: Settings, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
-    """Prepare a style as the settings require. The style itself is returned if they require nothing.
+    """Prepare a style as the settings require. If they require nothing, return the style itself.
 
     Args:
         style: Images [H, W, 3] in 0..1.
