@@ -1,6 +1,6 @@
 """All decisions before the first iteration, as a pure function of probe and settings.
 
-It neither renders nor measures anything: the same probe and settings give the same plan on any machine.
+It neither renders nor measures anything: the same probe and settings give the same plan.
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ def _losses_on_background(stylizer: Stylizer) -> list[float]:
 
 
 def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
-    measured = stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step  # in an earlier session
+    measured = stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step  # by an earlier session
     if callbacks.measure and not measured and callbacks.measure.due(stylizer.step):
         callbacks.measure(stylizer)
 

@@ -26,7 +26,7 @@ class JobStyles:
     Attributes:
         own: Default style; if one region contains everything that the views show, the style of that region.
         regions: Regions of the scene; None if there are none.
-        each: Style of each region in `active`; empty if views need no region maps.
+        each: Style of each region in `Regions.active`; empty if views need no region maps.
     """
 
     own: StyleMixture

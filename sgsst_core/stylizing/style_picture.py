@@ -82,8 +82,8 @@ def turned(style: Tensor, degrees: float) -> Tensor:
 def _inside(height: int, width: int, angle: float) -> tuple[int, int]:
     """Return the sides of the largest upright rectangle inside one that is rotated by 0 to pi/2; at least 1.
 
-    Either two of its corners lie on one long side of the rotated rectangle, with half of the short side above it as the
-    limit, or each of its corners lies on a different side.
+    If the rotated rectangle is narrow, two corners of the result lie on one of its long sides, and half of its short
+    side is the limit. Otherwise, each corner of the result lies on a different side.
     """
     sine, cosine = math.sin(angle), math.cos(angle)
     shorter, longer = min(height, width), max(height, width)

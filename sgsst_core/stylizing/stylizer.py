@@ -180,7 +180,7 @@ class Stylizer:
     ) -> Self:
         """Plan a job and create its stylizer; see `make_plan` for `weights`, `rasterizer` and exceptions.
 
-        If the settings refine the scene, the stylizer has the refined one.
+        If the settings request refinement, the stylizer contains the refined scene.
         """
         weights = weights or load_network_weights("auto")
         mixture = StyleMixture.of(style)
@@ -649,16 +649,17 @@ class Stylizer:
         return self._stylized
 
     def shown(self) -> Tensor:
-        """Return sh_dc [n, 3] of the rendered Gaussians, on the rasterizer's device, as output by a job that ends now.
+        """Return sh_dc [n, 3] of the rendered Gaussians in the output of a job that ends now.
 
-        In contrast to `sh_dc`, from which steps continue, it includes the final transfer if there is one.
+        It is on the rasterizer's device. In contrast to `sh_dc`, from which steps continue, it includes the final
+        transfer, if the job has one.
         """
         if not self.transfers_last:
             return self.sh_dc.detach()
         return self.stylized()[self.plan.seen].to(self.sh_dc.device)
 
     def set_colors(self, sh_dc: Tensor) -> None:
-        """Replace the present colors with sh_dc [N, 3] of the whole scene, to evaluate them on these views."""
+        """Replace the present colors with sh_dc [N, 3] of the whole scene, for example to evaluate them."""
         self._stylized = None
         with torch.no_grad():
             self.sh_dc.copy_(sh_dc[self.plan.seen])

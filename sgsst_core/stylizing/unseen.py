@@ -42,9 +42,9 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
 
 
 def _near_each_other(places: Tensor) -> Tensor:
-    """Return an order [U] of points [U, 3] by the cells of a coarse grid.
+    """Return the indices [U] that sort points [U, 3] by the cells of a coarse grid.
 
-    Consecutive neighbor searches then read the same part of a tree.
+    Consecutive neighbor searches then read the same part of the search tree.
     """
     places = places.double()
     lowest = places.amin(dim=0)
