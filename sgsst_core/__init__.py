@@ -1,4 +1,4 @@
-"""Style transfer for 3D Gaussian Splatting scenes: the method, without processes, HTTP or command line."""
+"""Style transfer for 3D Gaussian Splatting scenes: the core library, without command line or HTTP API."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from sgsst_core.stylizing.loop import Callbacks, Progress, run, stylize
     from sgsst_core.stylizing.stylizer import Stylizer
 
-# PyTorch reads this once, before its first tensor. Allocations of two megabytes and more then use huge pages, so a step
-# on a CPU touches a few thousand pages instead of millions. Linux grants them if it can; other systems ignore it.
+# PyTorch reads this variable once, before it allocates its first tensor. Allocations of 2 MB and more then use huge
+# pages, so a step on a CPU touches a few thousand pages instead of millions. Linux provides huge pages if it can; other
+# systems ignore the variable.
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 
 __all__ = ["Callbacks", "Camera", "Progress", "Scene", "Settings", "Stylizer", "make_settings", "run", "stylize"]

@@ -13,46 +13,47 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
 #: Maximum fractions of the total and of the free memory that a job plans with; the rest is for its buffers and for
-#: other programs. The first limit applies as long as half of the memory is free, so the same job on the same machine
-#: gets the same plan, with the same rounding, whatever else is running.
+#: other programs. As long as half of the memory is free, the first limit is the smaller one, so the same job on the
+#: same machine gets the same plan, with the same rounding, whatever else is running.
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
-#: Fraction of the total memory of a GPU, which a job has to itself.
+#: Maximum fraction of a GPU's total memory that a job plans with; a job does not share its GPU.
 GPU_SHARE = 0.7
 #: Fractions of the memory limit by use: see `memory_for`.
 _FRACTIONS = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
 
 
 def memory_for(use: Literal["activations", "views", "rasterizer"], memory: int) -> int:
-    """Return the part of a rank's memory limit in bytes that one use may take.
+    """Return the portion of a rank's memory limit, in bytes, that is reserved for one use.
 
     Args:
-        use: Activations of one iteration; view targets and colors; or the rasterizer's tile intersections and cached
-            weights.
+        use: "activations" for those of one iteration; "views" for view targets and colors; "rasterizer" for tile
+            intersections and cached blend weights.
         memory: Memory limit of the rank in bytes.
     """
     return int(memory * _FRACTIONS[use])
 
 
 def least_intersection_memory(memory: int) -> int:
-    """Return the size in bytes, as part of a rank's memory limit, left for tile intersections next to cached weights.
+    """Return the memory in bytes reserved for tile intersections if blend weights are cached too, given a rank's limit.
 
-    Views whose weights do not fit are rendered from them. The memory is taken from that for views.
+    Views whose blend weights do not fit are rendered from their tile intersections. The memory is taken from the budget
+    for views.
     """
     return memory // 16
 
 
 def measuring_memory(memory: int) -> int:
-    """Return the size in bytes of the cache for novel views, as part of a rank's memory.
+    """Return the cache size in bytes for novel views, given a rank's memory limit.
 
-    The views of the reference may use as much again.
+    The float32 reference has a cache of the same size.
     """
     return memory // 16
 
 
 def default_memory_limit(device: torch.device | None = None) -> int:
-    """Return how many bytes a job may plan with on this machine at present.
+    """Return the default memory budget of a job in bytes, given the memory that is free now.
 
-    They are those of the GPU if `device` is one, else those of the CPU.
+    For a GPU, it is GPU memory; for a CPU or None, it is memory of the machine.
     """
     if device is not None and device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
@@ -62,7 +63,7 @@ def default_memory_limit(device: torch.device | None = None) -> int:
 
 
 def forget_device_peak(device: torch.device | str) -> None:
-    """Reset the counter of `device_peak`."""
+    """Reset the peak that `device_peak` returns."""
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
 
@@ -73,9 +74,10 @@ def device_peak(device: torch.device | str) -> int | None:
 
 
 class Cache(Generic[K, V]):
-    """Cache of values by key within a number of bytes; what does not fit is recomputed at each use.
+    """Cache with a memory budget; values that do not fit are recomputed at each use.
 
-    Nothing is ever evicted: views are visited in rounds, so evicting one would only trade it for another.
+    Values are never evicted: views are visited in rounds, so a value that replaces another one is not needed any
+    sooner.
 
     Args:
         capacity: Memory budget in bytes; None for no limit.
@@ -114,11 +116,11 @@ class Cache(Generic[K, V]):
         return value
 
     def add(self, key: K, count: Callable[[], tuple[int, Callable[[], V]]]) -> None:
-        """Compute and cache the value of a key if it fits, which is decided at the first call for this key.
+        """Compute and cache the value of a key if it fits; only the first call for a key has an effect.
 
         Args:
             key: Key of the value.
-            count: Function that returns the size of the value in bytes and the function that computes it.
+            count: Function that returns the size of the value in bytes, and a function that computes the value.
         """
         with self._lock:
             if key not in self._decided:
@@ -133,7 +135,7 @@ class Cache(Generic[K, V]):
         return key in self.values
 
     def holds(self, key: K, size: int) -> bool:
-        """Return whether the value of a key is cached, or would be because it has at most as many bytes as are free."""
+        """Return whether the value of a key is cached, or a value of `size` bytes would still fit."""
         return key in self.values or self._fits(size)
 
     def clear(self) -> None:

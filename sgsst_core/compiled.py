@@ -14,36 +14,37 @@ import numba
 import numba.core.caching
 import torch
 
-#: Lock of the kernels of this process. Numba's `workqueue` threading layer, the only one that is always available,
-#: aborts the process if two Python threads run parallel kernels at once. A kernel uses every core anyway.
+#: Lock that is held while a kernel runs. Numba's `workqueue` threading layer, the only one that is always available,
+#: aborts the process if two Python threads run parallel kernels at once. Little is lost by running kernels one at a
+#: time, because each uses every core.
 _TURN = threading.RLock()
 
 
-#: Sources of this package that are compiled into kernels of other modules.
+#: Source files whose functions and constants are compiled into kernels of other modules.
 _COMPILED_IN = ("constants.py", "rasterizer/vectors.py", "rasterizer/kernels.py")
 
 
-#: Folders that hold the machine code of the kernels.
+#: Folders in which Numba caches compiled kernels.
 _folders: set[Path] = set()
 
 
 def kernel_folders() -> set[Path]:
-    """Return the folders that hold machine code."""
+    """Return the folders in which Numba caches compiled kernels."""
     return set(_folders)
 
 
 def keep_in_memory(report: Callable[[], None]) -> None:
-    """Do not write newly compiled kernels to disk, because this process may only read the folders.
+    """Cache newly compiled kernels only in memory, for a process that may read but not write the cache folders.
 
     Args:
-        report: Callback for each kernel that the folders lack.
+        report: Callback, called for each kernel that is compiled because the cache folders do not contain it.
     """
     numba.core.caching.Cache.save_overload = lambda self, sig, data: report()  # type: ignore[method-assign]
 
 
 @functools.cache
 def _digest() -> str:
-    """Return a hash of the sources that are compiled into kernels of other modules."""
+    """Return a hash of the source files that are compiled into kernels of other modules."""
     folder = Path(__file__).parent
     content = b"".join((folder / name).read_bytes() for name in _COMPILED_IN)
     return hashlib.sha256(content).hexdigest()[:12]
@@ -52,9 +53,10 @@ def _digest() -> str:
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a `numba.njit` decorator that caches machine code on disk, or only in memory if no folder is writable.
 
-    Numba validates a cached kernel only against its own source file. A hash of the other sources in its machine code is
-    therefore part of its cached name. A kernel may call compiled functions only from these modules (`_COMPILED_IN`).
-    Multiply-adds are contracted, but nothing is reordered, so results do not depend on the number of threads.
+    Numba recompiles a cached kernel only if the kernel's own source file has changed. The cached name therefore
+    contains a hash of the other source files that kernels use (`_COMPILED_IN`). A kernel may call compiled functions
+    only from its own file and from these. Multiplications and additions may be fused, but sums are not reordered, so
+    results do not depend on the number of threads.
     """
     settings: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}, **options}
 
@@ -72,10 +74,11 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 @contextmanager
 def kernel_threads() -> Iterator[None]:
-    """Run parallel kernels in a `with` block: one Python thread at a time, with the number of cores that PyTorch uses.
+    """Run parallel kernels in a `with` block, in one Python thread at a time and on as many cores as PyTorch uses.
 
-    Following `torch.set_num_threads` lets several ranks share the cores of a machine with one setting. If both use the
-    same OpenMP library, Numba's first kernel resets PyTorch to all cores, so the setting is restored.
+    Kernels use the thread count of `torch.set_num_threads`, so this one setting divides a machine's cores among ranks.
+    If Numba and PyTorch use the same OpenMP library, Numba's first kernel resets PyTorch's thread count to all cores,
+    so the count is restored.
     """
     with _TURN:
         threads = torch.get_num_threads()

@@ -1,15 +1,15 @@
 """Constants of the splatting model, each with the reason for its value.
 
-They are those of gsplat 1.6 and of the method it implements, because a scene renders correctly only with the constants
-it was trained with. Compiled kernels contain these values, so change them only here.
+The values are those of gsplat 1.6 and of the original 3DGS, because a scene renders correctly only with the constants
+it was trained with. They are compiled into kernels: edit this file to change one, and do not assign to it at run time.
 """
 
 from __future__ import annotations
 
 import math
 
-#: Real spherical harmonics in the order and with the signs of 3DGS files (Sloan, "Efficient Spherical Harmonic
-#: Evaluation", JCGT 2013). Degree 0: 1 / (2 sqrt(pi)).
+#: Factors of the real spherical harmonics, in the order and with the signs of 3DGS files (Sloan, "Efficient Spherical
+#: Harmonic Evaluation", JCGT 2013). Degree 0: 1 / (2 sqrt(pi)).
 SH_C0 = 0.5 / math.sqrt(math.pi)
 #: Degree 1: sqrt(3 / (4 pi)).
 SH_C1 = math.sqrt(0.75 / math.pi)
@@ -36,31 +36,34 @@ SH_C3 = (
 #: Files store colors relative to mid-gray, so coefficients of zero are gray.
 COLOR_OFFSET = 0.5
 
-#: Variance in square pixels added to both axes of a projected Gaussian: the width of a pixel. Without it, a Gaussian
-#: smaller than a pixel could fall between pixel centers.
+#: Variance in square pixels added to both axes of a projected Gaussian, to account for the size of a pixel. Without it,
+#: a Gaussian smaller than a pixel could fall between pixel centers.
 EPS2D = 0.3
 
 #: Upper limit of alpha: a Gaussian never hides everything behind it, so transmittance stays above zero. gsplat 1.6 and
 #: the original use 0.99; gsplat 1.5.3, the version on PyPI, uses 0.999.
 ALPHA_MAX = 0.99
 
-#: Contributions below one gray level of an 8-bit image are skipped, which also gives a Gaussian finite support.
+#: Minimum alpha, one level of an 8-bit image. Smaller contributions are skipped, which also gives a Gaussian finite
+#: support.
 ALPHA_MIN = 1.0 / 255.0
 
-#: A pixel is finished before its transmittance falls to this value, 1e-4: two opaque Gaussians. It is written as their
-#: product, so that the second one finishes the pixel in float64 as it does in float32 (where 1e-4 itself would not).
+#: Blending of a pixel stops before its transmittance falls to this value: 1e-4, which two Gaussians of maximum alpha
+#: leave. It is written as a product, so that the second of two such Gaussians stops blending in float64 as well as in
+#: float32. The literal 1e-4 would not ensure this.
 TRANSMITTANCE_MIN = (1.0 - ALPHA_MAX) ** 2
 
-#: Smallest depth that is drawn, in world units, as in the original viewers. gsplat trains with 0.01.
+#: Minimum depth of rendered Gaussians in world units, as in the original viewers. gsplat trains with 0.01.
 NEAR = 0.2
 
-#: Limit of the directions at which the perspective is linearized, as a fraction of the half field of view beyond the
-#: image border. Further out, linearizing would smear a distant Gaussian over the image.
+#: Directions are clamped to this distance beyond the image border, as a fraction of the half field of view, before the
+#: perspective is linearized. Without clamping, Gaussians far outside the view would be smeared over the image.
 FRUSTUM_MARGIN = 0.3
 
 #: Edge of a raster tile in pixels. 16 neighboring pixels of a row fill one 512-bit or two 256-bit vectors.
 RASTER_TILE = 16
 
-#: Maximum shorter side of the coarsest scale, which is then in 256..511, about the size VGG was trained on (SGSST). If
-#: full views are no larger than that, a smaller limit still gives them several scales.
+#: Maximum shorter side of the coarsest scale in pixels. Halving a larger view down to it leaves 256 to 511 pixels,
+#: about the size VGG was trained on (SGSST). A smaller maximum gives several scales to views that are no larger than
+#: this.
 COARSEST_SHORTER_SIDE = 511

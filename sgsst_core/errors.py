@@ -69,25 +69,25 @@ class CheckpointError(InvalidInputError):
 
 
 class TooManyIntersectionsError(SgsstError):
-    """Too many pairs of Gaussian and raster tile in a view for the rasterizer to address."""
+    """View with more pairs of Gaussian and raster tile than the rasterizer can index."""
 
     code = "too-many-intersections"
 
 
 class RanksFailedError(SgsstError):
-    """Workers of a job that were lost too often, or that failed for a reason of their own."""
+    """Failure of a job's workers: they were lost too often, or an error ended one of them."""
 
     code = "workers-failed"
 
 
 class RanksDriftedError(SgsstError):
-    """Different colors on ranks that must agree: a machine computes wrongly, or not like the others."""
+    """Different colors on ranks that must agree: one machine computes incorrectly, or rounds differently."""
 
     code = "ranks-drifted"
 
 
 class DivergedError(SgsstError):
-    """Divergence of colors or gradients beyond the range in which the optimizer works."""
+    """Colors or gradients beyond the range that the optimizer can handle."""
 
     code = "diverged"
 
@@ -99,6 +99,6 @@ class InfrastructureError(SgsstError):
 
 
 class ClusterAwayError(RanksFailedError, InfrastructureError):
-    """Missing cluster, or a cluster without capacity for even a single worker."""
+    """Cluster that is unavailable, or that has no capacity for even a single worker."""
 
     code = "workers-failed"

@@ -1,7 +1,7 @@
-"""Declaration of pydantic fields as options of the command line, the HTTP API and the reference.
+"""Declaration of pydantic fields as options of the command line, the HTTP API and the reference documentation.
 
-Type, bounds, default and help text are those of the field (`Field(..., ge=..., description=...)`). What pydantic cannot
-express is added by `Annotated[..., Option(...)]`.
+Type, bounds, default and help text are those of the field (`Field(..., ge=..., description=...)`). Properties that
+pydantic cannot express are added by `Annotated[..., Option(...)]`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-#: Former names of options and parameters, with their present ones. Only error messages and stored jobs use them.
+#: Former names of options and parameters, mapped to their present names. Only error messages and stored jobs use them.
 RENAMED = {
     "keep": "freeze",
     "keep_colours": "preserve_colors",
@@ -30,10 +30,10 @@ RENAMED = {
 
 
 def renamed_hint(name: str) -> str:
-    """Return what to write instead of a former option or parameter; empty if the name was never one.
+    """Return a hint with the new name of a renamed option or parameter; empty if it was not renamed.
 
     Args:
-        name: Parameter ("sh_fade", "regions.0.keep") or flag ("--sh-fade", "--no-revive").
+        name: Name of a parameter ("sh_fade", "regions.0.keep") or a flag ("--sh-fade", "--no-revive").
     """
     flag = name.startswith("--")
     plain = name.removeprefix("--").removeprefix("no-").replace("-", "_").rpartition(".")[2]
@@ -43,15 +43,15 @@ def renamed_hint(name: str) -> str:
 
 @dataclass(frozen=True)
 class Option:
-    """Presentation of a field to users, in addition to what pydantic knows.
+    """Presentation of a field to users, apart from what the pydantic field declares.
 
     Attributes:
-        unit: Unit of a quantity; empty for words and switches.
-        metavar: Placeholder of the value in a command's help and in the help text; empty for the name of the type.
+        unit: Unit of the value; empty for enumerations and switches.
+        metavar: Placeholder for the value in help texts; empty to use the name of the type.
         flags: Command-line flags, such as "--warm-start/--cold-start"; empty to derive them from the name.
-        default: Default as text, if it is None or not self-explanatory.
+        default: Description of the default if its value is None or not self-explanatory; empty to display the value.
         name: Name shown to users; empty for the field's own.
-        instead: Option that represents this field, which is then not an option itself; empty if the field is an option.
+        instead: Name of the option that sets this field, which is then not an option itself; empty if it is an option.
     """
 
     unit: str = ""
@@ -93,7 +93,7 @@ class Declared:
 
     @property
     def limits(self) -> list[Any]:
-        """Bounds of a number. If a word is accepted too, they are inside the union type."""
+        """Bounds of a number. If the field also accepts a word, they are taken from the members of its union type."""
         inside = [kind.__metadata__ for kind in get_args(self.info.annotation) if get_origin(kind) is Annotated]
         return [item for item in itertools.chain(self.info.metadata, *inside) if isinstance(item, Ge | Gt | Le | Lt)]
 
@@ -110,14 +110,14 @@ class Declared:
         return f"{low}x{high}" if high else above
 
     def text(self, value: object) -> str:
-        """Return a value as text; for the default, its text in the declaration."""
+        """Return a value as text; for the default value, `Option.default` if there is one."""
         if self.option.default and value == self.info.default:
             return self.option.default
         return _plain(value)
 
 
 def declared(model: type[BaseModel]) -> dict[str, Declared]:
-    """Return the fields of a model that are options, by the name shown to users."""
+    """Return the fields of a model that are options, keyed by the name shown to users."""
     found = [
         Declared(field, info, next((item for item in info.metadata if isinstance(item, Option)), Option()))
         for field, info in model.model_fields.items()

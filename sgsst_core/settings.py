@@ -1,4 +1,4 @@
-"""Settings of a stylization, and the presets that provide their values."""
+"""Settings of a stylization, and presets with default values for them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ StyleLossName = Literal["sos", "nnfm", "mixed"]
 #: Background of the Gaussians in a step: `Settings.background`, a uniform random color, or the color of a style pixel.
 PlannedBackground = Literal["background", "random", "palette"]
 TrainingBackground = Literal["auto", "background", "random", "palette"]
-#: Values of `Settings.keep`: items that can be left out without changing the result.
+#: Values of `Settings.keep`: computations that can be skipped without changing the result.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
 #: Content weight of each named style strength, chosen on the trade-off curve of style and content (docs/quality.md).
@@ -41,9 +41,10 @@ BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
 
 
-#: Upper limit of the longer side: well beyond the paper's 5187, and low enough that a typo does not exhaust memory.
+#: Upper limit of a view's longer side in pixels: well beyond the paper's 5187, and low enough that a typo does not
+#: exhaust memory.
 MAX_RESOLUTION = 16384
-#: Larger values are assumed to be typing errors.
+#: Maximum number of steps, and maximum weight. Larger values are assumed to be typos.
 _MAX_STEPS, _MAX_WEIGHT = 10_000_000, 1e12
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -258,10 +259,10 @@ class Settings(BaseModel):
         return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** share)
 
 
-#: `paper` is the published schedule. The others reach its loss sooner with larger, decaying steps. These push many
-#: colors below 0 along the way, which is why they need `clamp_aware_gradient` (docs/performance.md). They start from
-#: the style's colors, which steps alone reach only slowly (docs/quality.md). Phase 1 pays off for large views, and has
-#: no further effect after some 80 steps (docs/performance.md).
+#: `paper` is the published schedule. The other presets reach the same loss sooner, with larger, decaying steps. Such
+#: steps push many colors below 0, so these presets need `clamp_aware_gradient` (docs/performance.md). They start from
+#: the style's colors, which optimization alone reaches only slowly (docs/quality.md). Phase 1 pays off for large views,
+#: but has no further effect after about 80 steps (docs/performance.md).
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
         "steps_coarse": 50,
@@ -296,7 +297,7 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
 
 
 def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
-    """Return the settings of a preset with individual values replaced; values of None are left to the preset.
+    """Return the settings of a preset with the given values replaced; None keeps the preset's value.
 
     Raises:
         SettingsError: If the preset is unknown, or a value is out of range.
@@ -313,7 +314,7 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
     """Validate values against a model.
 
     Raises:
-        SettingsError: If a value is unknown or does not match the model's declaration; the message names the first one.
+        SettingsError: If a name is unknown or a value is invalid; the message reports the first error.
     """
     try:
         return model.model_validate(values)
@@ -324,7 +325,7 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
 
 
 def default_text(setting: Declared) -> str:
-    """Return the default of a setting as text, for each preset if they differ."""
+    """Return the default of a setting as text; if it depends on the preset, list it for each preset."""
     values = {preset: setting.text(getattr(make_settings(preset), setting.field)) for preset in _PRESETS}
     if len(set(values.values())) == 1:
         return values["standard"]

@@ -1,4 +1,4 @@
-"""Profiler: exclusive time by name, from the clock on a CPU and from stream events on a GPU."""
+"""Profiler of named code blocks: uses the clock on a CPU, and stream events on a GPU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 
 
 class Event(Protocol):
-    """Event in a device's stream, as `torch.cuda.Event`."""
+    """Event in a device's stream, with the interface of `torch.cuda.Event`."""
 
     def record(self) -> None:
         """Record the event after all work queued so far."""
@@ -28,13 +28,13 @@ class Event(Protocol):
 
 
 class Timer:
-    """Accumulator of seconds by name.
+    """Profiler that accumulates seconds by block name.
 
-    Time in nested blocks counts only for the innermost name, so the sum is the total. Blocks inside a `whole` block
-    count for the name of the latter.
+    Time in nested blocks counts only for the innermost block, so all names together add up to the total. Inside a
+    `whole` block, the time of nested blocks counts for the outer name.
 
-    A GPU works asynchronously: what is measured is when it started and finished the work of a block, not when the
-    program queued it. Nothing synchronizes until `read`.
+    A GPU works asynchronously: a block is timed from when the GPU starts its work to when it finishes, not by when the
+    program queues the work. The device is not synchronized before `read`.
 
     Args:
         device: Device whose time is measured.
@@ -42,7 +42,7 @@ class Timer:
             on a CPU.
 
     Attributes:
-        seconds: Seconds by name; on a GPU, of blocks that ended before the last `read`.
+        seconds: Accumulated seconds by name; on a GPU, only for blocks that ended before the last call of `read`.
     """
 
     def __init__(self, device: torch.device | str = "cpu", event: Callable[[], Event] | None = None) -> None:
@@ -59,7 +59,7 @@ class Timer:
 
     @contextmanager
     def __call__(self, name: str, *, whole: bool = False) -> Iterator[None]:
-        """Measure a `with` block. With `whole`, blocks nested in it count for its name."""
+        """Measure a `with` block. With `whole`, the time of nested blocks counts for this name too."""
         self._switch()
         outer = self._whole
         self._open.append(outer or name)
@@ -73,7 +73,7 @@ class Timer:
             self._whole = outer
 
     def clear(self) -> None:
-        """Discard all measurements; blocks that are open count from now on."""
+        """Discard all measurements; open blocks are measured from now on."""
         self.seconds.clear()
         self._marked.clear()
         if self._open:

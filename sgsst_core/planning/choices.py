@@ -19,13 +19,14 @@ from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
 from sgsst_core.settings import PlannedBackground, Precision, Settings
 
-#: On the CPU, computing a view's cached weights takes about three renders with gradient, and each use saves two thirds
-#: of one, so they do not pay off for fewer visits. On GPUs both are measured (`RasterCost.least_visits`).
+#: Minimum visits of a view for which caching its blend weights pays off on a CPU. Computing them takes as long as about
+#: three renders with gradient, and each use saves two thirds of a render. On GPUs, both times are measured
+#: (`RasterCost.least_visits`).
 LEAST_VISITS = 5
-#: Above this fraction of uncovered pixels, views show an object without background. (Views of a room that was captured
-#: from only some places have holes of a few percent.)
+#: Above this fraction of uncovered pixels, views are assumed to show an object without background. (Views of a room
+#: that was captured from only some places have holes of a few percent.)
 SCAN_SHARE = 0.2
-#: Default background of such an object in a step (docs/quality.md).
+#: Default training background for such an object (docs/quality.md).
 SCAN_BACKGROUND: PlannedBackground = "palette"
 
 
@@ -45,15 +46,15 @@ def optimized_gaussians(survey: Survey, settings: Settings) -> Tensor:
 
 
 def is_scan(survey: Survey, *, weighted: bool) -> bool:
-    """Return whether views show an object without background, whose statistics exclude the background."""
+    """Return whether views show an object without background, and statistics are weighted by coverage (`weighted`)."""
     return weighted and survey.uncovered_share > SCAN_SHARE
 
 
 def starts_warm(settings: Settings, *, scan: bool) -> bool:
-    """Return whether colors start like the style's.
+    """Return whether the job starts with the style's colors.
 
-    Steps change what all colors have in common only slowly (docs/quality.md). If only luminance is stylized, a warm
-    start pays off only for scans, in which nothing else determines how bright they should be.
+    Optimization changes the overall color of a scene only slowly (docs/quality.md). If only luminance is stylized, a
+    warm start pays off only for scans, because nothing around the object determines its brightness.
     """
     if settings.warm_start is None:
         return scan or settings.preserve_colors != "luminance"
@@ -61,29 +62,29 @@ def starts_warm(settings: Settings, *, scan: bool) -> bool:
 
 
 def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
-    """Return whether a job that starts with the style's colors is given them once more after the last step.
+    """Return whether a job with a warm start transfers the style's colors once more after the last step.
 
-    A loss without statistics lets these colors drift during the steps; ARF (Zhang et al. 2022) transfers them a second
-    time too. With statistics, the transfer would undo what the steps have achieved (docs/quality.md).
+    A loss without statistics lets colors drift from the style's during the steps; ARF (Zhang et al. 2022) transfers
+    them twice too. With statistics, a second transfer would undo what the steps have achieved (docs/quality.md).
     """
     return warm and not has_statistics(settings.style_loss)
 
 
 def training_background_of(settings: Settings, *, scan: bool) -> PlannedBackground:
-    """Return the training background, which is behind the Gaussians in a step."""
+    """Return the training background, the background of renders in optimization steps."""
     if settings.training_background == "auto":
         return SCAN_BACKGROUND if scan else "background"
     return settings.training_background
 
 
 def rendered_gaussians(optimized: Tensor, settings: Settings) -> Tensor:
-    """Return the mask [N] bool of Gaussians that are rendered: the optimized ones, or all for comparison."""
+    """Return the mask [N] bool of Gaussians that are rendered: the optimized ones, or all if requested."""
     everything = "unseen" in settings.keep and not settings.prune_weight
     return torch.ones_like(optimized) if everything else optimized
 
 
 def pruned_gaussians(survey: Survey, seen: Tensor) -> Tensor:
-    """Return the mask [N] bool of Gaussians that are visible in a view but not rendered."""
+    """Return the mask [N] bool of Gaussians that a view shows but that are not rendered (not in `seen`)."""
     return ~seen & (survey.total_blend_weights > 0)
 
 
@@ -107,9 +108,9 @@ GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
 def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, Any]:
     """Return the constructor options, apart from the scene, of the rasterizer that computes blend weights.
 
-    On the CPU, tile intersections share the memory of cached weights (`CachedRasterizer`). On a GPU, they are small
-    compared to its memory, and each view without them costs a sort and a synchronization. There they get half as much
-    as cached weights, from the part that is left for buffers.
+    On the CPU, tile intersections and cached weights share one memory budget (`CachedRasterizer`). On a GPU, tile
+    intersections have their own budget, half that of cached weights, taken from the memory reserved for buffers. They
+    are small compared to GPU memory, and recomputing them costs a sort and a synchronization per view.
 
     Args:
         name: Name of the rasterizer.

@@ -12,21 +12,21 @@ from sgsst_core.loss.nearest import MATCH_BYTES, MOST_VECTORS, working_bytes
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Piece, Size
 
-#: One of the layers whose features are matched with the style's; all of them have the same cells.
+#: One of the layers whose features are matched with the style's; all these layers have the same resolution.
 _MATCHED = "relu3_1"
 
 #: Additional bytes per optimized Gaussian: color, gradient and two moments, float32.
 OPTIMIZER_BYTES = 4 * 3 * 4
 
-#: Additional bytes per Gaussian allocated in each step on the CPU: a view's colors and their gradients, also by raster
-#: tile.
+#: Additional bytes per Gaussian allocated in each step on the CPU: for a view's colors, and for their gradients in
+#: total and per raster tile.
 STEP_BYTES = 4 * 3 * 4
 
 
 def gaussian_bytes(sh_degree: int) -> int:
     """Return the size in bytes of a float32 Gaussian.
 
-    It has position, rotation, scale, opacity, and coefficients of three color channels.
+    It consists of position, rotation, scale, opacity, and coefficients of three color channels.
     """
     return 4 * (3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2)
 
@@ -38,7 +38,8 @@ class Rate:
     Attributes:
         forward: Seconds per pixel of the forward pass alone.
         both: Seconds per pixel of both passes.
-        search: Seconds per pair of position and style vector in the nearest-neighbor search; 0 without one.
+        search: Seconds per pair of position and style vector in the nearest-neighbor search; 0 if features are not
+            matched.
     """
 
     forward: float
@@ -52,11 +53,11 @@ class RasterCost:
 
     Attributes:
         seconds: Time in seconds of a render and its gradient with recomputed weights, mean over some views.
-        kept_seconds: Time in seconds of the same with cached weights; None if those of even one view do not fit in
-            memory.
+        kept_seconds: Time in seconds of a render and its gradient with cached weights; None if not measured, for
+            example because not even one view's weights fit in memory.
         bytes: Size in bytes of the cached weights of all views, float32; None if the rasterizer cannot cache them.
-        half_bytes: Size in bytes of the same in half precision.
-        keeping_seconds: Time in seconds to compute a view's cached weights; None if not measured, on the CPU.
+        half_bytes: Size in bytes of the cached weights of all views in half precision; None as for `bytes`.
+        keeping_seconds: Time in seconds to compute a view's cached weights; None on the CPU, where it is not measured.
         first_seconds: Additional time in seconds of a view's first render, which computes its tile intersections.
         intersection_bytes: Mean size in bytes of a view's tile intersections; 0 if unknown.
         colors_seconds: Time in seconds for the contribution of spherical harmonics to the colors of a view.
@@ -73,25 +74,25 @@ class RasterCost:
 
     @property
     def least_visits(self) -> float | None:
-        """Visits of a view from which cached weights save time; None if they never do, or it was not measured."""
+        """Minimum visits of a view for which cached weights save time; None if they never do, or if not measured."""
         if self.kept_seconds is None or self.keeping_seconds is None or self.kept_seconds >= self.seconds:
             return None
         return self.keeping_seconds / (self.seconds - self.kept_seconds)
 
 
-#: Minimum fraction of the time of a view's loss that a graph must save to be worth its memory.
+#: Minimum fraction of the time of a view's loss that a CUDA graph must save to be worth its memory.
 LEAST_SAVING = 0.03
 
 
 @dataclass(frozen=True)
 class LaunchCost:
-    """Cost of the loss of a view and its gradient.
+    """Time for a view's loss and its gradient, with and without a CUDA graph.
 
     Attributes:
         seconds: Seconds with kernels launched one by one.
         replayed: Seconds as a graph.
         capture: Seconds to capture the graph, once.
-        problem: Reason why there is no graph and nothing was measured; None if there is one.
+        problem: Reason why a graph cannot be used and nothing was measured; None if it can.
     """
 
     seconds: float = 0.0
@@ -107,12 +108,12 @@ class LaunchCost:
 
     @property
     def least_visits(self) -> float | None:
-        """Visits of views that share a graph from which it saves time; None if it never does."""
+        """Minimum visits of views that share a graph for which it saves time; None if it never does."""
         return FIRST_VISITS + self.capture / self.saved if self.saved else None
 
 
 def pieces_of(size: Size, tiling: Tiling, region: Rectangle | None, *, coarsest: bool = False) -> tuple[Piece, ...]:
-    """Return the pieces of a view that go through the network: one per scale, or only that of the coarsest.
+    """Return the pieces of a view that go through the network: one per scale, or only the one of the coarsest scale.
 
     Args:
         size: (height, width) of the view.
@@ -130,8 +131,8 @@ def _piece(size: Size, scale: int, region: Rectangle | None) -> Piece:
     return Piece(scale, scaled, part)
 
 
-#: Temporary memory of a pass on a CPU, as a fraction of the working memory, if all activations are cached (measured:
-#: 0.4 at 512x384, where it is 40 MB, and at most 0.15 at 990x742).
+#: Temporary memory that a pass on a CPU uses if all activations are cached, as a fraction of `Tiling.working`
+#: (measured: 0.4 at 512x384, where it is 40 MB, and at most 0.15 at 990x742).
 WORKING_SHARE = 0.25
 
 
@@ -140,8 +141,8 @@ class Work:
     """Pixels through the network in one iteration, mean over views.
 
     Attributes:
-        pixels: Pixels that go forward and backward, including halos.
-        again: Pixels that go forward twice because their activations do not fit.
+        pixels: Pixels through the forward and the backward pass, including halos.
+        again: Pixels through a second forward pass, because their activations do not fit in memory.
         without_region: Value of `pixels` if uncovered pixels were processed too.
         tiles: Maximum number of tiles of a view at one scale.
         peak: Maximum number of pixels in memory at a time, including the temporary memory of a pass in units of pixels.
@@ -188,8 +189,8 @@ class Work:
                 without += sum(tile.outer.pixels for tile in tiling.tiles(piece.size))
                 tiles = max(tiles, len(areas))
                 once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
-                # If everything is cached, the temporary memory is needed when part of the activations is not there yet,
-                # or is gone.
+                # If all activations are cached, a pass needs its temporary memory while some activations are not
+                # computed yet, or already freed.
                 working = tiling.working * (1.0 if twice else working_share)
                 held = sum(areas) - twice + working * max(areas, default=0)
                 peak = max(peak, held, (1 + tiling.working) * once)
@@ -219,7 +220,7 @@ def _vectors(size: Size) -> int:
 def nearest_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, value: int, device: str) -> int:
     """Return the memory in bytes for matching features.
 
-    It holds style vectors of all view sizes at all scales, matches, and search buffers.
+    This includes style vectors for all view sizes at all scales, matches, and search buffers.
 
     Args:
         sizes: (height, width) of each view.

@@ -1,6 +1,6 @@
 """All decisions before the first iteration, as a pure function of probe and settings.
 
-Nothing is rendered or timed, and the machine is not inspected: the same probe and settings give the same plan.
+It neither renders nor measures anything: the same probe and settings give the same plan.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_r
 from sgsst_core.planning.visits import Visits
 from sgsst_core.settings import CachedWeights, Settings
 
-#: Above this fraction of uncovered pixels, views are taken for an object scan with an empty background.
+#: Fraction of uncovered pixels above which statistics are weighted by coverage, unless the settings say otherwise.
 UNCOVERED_SHARE = 0.01
-#: Minimum passes per image size for benchmarking cuDNN's algorithms, which takes about ten passes and makes the others
-#: a few percent faster.
+#: Minimum passes per image size for which benchmarking cuDNN's algorithms pays off. It takes as long as about ten
+#: passes, and makes later passes a few percent faster.
 LEAST_PASSES = 200
 
 
@@ -54,7 +54,7 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
     Args:
         probe: Measured facts.
         settings: Settings of the job.
-        measured: Whether the job will be measured between its steps and reported, as in `sgsst stylize`.
+        measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
 
     Raises:
         SettingsError: If pruning would leave no Gaussian.
@@ -160,14 +160,14 @@ class _Deciding:
     def _passes_of_a_size(self, steps_coarse: int, weighted: bool) -> int:
         """Return how often images of one size pass through the network.
 
-        Weighted views count one by one, because each is cropped to what it covers.
+        With weighted statistics, every view has its own size, because it is cropped to its covered pixels.
         """
         views = self.probe.distinct
         sizes = len(views) if weighted else len({self.probe.sizes[index] for index in views})
         return (steps_coarse + self.settings.steps_sos) * self.settings.views_per_step // sizes
 
     def _graphs_pay(self, steps_coarse: int, weighted: bool) -> bool:
-        """Return whether graphs of the loss save more time than capturing one per size and phase takes."""
+        """Return whether CUDA graphs of the loss save more time than it takes to capture one per size and phase."""
         launches, settings = self.probe.launches, self.settings
         if self.probe.machine.device != "cuda" or launches is None or "launches" in settings.keep:
             return False
@@ -179,7 +179,7 @@ class _Deciding:
     def _kept_form(self, visits: float) -> CachedWeights:
         """Return the format of cached blend weights.
 
-        It is float32 if that fits, else half precision, and none if caching does not pay off.
+        It is float32 if that fits, else half precision, and "none" if caching does not pay off.
         """
         raster, form = self.probe.raster, self.settings.cached_weights
         if raster.bytes is None or raster.half_bytes is None or "blend-weights" in self.settings.keep:
@@ -232,7 +232,7 @@ class _Deciding:
         return content_bytes(sizes, self.tiling, self.probe.network.content_bytes)
 
     def _nearest_bytes(self) -> int:
-        """Return the memory for feature matching in bytes; every rank has all of the style's vectors."""
+        """Return the memory for feature matching in bytes; every rank stores all of the style's vectors."""
         network, device = self.probe.network, self.probe.machine.device
         return nearest_bytes(self.sizes, self.tiling, network.vector_channels, 4, device)
 
@@ -268,7 +268,10 @@ class _Deciding:
     def _expected(
         self, choice: RanksChoice, coarse: list[IterationWork], sos: list[IterationWork]
     ) -> tuple[Prediction, int]:
-        """Return the prediction for the ranks that take part; groups of ranks process one view each in parallel."""
+        """Return the prediction for the chosen number of ranks, and each rank's activations in bytes.
+
+        Groups of ranks process views in parallel, one view per group.
+        """
         link, network = self.probe.link, self.probe.network
         groups = math.gcd(self.settings.views_per_step, choice.ranks)
         each, turns = choice.ranks // groups, self.settings.views_per_step // groups
@@ -291,7 +294,7 @@ class _Deciding:
         return expected, activations
 
     def _sampled(self, *, coarsest: bool) -> list[IterationWork]:
-        """Return iterations of some views for the model of several ranks: of phase 1, or on all scales."""
+        """Return the work of iterations of a sample of views, for `choose_ranks`: of phase 1, or on all scales."""
         network, sharing = self.probe.network, self.probe.machine.sharing
         step = max(1, len(self.sizes) // SAMPLED_VIEWS)
         found = []

@@ -22,19 +22,25 @@ from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.visits import RENDER, Visits
 from sgsst_core.settings import Settings
 
-#: Time from the last step to the last file: constant seconds for images and report, and seconds per Gaussian for the
-#: neighbor search and for writing (measured with 4 million Gaussians on two cores; an estimate elsewhere).
+#: Time from the last step to the last file written: constant seconds for images and report, and seconds per Gaussian
+#: for the neighbor search and for writing (measured with 4 million Gaussians on two cores; an estimate elsewhere).
 ENDING_SECONDS = 1.5
 ENDING_SECONDS_A_GAUSSIAN = 4e-6
-#: Part of it for the search, which every moment repeats if some Gaussians are unseen.
+#: Portion of `ENDING_SECONDS_A_GAUSSIAN` for the neighbor search. If some Gaussians are unseen, the search is repeated
+#: at every measurement.
 _NEIGHBORS_SECONDS_A_GAUSSIAN = 1.5e-6
-#: Renders needed for the depth of a novel view.
+#: Renders needed to compute the depth of a novel view.
 _DEPTH_RENDERS = 2
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Measurements outside the steps: `Plan.measuring` and `Plan.loss_views`."""
+    """Chosen measurements outside the steps.
+
+    Attributes:
+        level: See `Plan.measuring`.
+        loss_views: See `Plan.loss_views`.
+    """
 
     level: int
     loss_views: int
@@ -67,7 +73,8 @@ def whole_job(
     once = RENDER * visits.rasterized() + visits.later(coarse=False) + work.evaluation(probe.network.rate)
     unvisited = max(1 - settings.steps_sos * settings.views_per_step / views, 0.0)
     price = 2 * once + unvisited * expected.first_visit
-    # A target is relative to the loss before: how long that takes must not determine where the job ends.
+    # `target_loss` is relative to the initial loss on these views. Their number must not depend on timings, or timings
+    # would determine the step at which the job ends.
     share = settings.measure
     loss_views = min(LOSS_VIEWS[0], views) if settings.target_loss else choose_loss_views(share, steps, price, views)
     ending = ENDING_SECONDS + ENDING_SECONDS_A_GAUSSIAN * probe.scene.gaussians
@@ -92,7 +99,7 @@ def _steps_seconds(expected: Prediction, plan: Plan, settings: Settings) -> floa
 
 
 def _prices(expected: Prediction, plan: Plan, probe: Probe, settings: Settings, work: Work) -> Prices:
-    """Return the expected costs of novel views, assuming that they are like the job's views, between which they lie."""
+    """Return the expected cost of measuring novel views, assuming that one costs as much as a view of the job."""
     raster, forward = probe.raster, work.pixels * probe.network.rate.forward
     render = RENDER * raster.seconds
     pruned = bool(pruned_gaussians(plan.survey, plan.seen).any())

@@ -1,4 +1,4 @@
-"""Measurement of the kernel launches of a view's loss: one by one, and as a CUDA graph."""
+"""Timing of a view's loss with kernels launched one by one, and as a CUDA graph."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sgsst_core.planning.cost import LaunchCost
 from sgsst_core.planning.pictures import soft_picture
 from sgsst_core.timing import Timer
 
-#: Number of runs, of which the fastest counts, because other activity on the machine only makes launches slower.
+#: Number of runs. The fastest counts, because other activity on the machine can only slow launches down.
 RUNS = 3
 
 
 def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
-    """Time the loss of a synthetic view of size (height, width), with its gradient, in both ways."""
+    """Time the loss of a synthetic view of size (height, width), with its gradient, with and without a graph."""
     if not has_graphs(loss.network.device):
         return LaunchCost(problem="only NVIDIA GPUs are known to replay them")
     picture = soft_picture(max(size))[: size[0], : size[1]].contiguous().to(loss.network.device)

@@ -1,9 +1,8 @@
 """Selection of Gaussians by image masks: each Gaussian votes with its blend weights.
 
 The vote of a Gaussian is the fraction of its blend weights in the masked views that lies where masks are white. Most
-are inside or outside by a wide margin. Undecided ones, on which views disagree, follow the majority of their neighbors,
-and so do those that no masked view shows. A border therefore runs between Gaussians, not through a cloud of single
-votes.
+Gaussians are clearly inside or outside. Gaussians on which views disagree, and those that no masked view shows, follow
+the majority of their neighbors. The border of the selection is therefore smooth rather than scattered.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from sgsst_core.scene.camera import Camera
 
 #: A Gaussian is inside if its vote is above the first value, and outside if it is below the second.
 IN, OUT = 0.6, 0.4
-#: Number of neighbors that decide about an undecided or invisible Gaussian.
+#: Number of neighbors whose majority an undecided or invisible Gaussian follows.
 NEIGHBORS = 8
 
 
 def count_votes(
     rasterizer: Rasterizer, cameras: Sequence[Camera], masks: Sequence[Callable[[], Tensor]], gaussians: int
 ) -> tuple[Tensor, Tensor]:
-    """Return each Gaussian's blend weights where masks are white, and in all masked views: [N], [N] float64.
+    """Return each Gaussian's blend weights summed over white mask pixels, and over all pixels: two [N] float64.
 
     Args:
         rasterizer: Rasterizer of the scene.
@@ -47,7 +46,8 @@ def count_votes(
 def decide_by_votes(means: Tensor, inside: Tensor, total: Tensor) -> Tensor:
     """Return which Gaussians are inside, [N] bool.
 
-    If no Gaussian is decided by a margin, the larger fraction counts. Gaussians without votes or neighbors are outside.
+    If no Gaussian is clearly inside or outside, those with a vote above 0.5 are inside. Gaussians that no masked view
+    shows are then outside.
 
     Args:
         means: [N, 3].

@@ -1,10 +1,10 @@
-"""Choice of measurements outside the steps, such that they take only a given fraction of the job's time.
+"""Choice of measurements outside the steps, which may take only a given fraction of the job's time.
 
-The loss before and after is evaluated on some of the job's views; novel views are measured at certain moments of a run.
-The loss gets at most half of the time allowed, on fewer views if necessary. The rest is for novel views, whose number
-and moments decrease from level to level (`LEVELS`). The plan takes the first level whose predicted time is allowed. The
-first novel view that is measured shows whether a later level is needed (`quality.measure`). Nothing is measured before
-the first step, and measurements never change a color.
+Two things are measured: the loss before the first and after the last step, on some of the job's views; and novel views,
+after certain steps, called moments. The loss gets at most half of the time allowed, and is evaluated on fewer views if
+necessary. Novel views get the rest. Each level of `LEVELS` has fewer views or moments than the level before it, and the
+plan takes the first level whose predicted time is allowed. The first novel view that is measured shows whether a later
+level is needed (`quality.measure`). Measurements do not delay the first step, and never change a color.
 """
 
 from __future__ import annotations
@@ -14,24 +14,26 @@ from dataclasses import dataclass
 from sgsst_core.planning.plan import Prediction
 
 #: Seconds that are always allowed, so that short jobs are measured too. If the steps take less than five minutes, this
-#: may be more than a tenth of them.
+#: is more than a tenth of their time.
 LEAST_ALLOWED = 30.0
 #: Planned measurements may use this fraction of the time allowed, because predictions are accurate to about a fifth.
 _PLANNED = 0.8
 #: Candidate numbers of views for the loss before and after; the largest that half of the time allowed covers is used.
 #: At least one view is always evaluated, because a job that cannot report what it has achieved is of little use.
 LOSS_VIEWS = (4, 2, 1)
-#: Novel views rendered per view of a `Level`: one for the Gram distance, the others for its pairs.
+#: Novel views rendered per view of a `Level`: one for the Gram distance, the others for the pairs in which it is
+#: compared.
 RENDERED = 4
 
 
 @dataclass(frozen=True)
 class Level:
-    """Set of measurements, one step on the scale from everything to nothing.
+    """Set of measurements of novel views; `LEVELS` sorts them by cost.
 
     Attributes:
-        views: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
-        halvings: Exponents h of the moments, each after total / 2^h steps; 0 is the end.
+        views: Maximum number of views whose Gram distance is measured, and of view pairs compared per range (short and
+            long).
+        halvings: Exponents h of the moments: novel views are measured after total / 2^h steps; h = 0 is the end.
         start: Whether to measure the unstylized scene too, together with the first of the other moments.
     """
 
@@ -45,7 +47,7 @@ class Level:
         return sorted({0, *later} if self.start else later)
 
 
-#: From everything to nothing; the last but one measures only the end.
+#: Levels from the most to the least expensive. The last measures nothing, and the one before it only the end.
 LEVELS = (
     Level(4, (0, 1, 2, 3, 4, 5)),
     Level(4, (0, 2, 4)),
@@ -66,7 +68,7 @@ class Prices:
     Attributes:
         setup: Seconds once per view of `Level.views`, for neighboring poses, depth and warps.
         view: Seconds per view and moment, and once more for evaluating the views at the end.
-        moment: Additional seconds per moment, for comparing the gradient with the exact one.
+        moment: Additional seconds per moment, for comparing the gradient with the float32 reference.
     """
 
     setup: float
@@ -83,14 +85,14 @@ class Prices:
 
 
 def allowed_seconds(share: float, steps: float) -> float:
-    """Return the time in seconds that all measurements may take, given that of the steps."""
+    """Return the seconds that all measurements may take: the fraction `share` of the steps' time, or a minimum."""
     return max(LEAST_ALLOWED, share * steps)
 
 
 def novel_view_seconds(share: float, expected: Prediction) -> float:
     """Return the time in seconds that novel views may take.
 
-    It is what the loss before and after leaves, or 0 if `share` is 0.
+    This is the time allowed minus the time for the loss before and after; 0 if `share` is 0.
     """
     if not share:
         return 0.0
@@ -103,7 +105,7 @@ def choose_loss_views(share: float, steps: float, price: float, views: int) -> i
     Args:
         share: Fraction of the steps' time allowed for measurements.
         steps: Time in seconds of all steps.
-        price: Time in seconds of both losses of one view.
+        price: Time in seconds to evaluate the loss of one view before and after.
         views: Number of views of the job.
     """
     half = _PLANNED * allowed_seconds(share, steps) / 2

@@ -19,7 +19,8 @@ MEASURING_BYTES = 100 << 20
 SHAPE_BYTES, BUILDING_BYTES = 32, 104
 #: Bytes per Gaussian during the neighbor search for unseen ones: result, its difference, positions, and search tree.
 SEARCH_BYTES = 120
-#: Memory of the entries' gradients in a rasterizer's backward pass, as a fraction of a view's tile intersections.
+#: Memory for the gradient of each tile intersection in a rasterizer's backward pass, as a fraction of a view's tile
+#: intersections.
 SLOTS_SHARE = 0.25
 #: Bytes per pixel of a novel view: its coverage, and its two warps.
 _COVERAGE_BYTES, _WARP_BYTES = 4, 2 * 40
@@ -27,13 +28,13 @@ _COVERAGE_BYTES, _WARP_BYTES = 4, 2 * 40
 
 @dataclass(frozen=True)
 class PeakMemory:
-    """Memory that follows from a plan under construction.
+    """Peak memory of a rank, predicted from a plan under construction.
 
     Attributes:
         plan: Plan under construction.
         probe: Measured facts.
         settings: Settings of the job.
-        visits: Data that are computed per view.
+        visits: Predicted data that are computed per view.
         level: Level of measurements as an index into `LEVELS`; None if nothing is measured.
         loss_views: Number of views on which the loss is evaluated before and after.
         activations: Peak size of activations in an iteration in bytes.
@@ -52,12 +53,12 @@ class PeakMemory:
     def bytes(self) -> tuple[int, int | None]:
         """Return the peak memory in bytes of a rank's process, and of its GPU (None on a CPU).
 
-        With a GPU, the data of the computation are in GPU memory. Data that grow with the number of Gaussians are
-        counted only on a CPU; on a GPU they are small compared to its tensors.
+        With a GPU, computed data are in GPU memory. Some data that grow with the number of Gaussians are counted only
+        on a CPU, because they are small compared to other tensors on a GPU.
         """
         probe, gaussians = self.probe, int(self.plan.seen.sum())
         measuring = 0 if self.level is None else MEASURING_BYTES
-        # The memory of a graph is exclusive: the same work without the graph must fit in addition to it.
+        # A CUDA graph does not share its memory: evaluating the loss without the graph needs the same amount again.
         passing = image_bytes(probe.sizes) + self.activations * (2 if self.plan.graphs else 1) + self.matching
         if probe.machine.device != "cpu":
             computing = passing + self._content() + self._weights()
@@ -110,7 +111,7 @@ class PeakMemory:
     def _intersections_and_weights(self) -> int:
         """Return the size in bytes of weights and tile intersections, which share a budget.
 
-        What the survey has already cached is not included.
+        Tile intersections that the survey has already cached are not included.
         """
         memory, weights, visits = self.probe.machine.memory, self._weights(), self.visits
         room = memory_for("rasterizer", memory) - weights
@@ -121,7 +122,7 @@ class PeakMemory:
         return max(int(min(intersections, room)) + weights - visits.surveyed.cached_bytes, 0)
 
     def _other_intersections(self) -> int:
-        """Return the size in bytes of tile intersections for novel views, and for a reference with its own scene."""
+        """Return the size in bytes of tile intersections for novel views, and for the reference of a pruned scene."""
         views = RENDERED * LEVELS[self.level].views if self.level is not None else 0
         if self.level is not None and self._pruned():
             views += self.loss_views
@@ -159,14 +160,14 @@ class PeakMemory:
         return kept
 
     def _exact_activations(self) -> int:
-        """Return by how many bytes the reference's activations exceed the job's."""
+        """Return by how many bytes the activations of the float32 reference exceed the job's."""
         if self.level is None or not self._approximated():
             return 0
         budget = memory_for("activations", self.probe.machine.memory)
         return max(min(int(self.activations * self._exact_size()), budget) - self.activations, 0)
 
     def _exact_size(self) -> float:
-        """Return the size of a value in the reference's network relative to the job's."""
+        """Return the size of a feature value in the float32 reference, relative to the job's network."""
         return 2.0 if self.plan.precision == "bfloat16" else 1.0
 
     def _pruned(self) -> bool:

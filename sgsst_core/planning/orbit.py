@@ -1,4 +1,4 @@
-"""Choice of an orbit around a scene: the up direction, and as many rings of cameras as show more of its surface."""
+"""Choice of an orbit around a scene: the up direction, and rings of cameras that show enough of the surface."""
 
 from __future__ import annotations
 
@@ -19,22 +19,24 @@ from sgsst_core.scene.orbit import ELEVATION, middle_of, orbit
 from sgsst_core.scene.subject import Subject, find_subject
 from sgsst_core.scene.up import Up, find_up
 
-#: Elevations in degrees of rings that may be added to the first. Those from below are only for an isolated subject,
-#: with neither ground nor room beneath it.
+#: Elevations in degrees of rings that may be added to the first. Rings below the horizon are only for an isolated
+#: subject, without ground or background.
 _ABOVE, _BELOW = (40.0, 70.0), (-20.0,)
 #: Minimum fraction of the surface that a ring must add.
 _LITTLE = 0.03
-#: Default number of views of a level ring; 49 views with all rings.
+#: Default number of views of a ring at elevation 0. All rings together then have 49 views.
 _AROUND = 16
 #: Minimum number of views per ring if there are several rings.
 _LEAST_VIEWS = 6
-#: Fraction of the best visible area at which a surface counts as fully seen (rotated by 45 degrees).
+#: Fraction of its largest visible area from which on a surface counts as fully seen: that of a surface rotated by 45
+#: degrees.
 _ENOUGH = 0.7
-#: A surface seen at less than this fraction of its area is inside; maximum fraction of such surfaces without a warning.
+#: A surface counts as inside the scene if views show less than the first fraction of its area. The second is the
+#: maximum fraction of such surfaces without a warning.
 _HARDLY, _INSIDE = 0.02, 0.3
-#: Trial views: number in a level ring, resolution, and number of sampled Gaussians.
+#: Trial views: number in a ring at elevation 0, resolution, and number of sampled Gaussians.
 _TRIALS, _TRIAL_SIDE, _TRIAL_GAUSSIANS = 8, 160, 50_000
-#: If the subject makes up less than this fraction of a view, other things hide it.
+#: If the subject makes up less than this fraction of a view, other objects are assumed to hide it.
 _SHOWS = 0.7
 #: Maximum fraction of a scene outside its subject without a warning.
 _OUTSIDE = 0.03
@@ -42,12 +44,12 @@ _OUTSIDE = 0.03
 
 @dataclass(frozen=True)
 class OrbitRequest:
-    """Requested properties of an orbit; None leaves them to the scene.
+    """Requested properties of an orbit; None to choose a value that suits the scene.
 
     Attributes:
         count: Number of views.
         up: [3], world direction of up.
-        elevation: Elevation of its single ring in degrees.
+        elevation: Elevation in degrees of the orbit's only ring; None to choose one or several rings.
         radius: Distance of the cameras from the center in world units.
         near: Near plane in world units.
     """
@@ -70,9 +72,9 @@ class Orbit:
         radius: Distance of the cameras from the center of the subject in world units.
         tried: Elevations that were tried.
         shown: Surface that the rings show, as a fraction of what all tried rings would show.
-        next: Fraction that the best remaining ring would add; None if there is none.
+        next: Fraction of that surface that the best remaining ring would add; None if no ring remains.
         outside: Fraction of the scene that is not part of the subject.
-        hidden: Fraction of the trial views in which other things hide the subject too much.
+        hidden: Fraction of the trial views in which other objects hide too much of the subject.
         inside: Fraction of the surface that no trial view shows.
     """
 
@@ -157,7 +159,7 @@ def orbit_decisions(made: Orbit, cameras: Sequence[Camera], survey: Survey) -> l
 
 
 def _doubts(made: Orbit) -> list[Decision]:
-    """Return warnings about reasons against an orbit around this scene."""
+    """Return warnings if an orbit may be unsuitable for this scene."""
     found = []
     better = "the cameras of its capture (--cameras) would show it better"
     if made.outside > _OUTSIDE:
@@ -186,8 +188,8 @@ class _Ring:
     """Result of the trial views of a ring.
 
     Attributes:
-        areas: [n], largest area of each Gaussian that one of the views shows, in squared world units.
-        subject: For each view that shows anything, the fraction of it that is the subject.
+        areas: [n], visible area of each Gaussian in the view that shows most of it, in squared world units.
+        subject: Fraction of the visible area that belongs to the subject, for each view that shows anything.
     """
 
     areas: Tensor
@@ -195,7 +197,7 @@ class _Ring:
 
 
 class _Trial:
-    """Small views of a scene, or of an enlarged sample of its Gaussians, for comparing rings."""
+    """Renderer of small trial views of a scene, or of an enlarged sample of its Gaussians, for comparing rings."""
 
     def __init__(self, scene: Scene, subject: Subject, up: Up, request: OrbitRequest) -> None:
         self._subject, self._up, self._request = subject, up, request
@@ -234,17 +236,19 @@ class _Trial:
 
 
 def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float, float | None]:
-    """Choose rings: the first, then repeatedly the one that adds most of the surface, until it would add little.
+    """Choose rings greedily: the first one, then repeatedly the one that adds most surface, until the gain is small.
 
-    The surface of a set of rings is the sum over all Gaussians of the largest area [n] that one of their views shows,
-    relative to that of all rings. A Gaussian seen from the side counts in proportion, and fully from `_ENOUGH` on.
+    For each Gaussian, the view that shows most of it counts. The surface that a set of rings shows is the sum of these
+    areas, relative to that of all rings. A Gaussian counts fully if a ring shows at least the fraction `_ENOUGH` of its
+    largest area, and in proportion below that.
 
     Args:
         areas: Areas [n] for each ring.
         most: Maximum number of rings to choose.
 
     Returns:
-        Chosen rings in the order of `areas`, fraction of the surface that they show, and what the best other would add.
+        Indices of the chosen rings, ascending; fraction of the surface that they show; and fraction that the best other
+        ring would add (None if there is none).
     """
     best_of_all = torch.stack(list(areas)).amax(0)
     areas = [(area / _ENOUGH).minimum(best_of_all) for area in areas]

@@ -1,4 +1,4 @@
-"""Synthetic images for measurements, for use when the job's own are not available."""
+"""Synthetic images for measurements that do not use the job's own images."""
 
 from __future__ import annotations
 

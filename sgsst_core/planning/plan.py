@@ -75,12 +75,12 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Plan:
-    """Decisions for a scene. They are final.
+    """Final decisions for a job.
 
     Attributes:
         survey: Survey of the views.
         optimized: [N] bool, Gaussians whose colors are determined by the views.
-        seen: [N] bool, Gaussians that are rendered: the optimized ones, or all for comparison.
+        seen: [N] bool, Gaussians that are rendered: the optimized ones, or all if the settings ask for it.
         covered: Indices of the views that are stylized.
         weighted: Whether statistics are weighted by coverage.
         training_background: Background of the Gaussians in a step.
@@ -96,10 +96,12 @@ class Plan:
         cached_weights: Format of blend weights that are cached between iterations.
         coarse_weights: Whether phase 1 caches only the weights of the coarsest scale.
         measured: Whether the prediction includes measurements between steps and the report.
-        measuring: Maximum level of measurements between steps, as an index into `measuring.LEVELS`.
+        measuring: Level of measurements between steps, as an index into `measuring.LEVELS`; a later level is used if
+            measuring is slower than predicted.
         loss_views: Number of views on which the loss is evaluated before and after.
         ranks: Number of ranks that take part.
-        refinement: Refinement that turned the input scene into the one planned for; None if they are the same.
+        refinement: Refinement that produced the scene of the plan from the input scene; None if the input scene is not
+            refined.
         decisions: Decisions for display.
         prediction: Predicted values, for comparison with the measured ones.
     """

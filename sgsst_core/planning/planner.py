@@ -57,11 +57,11 @@ def make_plan(
         survey: Survey from an earlier plan of the same job; None to survey the views.
         measured: Whether the job will be measured between its steps; see `decide`.
         show: Callback for the progress of the survey.
-        timer: Timer for `survey`, and for all else as `planning`.
-        orbit: Orbit that made the cameras, for the plan to report; None for cameras from files.
+        timer: Timer that records the survey as "survey", and everything else as "planning".
+        orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
         style: Style mixture, for the plan to report its images; None for one image.
         regions: Regions of the scene; None if there are none.
-        refinement: Refinement that made the scene; None if there was none.
+        refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
 
     Returns:
         The plan, and the planning context, whose objects a `Stylizer` continues to use.

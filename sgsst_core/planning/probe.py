@@ -62,7 +62,7 @@ from sgsst_core.timing import Timer, wait_for
 #: Maximum side of the image for timing the network: large enough for the rate of a partition tile. A GPU needs more
 #: work before launch times become negligible.
 PROBE_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 1024}
-#: Minimum visits per view size for which a graph of the loss can pay off, whatever it saves.
+#: Minimum visits per view size for which a CUDA graph of the loss is considered at all.
 LEAST_GRAPH_VISITS = 20
 #: Number of views whose blend weights are counted and timed, as representatives of all.
 SAMPLED_VIEWS = 3
@@ -80,7 +80,7 @@ class SceneFacts:
     """Facts about the scene.
 
     Attributes:
-        gaussians: N.
+        gaussians: Number N of Gaussians.
         sh_degree: SH degree of its file.
         used_degree: Highest SH degree with a non-zero coefficient after SH attenuation, among the rendered Gaussians.
         held_degree: SH degree in memory; 0 if coefficients stay in the file.
@@ -102,12 +102,12 @@ class NetworkFacts:
         working_bytes: Additional bytes per pixel needed by a pass.
         content_bytes: Bytes per cell of the content layer.
         rate: Time per pixel.
-        fixed: Time in seconds of a partition tile with almost no pixels.
+        fixed: Constant time in seconds of a partition tile, measured on one with almost no pixels.
         precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision; None if float32
             was requested, or the requested one is unavailable.
         gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
         vector_channels: Length of a vector that is matched with the style's; 0 if nothing is matched.
-        deepest: Deepest reported layer.
+        deepest: Name of the deepest layer in use.
     """
 
     halo: int
@@ -127,9 +127,9 @@ class Machine:
     """Facts about the machine and its ranks.
 
     Attributes:
-        device: Device that computes.
+        device: Device of the feature network.
         memory_limit: Memory budget in bytes of all ranks on one machine together.
-        sharing: Maximum number of ranks on one machine.
+        sharing: Maximum number of ranks that share one machine's memory; 1 if they run on GPUs.
         ranks: Number of available ranks.
         problems: Reason by name for each GPU rasterizer that does not work; empty on the CPU.
     """
@@ -154,15 +154,15 @@ class Probe:
         scene: Facts about the scene.
         sizes: (height, width) of each view.
         survey: Survey of the views.
-        distinct: Indices of the views that do not nearly repeat another one.
+        distinct: Indices of the views to stylize: those that see anything and do not nearly repeat another view.
         network: Facts about the feature network.
         rasterizer: Timed rasterizer, which computes blend weights.
         raster: Cost of rendering with recomputed and with cached weights.
         machine: Facts about the machine.
         link: Connection between ranks.
-        process_bytes: Physical memory of the process with scene and network loaded.
+        process_bytes: Physical memory of the process in bytes, with scene and network loaded.
         pruned_error: Error of leaving out visible Gaussians; None if there are none.
-        device_bytes: GPU memory with scene and network loaded; 0 on a CPU.
+        device_bytes: GPU memory in bytes, with scene and network loaded; 0 on a CPU.
         launches: Cost of launching a view's loss on a GPU; None on a CPU, or if no decision depends on it.
         styles: Number of images in the style mixture.
         kept: [N] bool, frozen Gaussians; None if there are none.
@@ -189,7 +189,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class PlanningContext:
-    """Planning context: objects that are needed for measuring and that the job continues to use.
+    """Objects that are created for measuring before the job, and that the job continues to use.
 
     Attributes:
         scene: Whole scene, with the SH attenuation of the settings applied.
@@ -240,7 +240,7 @@ def equip(
     limit = settings.memory_limit or default_memory_limit(network.device)
     machine = Machine(
         device,
-        # The partition, and thereby rounding, depends on it, so it must be identical on all ranks.
+        # The partition, and thereby rounding, depends on the limit, so it must be identical on all ranks.
         memory_limit=min(collectives.all_gather(limit)),
         sharing=sharing_memory(collectives, device),
         ranks=collectives.size,
@@ -257,9 +257,9 @@ def common_device(collectives: Collectives) -> Device:
 
 
 def gpu_problems(collectives: Collectives) -> dict[str, str]:
-    """Return the reasons, by name, why preferred GPU rasterizers do not work on some rank.
+    """Return the reason, by name, why each GPU rasterizer that was tried does not work on some rank.
 
-    A rasterizer is tried only if all preferred ones have failed.
+    Rasterizers are tried in order of preference, until one works.
     """
     problems: dict[str, str] = {}
     for name in GPU_RASTERIZERS:
@@ -293,7 +293,7 @@ def measure(planning_context: PlanningContext, survey: Survey, link: Link, maps:
     One rank does this for all, because timings differ between ranks.
 
     Args:
-        workshop: Planning context.
+        planning_context: Objects to measure with.
         survey: Survey of the views.
         link: Connection between ranks.
         maps: Number of regions whose maps are rendered in each view.
@@ -457,10 +457,10 @@ def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], b
     sample = spread(cameras, SAMPLED_VIEWS)
     count, middle = len(sample), len(sample) // 2
     if isinstance(rasterizer, CpuRasterizer):
-        _raster_seconds(CpuRasterizer(scene.subset(torch.arange(1))), 1, sample[0])  # compiles
+        _raster_seconds(CpuRasterizer(scene.subset(torch.arange(1))), 1, sample[0])  # compiles the kernels
         seconds = []
         for camera in sample:
-            rasterizer.intersections(camera)  # the survey's, if it could cache them
+            rasterizer.intersections(camera)  # reuses those of the survey if it cached them
             seconds += _raster_seconds(rasterizer, len(scene), camera)
         more, intersection_bytes = _intersections_cost(scene, sample, planning_context.settings.near)
     else:
@@ -498,7 +498,7 @@ def _raster_cost(planning_context: PlanningContext, cameras: Sequence[Camera], b
 
 
 def _comes_too_seldom(settings: Settings, views: int) -> bool:
-    """Return whether visits are so few that cached weights, which were not requested, do not pay off on a CPU."""
+    """Return whether views are visited too few times for caching to pay off on a CPU, and it was not requested."""
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / views
     return settings.cached_weights == "auto" and visits < LEAST_VISITS
 
@@ -540,7 +540,7 @@ def _keeping_seconds(cached: CachedRasterizer, camera: Camera, form: WeightPreci
 def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera, visits: int = 1) -> list[float]:
     """Return the time in seconds of each of several renders with gradient.
 
-    The first one prepares the view if necessary.
+    The first one includes the time to prepare the view, unless it is already prepared.
     """
     colors = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
     seconds = []

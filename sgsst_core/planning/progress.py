@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PlanningProgress:
-    """Number of surveyed views.
+    """Progress of a survey.
 
     Attributes:
         done: Views surveyed by all ranks together.
@@ -30,6 +30,13 @@ ShowPlanning = Callable[[PlanningProgress], None]
 
 
 def progress_of(own: int, total: int, ranks: int, seconds: float) -> PlanningProgress:
-    """Return the progress after this many views on this rank, assuming that the other ranks are equally fast."""
+    """Return the progress of all ranks, assuming that they are as fast as this one.
+
+    Args:
+        own: Number of views that this rank has surveyed.
+        total: Number of views that all ranks survey.
+        ranks: Number of ranks.
+        seconds: Seconds since the survey started.
+    """
     done = min(total, own * ranks)
     return PlanningProgress(done, total, seconds * (total - done) / done if done else None)

@@ -33,10 +33,10 @@ def pruned_image_error(
 ) -> ImageError:
     """Bound the change of every pixel of every view if some Gaussians are not rendered.
 
-    Remove them one by one, the farthest first. Each contributed w (c - b) to its pixel, where w is its blend weight, c
-    its color, and b the blend of everything behind it; the weights of those in front do not change. Therefore no pixel
-    changes by more than the sum of the pruned weights times the range of colors, plus the transmittance at which
-    blending stops.
+    Consider removing pruned Gaussians one by one, the farthest first. Removing one changes a pixel by w (c - b), where
+    w is its blend weight, c its color, and b the blend of everything behind it. The weights of Gaussians in front of it
+    do not change. Therefore no pixel changes by more than the sum of the pruned weights times the range of colors, plus
+    the transmittance at which blending stops.
 
     Args:
         pruned: [N] bool, Gaussians that are left out.

@@ -20,11 +20,12 @@ from sgsst_core.parallel.division import Piece, divide, rounds
 from sgsst_core.parallel.shown import gaussians_sent
 from sgsst_core.timing import wait_for
 
-#: Channels of the style layers. Their statistics are sent as n, mean and one half of C, in float64.
+#: Channels of the style layers. Ranks exchange their statistics in float64: first the pixel count and the mean, then
+#: one half of the symmetric covariance.
 _STYLE_CHANNELS = (64, 128, 256, 512, 512)
 _FIRST_BYTES = 8 * sum(c + 1 for c in _STYLE_CHANNELS)
 _SECOND_BYTES = 8 * sum(c * (c + 1) // 2 for c in _STYLE_CHANNELS)
-#: Bytes for timing a link between CPUs and between GPUs: enough to saturate it, and no more than the images of a few
+#: Bytes sent to time a link between CPUs and between GPUs: enough to saturate it, and no more than the images of a few
 #: views.
 _PROBE_BYTES = {"cpu": 4 << 20, "cuda": 64 << 20}
 #: Minimum fraction of an iteration that additional ranks must save.
@@ -54,7 +55,7 @@ class Link:
 
 @dataclass(frozen=True)
 class IterationWork:
-    """Work of an iteration of one view.
+    """Work of an iteration on one view.
 
     Attributes:
         pieces: One piece for each computed scale.
@@ -68,7 +69,7 @@ class IterationWork:
         forward: Seconds per pixel of a forward pass alone, for pixels whose activations are not cached.
         held: Number of pixels whose activations a single rank can hold (see `choose_tile_size`).
         working: Memory of a pass in addition to the activations, as a fraction of them.
-        sharing: Number of ranks that divide this memory.
+        sharing: Number of ranks that divide the memory for activations.
         shown: Number of Gaussians that the view shows, whose gradients are sent; None for all.
         matching: Time in seconds of the nearest-neighbor search on one rank.
     """
@@ -119,7 +120,7 @@ class IterationWork:
     def communication(self, ranks: int, link: Link) -> float:
         """Return the time in seconds that ranks wait for data.
 
-        Only the statistics of the last scale count; the others overlap.
+        Only the statistics of the last scale count; other scales' reductions overlap computation.
         """
         if ranks == 1:
             return 0.0
@@ -161,7 +162,7 @@ class IterationWork:
 def probe_link(collectives: Collectives, device: torch.device) -> Link:
     """Time all-reduces over all ranks; the result is identical on all ranks.
 
-    A single rank has an infinitely fast link.
+    If there is only one rank, the link is infinitely fast.
     """
     if collectives.size == 1:
         return Link(math.inf, 0.0)
@@ -210,10 +211,10 @@ class RanksChoice:
 def choose_ranks(
     phases: Sequence[tuple[int, Sequence[IterationWork]]], views_per_step: int, available: int, link: Link
 ) -> RanksChoice:
-    """Return the smallest number of ranks beyond which more ranks would not be worth their communication.
+    """Choose the smallest number of ranks whose time is within `LEAST_GAIN` of the best.
 
     Args:
-        phases: Number of steps of each phase, and iterations of some of its views.
+        phases: Number of steps of each phase, and the work of iterations on a sample of views.
         views_per_step: Views per step, which groups of ranks process in parallel.
         available: Number of available ranks.
         link: Connection between the ranks.
@@ -225,7 +226,7 @@ def choose_ranks(
 
 
 def _candidates(available: int) -> list[int]:
-    """Return the numbers of ranks to consider: all up to eight, then in steps of a quarter."""
+    """Return the numbers of ranks to consider: all up to eight, then increasing by a quarter."""
     found, ranks = [], 1
     while ranks < available:
         found.append(ranks)

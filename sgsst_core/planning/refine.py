@@ -1,7 +1,7 @@
 """Choice of the Gaussians to split before a job (`Settings.refine`), and of the number of pieces.
 
-A Gaussian has a single color per viewing direction, so strokes cannot be finer than it. Gaussians that are large in the
-views are split if the gradient of the loss asks for different colors within them.
+A Gaussian has a single color per viewing direction, so strokes cannot be finer than a Gaussian. Gaussians that are
+large in the views are split if the gradient of the loss asks for different colors within them.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from sgsst_core.settings import Settings
 
 #: Minimum PSNR of the unstylized image in dB, in each measured view.
 LEAST_PSNR = 40.0
-#: Candidate sizes as standard deviations in the views in pixels, coarsest first. Below the last one, a Gaussian is
-#: hardly larger than the pixels that are averaged in it.
+#: Candidate target sizes: projected standard deviations in pixels, coarsest first. A Gaussian below the last one is
+#: hardly larger than a pixel.
 SIZES = tuple(256 * 2 ** (-step / 4) for step in range(30))
-#: Minimum total pixels of a Gaussian over all views; smaller ones carry no stroke.
+#: Minimum total blend weight of a Gaussian over all views, in pixels; smaller ones are too small for a stroke.
 _LEAST_WEIGHT = 8.0
 #: Maximum number of children: those of a flat Gaussian split into the most pieces along both axes.
 _MOST_CHILDREN = MOST_PIECES**2
-#: Maximum ratio of a Gaussian's deviation to its distance from a camera that shows it. Beyond it, its pieces appear
-#: elsewhere than the projection of the whole, which linearizes the perspective at the center.
+#: Maximum ratio of a Gaussian's deviation to its distance from a camera that shows it. Beyond it, pieces would be
+#: projected elsewhere than the unsplit Gaussian, whose projection linearizes the perspective at its center.
 _LARGEST_REACH = 1.0
-#: Minimum fraction of the gradient's magnitude under a Gaussian that cancels in its sum. Below it, the gradient asks
-#: for a single color.
+#: Minimum fraction of the gradient's magnitude under a Gaussian that cancels in its sum. Below it, the Gaussian needs
+#: only one color.
 _LEAST_DISAGREEMENT = 0.1
 #: Number of Gaussians whose sizes are computed at a time; takes some tens of megabytes in float64.
 _CHUNK = 1 << 17
@@ -61,11 +61,11 @@ class Footprints:
 
     @property
     def parts(self) -> tuple[Tensor, Tensor]:
-        """Values to be summed [N, 4] and to be maximized [N] over ranks."""
+        """Accumulated values to be reduced over ranks: [N, 4] by sum, and [N] by maximum."""
         return torch.cat([self.weights[:, None], self._squares], dim=1), self.reach
 
     def take(self, sums: Tensor, reach: Tensor) -> None:
-        """Replace the values by those of all ranks together."""
+        """Replace the accumulated values by the reduced ones of all ranks, in the format of `parts`."""
         self.weights, self._squares, self.reach = sums[:, 0].contiguous(), sums[:, 1:].contiguous(), reach
 
     @property
@@ -75,10 +75,10 @@ class Footprints:
 
 
 def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return the projected deviations of the axes of some Gaussians in pixels [n, 3], and the largest over depth [n].
+    """Return Gaussians' projected axis deviations in pixels [n, 3], and their largest deviation divided by depth [n].
 
-    They are those of the rasterizer's projection, without its limit on directions far outside the image. Values that
-    overflow float64 (huge Gaussians) are infinite.
+    The projection is the rasterizer's, but does not clamp directions far outside the image. Values that overflow
+    float64 (huge Gaussians) become infinite.
     """
     pose = camera.world_to_camera.double()
     centers = scene.means[rows].double() @ pose[:3, :3].T + pose[:3, 3]
@@ -95,9 +95,10 @@ def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Te
 def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor) -> tuple[Tensor, Tensor]:
     """Return how much of an image gradient [H, W, 3] cancels under each Gaussian, and its total: both [N] float64.
 
-    The total is sum |g| w over pixels and channels, with blend weights w, and |sum g w| of it reaches the Gaussian's
-    color. The difference is what its pixels disagree about. It takes two passes of the rasterizer, for |g| and g.
-    G-Style (Kovács, Hermosilla, Raidou 2024) also splits by gradient magnitudes, which it accumulates over steps.
+    With gradients g and blend weights w, the total is sum |g| w over pixels and channels. Only |sum g w| of it remains
+    in the gradient of the Gaussian's color. The rest cancels, because the Gaussian's pixels disagree. Computing this
+    takes two passes of the rasterizer, for |g| and g. G-Style (Kovács, Hermosilla, Raidou 2024) also splits by gradient
+    magnitudes, which it accumulates over steps.
     """
     whole = rasterizer.color_gradient(image_gradient.abs(), camera).double()
     summed = rasterizer.color_gradient(image_gradient, camera).double().abs()
@@ -110,8 +111,8 @@ def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, ther
     Args:
         footprints: Sizes in the views.
         splittable: [N] bool, see `can_be_split`.
-        cancels: [N], part of the gradient that cancels over all views, see `disagreement`.
-        there_is: [N], total of the gradient over all views.
+        cancels: [N], portion of the gradient that cancels, summed over all views; see `disagreement`.
+        there_is: [N], total of the gradient's magnitude, summed over all views; see `disagreement`.
     """
     asked = cancels > _LEAST_DISAGREEMENT * there_is
     large = footprints.weights >= _LEAST_WEIGHT
@@ -119,7 +120,7 @@ def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, ther
 
 
 def most_children(weights: Tensor) -> Tensor:
-    """Return the maximum number of Gaussians that each one may become, [N]; children of too few pixels carry no stroke.
+    """Return the maximum number of children of each Gaussian, [N]; smaller children would be too small for a stroke.
 
     Args:
         weights: [N], blend weights over all pixels of all views.
@@ -132,9 +133,9 @@ def choose_pieces(
 ) -> tuple[Tensor, float | None]:
     """Choose the number of pieces of each Gaussian within a budget.
 
-    In every round, all allowed Gaussians are split to a smaller size, except those that would exceed their maximum:
-    blobs, which are split along three axes although views need only two. In the round that exceeds the budget,
-    Gaussians with the largest disagreement per new Gaussian go first.
+    In every round, all allowed Gaussians are split to a smaller size, except those that would exceed their maximum
+    number of children. (These are mostly isotropic Gaussians, which are split along three axes.) In the round that
+    would exceed the budget, Gaussians with the largest disagreement per new Gaussian are split first.
 
     Args:
         lengths: [N, 3], see `Footprints`.

@@ -1,7 +1,7 @@
 """Survey of all views before the job: blend weights per Gaussian, and covered pixels per view.
 
-It takes one pass of the rasterizer per view (`Rasterizer.survey`) and does not use the feature network. Ranks share the
-views.
+It takes one pass of the rasterizer per view (`Rasterizer.survey`) and does not use the feature network. Views are
+distributed among ranks.
 """
 
 from __future__ import annotations

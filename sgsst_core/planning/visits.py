@@ -1,8 +1,7 @@
-"""Costs of a view apart from an iteration's passes: data computed at its first visit, or at each visit if not cached.
+"""Cost of a view's data: they are computed at its first visit and cached, or recomputed at every visit.
 
 Tile intersections, SH colors, blend weights and content features of a view are computed at its first visit, and cached
-as far as each of them fits its part of the memory. What fits costs its seconds once; what does not fit costs them at
-every visit.
+as far as they fit their memory budgets. Cached data take time once; other data take time at every visit.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.settings import Settings
 
-#: Cost of computing a view's cached weights on the CPU, in renders with gradient.
+#: Time to compute a view's cached weights on the CPU, relative to a render with gradient.
 KEEPING_RENDERS = 3
-#: Cost of a render without its gradient, in renders with it.
+#: Time of a render without gradient, relative to a render with gradient.
 RENDER = 0.5
 #: Bytes per Gaussian of a view's colors: the contribution of spherical harmonics.
 COLOR_BYTES = 12
@@ -55,21 +54,21 @@ class Made:
 
     @property
     def once(self) -> float:
-        """Additional time in seconds of a view's first visit, mean over views."""
+        """Time in seconds at a view's first visit to compute data that are then cached, mean over views."""
         return self.kept * self.seconds
 
     @property
     def always(self) -> float:
-        """Time in seconds of every visit of a view, mean over views."""
+        """Time in seconds at every visit of a view to recompute uncached data, mean over views."""
         return (1 - self.kept) * self.seconds
 
     @property
     def cached_bytes(self) -> int:
-        """Final memory use in bytes."""
+        """Final size of the cached data in bytes."""
         return int(self.fitting())
 
     def fitting(self, ranks: int = 1) -> float:
-        """Return the bytes cached on each of some ranks, among which every view is divided."""
+        """Return the bytes that each rank caches if every view is divided among `ranks` ranks."""
         own = self.bytes / ranks
         if own <= self.room:
             return own
@@ -83,7 +82,8 @@ class Visits:
     Attributes:
         intersections: Tile intersections of the rasterizer that computes weights.
         surveyed: Tile intersections cached by the survey, of all views.
-        handed: Fraction of the time for cached tile intersections that the survey's save.
+        handed: Fraction of the time for cached tile intersections that is saved because the survey already computed
+            them.
         colors: SH colors.
         weights: Cached weights; None if there are none.
         content: Content features at all scales, including their render.
@@ -137,7 +137,7 @@ class Visits:
         rendered = RENDER * raster.seconds if settings.content_weight else 0.0
         forward = probe.network.rate.forward if settings.content_weight else 0.0
         room_of_content = 0 if "content" in settings.keep else room / (4 if probe.maps else 2)
-        share = coarse.pixels / work.pixels  # as a fraction of the content's bytes, equal to that of its pixels
+        share = coarse.pixels / work.pixels  # fraction of the pixels, and thereby of the content's bytes
         images = Made(0.0)
         if (
             plan.training_background != "background" and settings.content_weight
@@ -169,7 +169,7 @@ class Visits:
         return uncached + self.colors.always
 
     def later(self, *, coarse: bool) -> float:
-        """Return the time in seconds of every visit for content that is not cached, without rendering and network."""
+        """Return the time in seconds to recompute uncached content and region maps at every visit."""
         return (self.content_coarse if coarse else self.content).always + self.images.always + self.maps.always
 
     def first(self, *, coarse: bool) -> float:

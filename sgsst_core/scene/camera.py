@@ -28,8 +28,8 @@ class Camera:
         width, height: Size in pixels.
         fx, fy, cx, cy: Intrinsics in pixels.
         world_to_camera: [4, 4] float64 rigid transform.
-        resolution: For cameras whose aspect ratio was chosen to fit the content: longer side of the 4:3 view with the
-            same number of pixels. None for the camera's own longer side.
+        resolution: Longer side in pixels of the 4:3 view with the same number of pixels, for cameras whose aspect ratio
+            was fitted to the content. None if resolutions refer to the camera's own longer side.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Camera:
 
     @property
     def side(self) -> int:
-        """Length that resolutions are compared with: `resolution`, or the longer side in pixels."""
+        """Length in pixels that resolution limits apply to: `resolution`, or the longer side if that is None."""
         return self.resolution or max(self.width, self.height)
 
     @property
@@ -57,13 +57,13 @@ class Camera:
 def resized(camera: Camera, side: int) -> Camera:
     """Return the camera with another number of pixels and exactly the same field of view.
 
-    Sizes are integers, so the aspect ratio changes by up to half a pixel. The intrinsics of each axis scale with its
-    own ratio, which stretches the pixels accordingly and leaves the image content in place.
+    Width and height are rounded to integers, so the aspect ratio may change slightly. Each axis's intrinsics are scaled
+    by that axis's own ratio, so the image content stays in place.
 
     Args:
         camera: Any camera.
-        side: Longer side in pixels, or the new `Camera.resolution` if the camera has one; at least 1. May exceed the
-            camera's own.
+        side: Longer side in pixels, or the new `Camera.resolution` if the camera has one; at least 1. It may be larger
+            than the camera's own.
 
     Raises:
         SettingsError: If the side is below 1.
@@ -92,9 +92,10 @@ def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:
 
 
 def spread(views: Sequence[V], count: int) -> list[V]:
-    """Return `count` views, evenly spread over the sequence and in its order, or all if there are no more.
+    """Return `count` views that are evenly spread over a sequence, in its order, or all if there are at most `count`.
 
-    Each is the middle one of `count` equal parts, so neither the ends of a path nor the seam of a ring are preferred.
+    The sequence is divided into `count` equal sections, and the middle view of each is taken. This favors neither the
+    ends of a camera path nor the start of a ring.
 
     Raises:
         SettingsError: If the count is below 1.
@@ -109,7 +110,7 @@ def between(first: Camera, second: Camera) -> Camera:
     """Return the camera halfway between two: at their midpoint, with the spherical mean of their rotations.
 
     Size and intrinsics are the first camera's. The mean is halfway along the shortest rotation between the two (slerp,
-    Shoemake 1985); at 180 degrees, either of the two shortest ones.
+    Shoemake 1985). If they differ by 180 degrees, it is halfway along either of the two shortest rotations.
     """
     ends = np.stack([camera.world_to_camera[:3, :3].double().numpy() for camera in (first, second)])
     rotation = torch.from_numpy(Slerp([0, 1], Rotation.from_matrix(ends))(0.5).as_matrix())
@@ -136,14 +137,15 @@ def look_at(
         name: Name of the camera.
         position: [3], position of the camera.
         target: [3], point at the center of the view.
-        up: [3], direction toward the upper edge; need not be a unit vector, but must not be parallel to the view.
+        up: [3], direction toward the upper edge; need not be a unit vector, but must not be parallel to the viewing
+            direction.
         width: Width in pixels.
         height: Height in pixels.
         focal: Focal length in pixels for both axes; the principal point is the image center.
         resolution: See `Camera`.
 
     Raises:
-        CameraError: If position and target coincide, or `up` is parallel to the view.
+        CameraError: If position and target coincide, or `up` is parallel to the viewing direction.
     """
     up = up.to(torch.float64)
     forward = target.to(torch.float64) - position.to(torch.float64)

@@ -1,4 +1,4 @@
-"""Scene type: N Gaussians, in the units of 3DGS files."""
+"""Scene type: N Gaussians, with values encoded as in 3DGS files."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class Scene:
         return {0: 0, 3: 1, 8: 2, 15: 3}[int(self.sh_rest.shape[1])]
 
     def subset(self, rows: Tensor) -> Scene:
-        """Return the Gaussians of some rows ([N] bool, or indices)."""
+        """Return a scene of the selected Gaussians only, given a mask [N] bool or indices."""
         return Scene(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def used_degree(self, rows: Tensor | None = None) -> int:
-        """Return the highest degree with a non-zero coefficient, among some Gaussians ([N] bool) or all."""
+        """Return the highest SH degree with a non-zero coefficient, among the Gaussians of a mask [N] bool, or all."""
         if self.sh_degree == 0:
             return 0
         if isinstance(self.sh_rest, StoredHarmonics):
@@ -60,9 +60,10 @@ class Scene:
         return next(degree for degree in range(4) if (degree + 1) ** 2 - 1 >= used)
 
     def attenuated(self, attenuation: float) -> Scene:
-        """Return the scene with all SH bands above degree 0 multiplied by 1 - fade; for a fade of 1, without them.
+        """Return the scene with all SH bands above degree 0 multiplied by 1 - `attenuation`, or removed if that is 0.
 
-        Coefficients are multiplied in float32 by the factor rounded to float32, as in files (`attenuation_factor`).
+        The factor is rounded to float32 (`attenuation_factor`), and products are computed in float32, exactly as when a
+        file is attenuated.
         """
         if not attenuation or not self.sh_degree:
             return self
@@ -74,7 +75,7 @@ class Scene:
         return replace(self, sh_rest=self.sh_rest * factor)
 
     def without_zero_bands(self) -> Scene:
-        """Return the scene without the SH bands that are zero in all Gaussians; it looks the same from everywhere."""
+        """Return the scene without the highest SH bands that are zero for all Gaussians; renders do not change."""
         coefficients = (self.used_degree() + 1) ** 2 - 1
         if coefficients == self.sh_rest.shape[1]:
             return self
@@ -89,7 +90,7 @@ def attenuation_factor(attenuation: float) -> float:
 
 
 def sampled(scene: Scene, count: int) -> Scene:
-    """Return a random sample of at most `count` Gaussians, enlarged to cover about the same area together.
+    """Return a random sample of at most `count` Gaussians, enlarged to cover about the same area as all of them.
 
     The area of a Gaussian grows with the square of its size, so sizes are multiplied by the square root of the number
     of Gaussians that each one represents.
@@ -99,9 +100,9 @@ def sampled(scene: Scene, count: int) -> Scene:
 
 
 def sampled_rows(total: int, count: int) -> Tensor:
-    """Return a random row from each run of equal length, at most `count` of `total` rows, with a fixed seed.
+    """Return at most `count` of `total` row indices: a random one (fixed seed) from each block of consecutive rows.
 
-    Regular sampling could coincide with a period in the order of the file.
+    Taking every n-th row instead could coincide with a periodic pattern in the file.
     """
     step = -(-total // count)
     first = torch.arange(0, total, step)
@@ -110,7 +111,7 @@ def sampled_rows(total: int, count: int) -> Tensor:
 
 
 def _used_coefficients(sh_rest: Tensor, rows: Tensor | None = None) -> int:
-    """Return how many leading coefficients cover all non-zero ones, for all Gaussians or those of a mask [N].
+    """Return the number of SH coefficients up to the last non-zero one, for the Gaussians of a mask [N] bool, or all.
 
     Processes the Gaussians in chunks, without a copy.
     """

@@ -1,8 +1,9 @@
 """Luminance, for changing colors without changing their chroma.
 
-Y = 0.299 R + 0.587 G + 0.114 B, the luma of YIQ, of colors as in files and on screens, as in Gatys, Ecker, Bethge,
-Hertzmann and Shechtman, "Controlling Perceptual Factors in Neural Style Transfer", CVPR 2017, section 5.1. Adding the
-same value to all channels of a color keeps its I and Q, which are its chroma.
+Luminance is Y = 0.299 R + 0.587 G + 0.114 B, the luma of YIQ, computed from colors as they are stored and displayed
+(gamma-encoded), as in Gatys, Ecker, Bethge, Hertzmann and Shechtman, "Controlling Perceptual Factors in Neural Style
+Transfer", CVPR 2017, section 5.1. Adding the same value to all channels of a color does not change its I and Q, which
+are its chroma.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ def luminance(colors: Tensor) -> Tensor:
 
 
 def gray(colors: Tensor) -> Tensor:
-    """Return colors [..., 3] with their luminance in every channel, which makes images gray."""
+    """Return gray colors [..., 3], whose channels all equal the luminance of the given colors."""
     return torch.stack([luminance(colors)] * 3, dim=-1)
 
 
@@ -32,10 +33,10 @@ def gray_gradient(gradient: Tensor) -> Tensor:
 
 
 def with_chroma_of(colors: Tensor, original: Tensor) -> Tensor:
-    """Return colors [n, 3] with the chroma of the original ones, which they must already have up to rounding.
+    """Remove rounding errors from the chroma of colors [n, 3] that differ from `original` only in luminance.
 
-    The mean difference of the three channels is added to each original channel and rounded once, so errors of many
-    steps do not accumulate. This works for the linear coefficients of colors too.
+    The difference from the original, averaged over the three channels, is added to each original channel and rounded
+    once, so errors of many steps do not accumulate. DC coefficients work too, because colors are linear in them.
     """
     change = (colors.double() - original.double()).mean(dim=-1, keepdim=True)
     return (original.double() + change).to(colors.dtype)

@@ -21,27 +21,27 @@ RESOLUTION = 1024
 _PIXELS = 3 / 4
 #: Default elevation of a ring in degrees.
 ELEVATION = 10.0
-#: Focal length relative to the longer side, which determines the distance: a field of view of 37 degrees, as with a 50
-#: mm lens. From closer up, the front would hide more of the rest.
+#: Focal length relative to the longer side, which determines the distance of the cameras: a field of view of 37
+#: degrees, about that of a 50 mm lens. For closer cameras, the front of the subject would hide more of the rest.
 _FOCAL = 1.5
 #: Margin around the subject, as a factor of its extent in the frame.
 _MARGIN = 1.03
-#: Aspect ratios (width over height) are steps of a quarter octave, so that an orbit has few sizes, and at most this
-#: many steps from square: 4 to 1.
+#: Aspect ratios (width over height) are powers of `_STEP`, a quarter octave, so that an orbit has few different sizes.
+#: They are at most `_MOST_STEPS` steps from square, which is 4 to 1.
 _STEP, _MOST_STEPS = 2**0.25, 8
 #: Minimum area of a frame as a fraction of the largest, so that stroke sizes stay within half an octave.
 _SMALLEST = 0.5
 #: Minimum distance of the subject's nearest point, as a multiple of the near plane.
 _NEAR_MARGIN = 1.1
-#: Maximum half field of view of a frame, for cameras that a given radius places inside the subject.
+#: Tangent of the maximum half field of view, for cameras that an explicit radius places inside the subject.
 _WIDEST = math.tan(math.radians(50))
-#: If the spreads of the subject along two axes differ by less than this factor, it has no broad side.
+#: If the ratio of the subject's smaller to its larger horizontal spread is at least this, it has no broad side.
 _ROUND = 0.9
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """Position and target of a camera, and the half extents at depth 1 that it has to show."""
+    """Position and target of a camera, and half the width and height at depth 1 that it must show."""
 
     position: Tensor
     target: Tensor
@@ -59,7 +59,7 @@ def orbit(
     height: int | None = None,
     near: float = 0.2,
 ) -> list[Camera]:
-    """Return cameras around the robust center of a scene, all at one distance, framed to fit the subject.
+    """Return cameras on rings around the subject of a scene, all at the same distance, each framed to fit the subject.
 
     Stray Gaussians and background are ignored (`find_subject`). The cameras look at the center of the visible part of
     the subject. Aspect ratios follow its shape, and every frame has as many pixels as 1024x768.
@@ -70,13 +70,14 @@ def orbit(
         up: World direction of up. Captures processed by COLMAP have y pointing down, so -y is up.
         elevations: Elevation of each ring above the scene's horizon in degrees, between -90 and 90.
         radius: Distance of the cameras from the center in world units; None for the smallest distance at which the
-            longer side of every frame spans 37 degrees.
+            subject fits in a field of view of 37 degrees from every camera.
         width: Width in pixels of every frame; None to follow the shape of the subject.
         height: Height in pixels of every frame; None to follow the shape of the subject.
         near: Near plane of the rasterizer in world units; cameras stay at least that far from the subject.
 
     Raises:
-        SettingsError: If count or size are below 1, `up` has no direction, or elevation or radius are out of range.
+        SettingsError: If count or size are below 1, `up` is zero or not finite, or elevation or radius are out of
+            range.
     """
     axis = _checked(count, up, elevations, radius, (width, height))
     subject = scene if isinstance(scene, Subject) else find_subject(scene)
@@ -108,7 +109,7 @@ def orbit(
 
 
 def share_out(count: int, elevations: Sequence[float]) -> list[int]:
-    """Distribute `count` cameras over the rings by circumference, at least one per ring if there are enough."""
+    """Distribute `count` cameras over the rings by circumference, at least one per ring if there are enough cameras."""
     around = [math.cos(math.radians(elevation)) for elevation in elevations]
     shares = [count * length / sum(around) for length in around]
     counts = [max(1, math.floor(share)) for share in shares]
@@ -121,7 +122,10 @@ def share_out(count: int, elevations: Sequence[float]) -> list[int]:
 
 
 def ring_directions(subject: Subject, count: int, up: Tensor, elevations: Sequence[float]) -> list[Tensor]:
-    """Return unit vectors [3] from the center to the cameras, ring by ring. Odd rings are rotated by half a step."""
+    """Return unit vectors [3] from the center to the cameras, ring by ring.
+
+    Every second ring is rotated by half the angle between its cameras.
+    """
     start, side, _ = _level_frame(subject, up).T
     found = []
     for ring, (number, elevation) in enumerate(zip(share_out(count, elevations), elevations, strict=True)):
@@ -134,14 +138,17 @@ def ring_directions(subject: Subject, count: int, up: Tensor, elevations: Sequen
 
 
 def middle_of(subject: Subject, up: Tensor) -> Tensor:
-    """Return the center [3] of the upright box around a subject; the median of a standing figure is not its center."""
+    """Return the center [3] of a subject's upright bounding box.
+
+    A median would be unsuitable: that of a standing figure, for example, is not at half its height.
+    """
     frame = _level_frame(subject, up)
     local = subject.hull @ frame
     return frame @ ((local.amin(0) + local.amax(0)) / 2)
 
 
 def _level_frame(subject: Subject, up: Tensor) -> Tensor:
-    """Return [3, 3] whose columns are the level direction to the first camera, another level direction, and up."""
+    """Return unit vectors as columns [3, 3]: horizontally to the first camera, horizontally to its side, and up."""
     front = _front(subject, up)
     return torch.stack([front, torch.linalg.cross(up, front), up], dim=1)
 
@@ -153,7 +160,7 @@ def _checked(
     radius: float | None,
     size: tuple[int | None, int | None],
 ) -> Tensor:
-    """Return up as a unit vector after checking all arguments."""
+    """Validate the arguments, and return the normalized up vector."""
     axis = torch.tensor(up, dtype=torch.float64)
     if count < 1 or any(side is not None and side < 1 for side in size) or not elevations:
         raise SettingsError(
@@ -169,7 +176,7 @@ def _checked(
 
 
 def _front(subject: Subject, up: Tensor) -> Tensor:
-    """Return the level direction [3] to the first camera: facing the broad side, if there is one."""
+    """Return the horizontal direction [3] to the first camera, which faces the subject's broad side if it has one."""
     start = torch.zeros(3, dtype=torch.float64)
     start[2 if abs(float(up[2])) < 0.9 else 0] = 1.0  # any direction that is not (nearly) parallel to up
     start = torch.nn.functional.normalize(start - (start @ up) * up, dim=0)
@@ -180,7 +187,8 @@ def _front(subject: Subject, up: Tensor) -> Tensor:
     spreads, axes = torch.linalg.eigh((subject.weights[:, None] * flat).T @ flat)
     if not float(spreads[0]) < _ROUND**2 * float(spreads[1]):
         return start
-    # Of the two broad sides, take the one from which more protrudes; if they are alike, the one on the positive z side.
+    # Of the two broad sides, take the one from which more protrudes; if they are similar, the one on the positive z
+    # side.
     skew = float((subject.weights * (flat @ axes[:, 0]) ** 3).sum()) / max(float(spreads[0]), 1e-100) ** 1.5
     sense = skew if abs(skew) > 0.05 else float(axes[0, 0]) or 1.0
     level: Tensor = math.copysign(1.0, sense) * (frame @ axes[:, 0])
@@ -188,7 +196,7 @@ def _front(subject: Subject, up: Tensor) -> Tensor:
 
 
 def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: float) -> float:
-    """Return the smallest distance from the center at which every camera sees all points at offsets [D, 3]."""
+    """Return the smallest distance at which all cameras see all points, given their offsets [D, 3] from the center."""
     origin = torch.zeros(3, dtype=torch.float64)
     distance = 0.0
     for direction in directions:
@@ -201,7 +209,7 @@ def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: f
 
 
 def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: float) -> _Frame:
-    """Return the frame of a camera at an offset from the center, aimed at the center of what it sees of the subject."""
+    """Return the frame of a camera at an offset from the center, aimed at the middle of the visible subject."""
     position, target = middle + offset, middle
     half = (0.0, 0.0)
     for _ in range(5):
@@ -217,7 +225,8 @@ def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: f
         if float(aim[:2].abs().amax()) < 1e-3 * max(half):
             break
         target = position + float(offset.norm()) * (pose[:3, :3].T @ aim)
-    # A single point has no extent; as large as the blur, it would look the same from any distance.
+    # A single point has no extent, so give it a small one. With that of the pixel blur, it would look the same from any
+    # distance.
     least = 1e-3 * subject.size / float(offset.norm()) + 1e-6
     return _Frame(position, target, (_MARGIN * max(half[0], least), _MARGIN * max(half[1], least)))
 

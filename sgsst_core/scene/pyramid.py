@@ -11,7 +11,7 @@ STYLE_SIZE_TOLERANCE = 1.1
 
 
 def scale_count(height: int, width: int, coarsest: int = COARSEST_SHORTER_SIDE) -> int:
-    """Return n_s: halve the shorter side (integer division) until it is at most `coarsest`.
+    """Return the number of scales n_s: halve the shorter side (integer division) until it is at most `coarsest`.
 
     Small views have one scale.
     """
@@ -23,7 +23,7 @@ def scale_count(height: int, width: int, coarsest: int = COARSEST_SHORTER_SIDE) 
 
 
 def downscale(image: Tensor, scale: int) -> Tensor:
-    """Box-average an image [H, W] or [H, W, c] over 2^scale x 2^scale blocks: [H >> scale, W >> scale, ...].
+    """Box-average an image [H, W] or [H, W, c] over 2^scale x 2^scale blocks, to [H >> scale, W >> scale, ...].
 
     Rows and columns outside complete blocks are dropped.
     """
@@ -51,7 +51,7 @@ def add_upscaled_(target: Tensor, gradient: Tensor, scale: int, factor: float = 
 
 
 def style_size(style: tuple[int, int], view: tuple[int, int], scale: float = 1.0) -> tuple[int, int]:
-    """Return the size (height, width) at which a style image is used for views of a size.
+    """Return the size (height, width) to which a style image is resized for views of a given size.
 
     A style whose shorter side is more than 1.1 times the view's is downscaled to the view's shorter side. Its size is
     then multiplied by `scale`, which scales its strokes. With a scale of 1, styles are never enlarged.
@@ -64,5 +64,5 @@ def style_size(style: tuple[int, int], view: tuple[int, int], scale: float = 1.0
 
 
 def coverage_pyramid(coverage: Tensor, levels: int) -> list[Tensor]:
-    """Box-average coverage [H, W] to each of the first `levels` powers of two."""
+    """Return coverage [H, W] box-averaged at the scales 0 to `levels` - 1."""
     return [downscale(coverage, level) for level in range(levels)]

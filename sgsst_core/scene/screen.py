@@ -1,8 +1,8 @@
 """Projection of colors to the range that screens can display: 0 to 1 in every channel.
 
-A loss on images pushes colors beyond what a screen can show, where viewers clip them and the change is lost. Restoring
-each color after every step is projected gradient descent on a box. Adam's metric is diagonal, so clamping each channel
-is the exact projection.
+A loss on images pushes colors beyond what a screen can show, where viewers clip them and the change is lost. Projecting
+each color back after every step is projected gradient descent on a box. Adam scales each channel separately, so
+clamping each channel is the exact projection.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def on_screen(sh_dc: Tensor) -> Tensor:
 
 
 def on_screen_by_luminance(sh_dc: Tensor) -> Tensor:
-    """Shift DC coefficients [n, 3] along gray as little as possible to bring all channels into 0..1.
+    """Add the smallest gray shift to DC coefficients [n, 3] that brings all channels of their colors into 0..1.
 
     If the channels differ by more than 1, no shift suffices; they then exceed the range equally on both sides.
 
@@ -43,7 +43,7 @@ def on_screen_by_luminance(sh_dc: Tensor) -> Tensor:
         [n, 3], in the dtype of the argument; chroma is preserved up to rounding (`luminance.with_chroma_of`).
     """
     lowest, highest = torch.aminmax(sh_dc.double(), dim=1, keepdim=True)
-    # Slightly inside, so that rounding of the sums does not leave the range again.
+    # Slightly inside the range, so that rounded sums do not leave it again.
     bound = LARGEST * (1 - 1e-6)
     inwards = (-bound - lowest).clamp_min(0) - (highest - bound).clamp_min(0)
     centered = -(lowest + highest) / 2

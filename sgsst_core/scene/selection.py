@@ -1,6 +1,7 @@
-"""Selection of Gaussians by position or property: [N] bool from positions [N, 3] or values [N].
+"""Selection of Gaussians by position or property.
 
-Positions are compared in float64; boundaries are included. NaN is never selected.
+Functions return a mask [N] bool, from positions [N, 3] or values [N]. Positions are compared in float64; boundaries are
+included. NaN is never selected.
 """
 
 from __future__ import annotations
@@ -44,5 +45,5 @@ def in_half_space(means: Tensor, plane: Sequence[float]) -> Tensor:
 
 
 def where_property(values: Tensor, sign: str, number: float) -> Tensor:
-    """Select values [N] by comparison with a number, which is converted to their dtype so that "=" can hold."""
+    """Select values [N] by comparison with a number, which is converted to their dtype so that "=" can match."""
     return COMPARISONS[sign](values, torch.tensor(number).to(values).item()) & ~values.isnan()

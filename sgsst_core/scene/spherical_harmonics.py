@@ -85,7 +85,7 @@ def rest_colors(
 
     The result has the dtype and device of `sh_rest`. The sum is computed in float64 and rounded once, except for
     float32 on a GPU, which is summed in float32 (`kernel_rest_colors`). Bands above `degree` are skipped, for instance
-    because a plan found them to be zero; degree 0 gives zeros without any work.
+    because a plan found them to be zero; for degree 0, the result is zero.
 
     Raises:
         ValueError: If K does not match a degree of 0 to 3, or `degree` exceeds that of the coefficients.
@@ -128,7 +128,7 @@ def reference_rest_colors(
 
 
 def _compiled_rest_colors(sh_rest: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
-    """Compute `rest_colors` for float32 on all CPU cores. Another summation order may change the last bit."""
+    """Compute `rest_colors` for float32 on all CPU cores. The last bit may differ from the reference."""
     from sgsst_core.compiled import kernel_threads
     from sgsst_core.scene import spherical_harmonics_kernels as kernels
 
@@ -140,9 +140,9 @@ def _compiled_rest_colors(sh_rest: Tensor, means: Tensor, camera: Camera, degree
 
 
 def _stored_rest_colors(sh_rest: StoredHarmonics, means: Tensor, camera: Camera, degree: int) -> Tensor:
-    """Compute `rest_colors` from coefficients in a file, bit-identically.
+    """Compute `rest_colors` from coefficients in a file, bit-identical to coefficients in memory.
 
-    Each block is used while it is in a core's cache.
+    Each block of the file is used while it is in a core's cache.
     """
     from sgsst_core.scene import spherical_harmonics_kernels as kernels
 
@@ -191,7 +191,7 @@ def triton_runs_on(device: torch.device) -> bool:
     camera = Camera("trial", 1, 1, 1.0, 1.0, 0.5, 0.5, center)
     try:
         found = kernel_rest_colors(one, torch.tensor([[0.0, 0.0, 1.0]], device=device), camera, 1)
-    except Exception:  # whatever the reason, the tensor functions do the same
+    except Exception:  # the tensor functions are used instead
         return False
     return abs(float(found[0, 0]) - SH_C1) < 1e-6
 

@@ -21,9 +21,9 @@ _C30, _C31, _C32, _C33, _C34, _C35, _C36 = SH_C3
 
 @compiled()
 def _direction(means, i, center):
-    """Return the unit vector from the camera center; 0 at the center.
+    """Return the unit vector from the camera center to Gaussian i; zero if it is at the center.
 
-    Scales first if squares would over- or underflow.
+    The offset is scaled first if its squares would overflow or underflow.
     """
     x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
     largest = max(abs(x), abs(y), abs(z))

@@ -53,7 +53,8 @@ def rest_colors(
     length = tl.sqrt(x * x + y * y + z * z)  # 1 to sqrt(3), or 0 at the camera center
     length = tl.where(length > 0, length, 1.0)
     x, y, z = x / length, y / length, z / length
-    # Four channels, the last of them without memory, because the three values of a coefficient are contiguous.
+    # Triton's block sizes are powers of two, so a masked fourth channel is added to a coefficient's three contiguous
+    # values.
     channel = tl.arange(0, 4)[None, :]
     own = there[:, None] & (channel < 3)
     row = sh_rest + (3 * COEFFICIENTS) * p[:, None] + channel

@@ -1,18 +1,20 @@
 """Splitting Gaussians into grids of smaller ones with the same appearance and moments.
 
-Along an axis with standard deviation s, K children have the deviation s / r, are at x_i and have the fractions w_i of
-the parent's weight: values of a Gaussian at equally spaced points. r follows from K, and the weights from
+Along an axis with standard deviation s, a parent is split into K children with deviation s / r, at equally spaced
+positions x_i. Child i has the fraction w_i of the parent's weight; the w_i are values of a Gaussian function at the
+x_i. K determines r, and the weights follow from
 
     sum_i w_i x_i = 0,    (s / r)^2 + sum_i w_i x_i^2 = s^2,
 
 so the mixture of the children has the parent's mean and variance. The spacing is the one at which the mixture is
-closest to the parent in L2: within 3 % for every K. (K = 2 is not used: two children are closest if they are hardly
-smaller.) Axes are split independently, so the mixture of all children has the parent's mean and covariance.
+closest to the parent in L2: within 3 % for every K. (K = 2 is not used: with two children, the mixture is closest if
+they are hardly smaller than the parent.) Axes are split independently, so the mixture of all children has the parent's
+mean and covariance.
 
-A child's opacity is the parent's times the product of w_i r over the axes. This is its fraction of the parent's
-density, whose peak is r times as high if the deviation is r times as small. As long as children do not cover each other
-fully, this adds up to the parent's alpha to first order in the opacity. Opacities stay proportional to the weights, so
-the opacity-weighted mixture keeps its moments at any opacity.
+A child's opacity is the parent's times the product of w_i r over the axes. The factor r is due to the density, whose
+peak is r times as high if the deviation is r times as small. As long as children do not hide each other completely,
+their alphas add up to the parent's, to first order in the opacity. Opacities stay proportional to the weights, so the
+opacity-weighted mixture keeps its moments at any opacity.
 
 Two alternatives are no better (benchmarks/results/README.md). Children that add up in optical depth, with opacity
 1 - (1 - a)^(w r), cover more than the parent in its tails. Children whose lattice has the parent's optical depth are
@@ -32,26 +34,29 @@ from torch import Tensor
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rotations import rotations
 
-#: Maximum along one axis. A Gaussian that is as thick as it is long is split into at most a third as many per axis.
+#: Maximum number of pieces along one axis. Isotropic Gaussians get at most a third as many per axis, because the number
+#: of their children is limited too (`planning.refine`).
 MOST_PIECES = 32
-#: K pieces are smaller by the factor r = _SLOPE K + _START, for which the mixture is within 3 % of the parent.
+#: K pieces are smaller than the parent by the factor r = _SLOPE K + _START, for which the mixture is within 3 % of the
+#: parent.
 _SLOPE, _START = 0.35, 0.33
 #: Candidate spacings of children, in units of their deviation.
 _DISTANCES = np.linspace(1.0, 2.6, 33)
 #: Number of children whose geometry is computed at a time; takes some tens of megabytes in float64.
 _CHUNK = 1 << 18
-#: Gaussians whose children could leave the range of float32 (limits of log scale and position) are not split.
+#: Limits of log scale and position. Gaussians beyond them are not split, because their children could leave the range
+#: of float32.
 _LARGEST_LOG_SCALE, _SMALLEST_LOG_SCALE = 60.0, -60.0
 _FARTHEST = 1e30
 
 
 @dataclass(frozen=True)
 class AxisSplit:
-    """Division of one axis into pieces, for a deviation of 1.
+    """Division of one axis into pieces, for a parent with deviation 1.
 
     Attributes:
         ratio: Factor by which children are smaller.
-        offsets: [K] float64, ascending, symmetric about 0.
+        offsets: [K] float64, positions of the children, ascending and symmetric about 0.
         weights: [K] float64 with sum 1.
     """
 
@@ -62,21 +67,21 @@ class AxisSplit:
 
 @dataclass(frozen=True)
 class Refinement:
-    """Record of how a scene was refined, for display and for repeating it.
+    """Record of how a scene was refined, for display and to repeat the refinement.
 
     Attributes:
         pieces: [N, 3] uint8, number of pieces of each Gaussian along each of its axes; 1 if not split.
         split: Number of Gaussians that were split.
         gaussians: Number of Gaussians after splitting.
-        size: Target for the standard deviation in the views, in pixels, as far as the budget allowed; None if not
-            split.
-        psnr: PSNR in dB of the unstylized images against those before splitting, over all measured views; None if
-            nothing was split.
+        size: Projected standard deviation in pixels to which Gaussians were split, as far as the budget allowed; None
+            if none was split.
+        psnr: PSNR in dB of unstylized renders of the refined scene against the original one, over all compared views;
+            None if nothing was split.
         lowest_psnr: PSNR of the worst of these views.
         taken_back: Number of Gaussians that were left whole because splitting them would have changed the image too
             much.
-        sh_dc: [M, 3] float32, colors of the refined scene: the parents', fitted to the image. None for the parents'
-            own.
+        sh_dc: [M, 3] float32, colors of the refined scene, fitted to renders of the original scene. None if children
+            have their parents' colors.
     """
 
     pieces: Tensor
@@ -95,7 +100,7 @@ class Refinement:
 
 
 def piece_counts(pieces: Tensor) -> Tensor:
-    """Return the number of Gaussians that each one becomes, [N] int64."""
+    """Return the number of Gaussians into which each Gaussian is split, [N] int64."""
     return pieces.long().prod(dim=1)
 
 
@@ -113,7 +118,7 @@ def can_be_split(scene: Scene) -> Tensor:
 def split(scene: Scene, pieces: Tensor) -> Scene:
     """Split Gaussians along their axes; children replace their parent in order.
 
-    Gaussians of one piece remain bit-identical. Colors, spherical harmonics and orientation are the parent's.
+    Gaussians with one piece per axis remain bit-identical. Children inherit color, spherical harmonics and orientation.
 
     Args:
         scene: Scene with N Gaussians.
@@ -143,7 +148,7 @@ def split(scene: Scene, pieces: Tensor) -> Scene:
 
 
 def pieces_to(lengths: Tensor, size: Tensor | float) -> Tensor:
-    """Return the smallest numbers of pieces, [n, 3] uint8, that reduce lengths to a size, as far as possible.
+    """Return the smallest piece counts [n, 3] uint8 that reduce lengths to a size, or the maximum if none suffices.
 
     Args:
         lengths: [n, 3].
@@ -156,13 +161,13 @@ def pieces_to(lengths: Tensor, size: Tensor | float) -> Tensor:
 
 
 def ratio_of(number: int) -> float:
-    """Return the factor by which this many pieces are smaller along their axis."""
+    """Return r, the factor by which children are smaller along an axis that is split into `number` pieces."""
     return 1.0 if number == 1 else _SLOPE * number + _START
 
 
 @functools.cache
 def split_axis(number: int) -> AxisSplit:
-    """Return the division of an axis into 1, or 3 to `MOST_PIECES`, pieces."""
+    """Return the division of an axis into `number` pieces, which is 1, or 3 to `MOST_PIECES`."""
     if number == 1:
         return AxisSplit(1.0, np.zeros(1), np.ones(1))
     ratio = ratio_of(number)
@@ -173,9 +178,9 @@ def split_axis(number: int) -> AxisSplit:
 
 
 def mixture_error(division: AxisSplit) -> float:
-    """Return the L2 distance of the children's mixture from the normal density, relative to the norm of the latter.
+    """Return the L2 distance of the children's mixture from the normal density, relative to that density's norm.
 
-    The result is exact, not sampled.
+    It is computed in closed form.
     """
     own, both = 1 / division.ratio**2, 1 + 1 / division.ratio**2
     apart = division.offsets[:, None] - division.offsets
@@ -191,7 +196,7 @@ def _normal(offsets: NDArray[np.float64], variance: float) -> NDArray[np.float64
 
 
 def _split_axis_at(number: int, ratio: float, distance: float) -> AxisSplit | None:
-    """Return children at a spacing, with Gaussian weights and the right variance; None if there are none."""
+    """Return the division with spacing `distance` that preserves the parent's variance; None if there is none."""
     offsets = np.linspace(-1.0, 1.0, number) * ((number - 1) / 2 * distance)
     squares, wanted = offsets**2, 1 - 1 / ratio**2
     if not squares.min() < wanted < squares.mean():
@@ -207,7 +212,7 @@ def _split_axis_at(number: int, ratio: float, distance: float) -> AxisSplit | No
 
 
 def _shares(squares: NDArray[np.float64], slope: float) -> NDArray[np.float64]:
-    """Return normalized weights of a Gaussian at some squared distances."""
+    """Return exp(-slope * squares), normalized to a sum of 1."""
     weights = np.exp(-slope * (squares - squares.min()))
     shares: NDArray[np.float64] = weights / weights.sum()
     return shares
@@ -219,7 +224,7 @@ def _is_number_of_pieces(pieces: Tensor) -> Tensor:
 
 @functools.cache
 def _tables() -> tuple[Tensor, Tensor, Tensor]:
-    """Return lookup tables by number of pieces: child offsets [P, P], log density fractions [P, P] and log r [P]."""
+    """Return tables indexed by piece count: child offsets [P + 1, P], log(w r) [P + 1, P] and log(r) [P + 1]."""
     offsets, shares = torch.zeros(2, MOST_PIECES + 1, MOST_PIECES, dtype=torch.float64)
     ratios = torch.zeros(MOST_PIECES + 1, dtype=torch.float64)
     for number in (1, *range(3, MOST_PIECES + 1)):
@@ -245,8 +250,8 @@ def _place_children(scene: Scene, pieces: Tensor, rows: Tensor, counts: Tensor, 
     shift = torch.einsum("nij,nj->ni", axes, offsets[into, place])
     found.means[children] = (scene.means[parent].double() + shift).float()
     found.scales[children] = (scene.scales[parent].double() - ratios[into]).float()
-    # Logit of a product, computed from logarithms: it neither vanishes for a faint parent nor reaches 1 for an opaque
-    # one.
+    # Logit of a product, computed from logarithms, so that the opacity neither vanishes for a faint parent nor reaches
+    # 1 for an opaque one.
     logit = scene.opacities[parent].double()
     log = torch.nn.functional.logsigmoid(logit) + shares[into, place].sum(dim=1)
     found.opacities[children] = (log - torch.log(-torch.expm1(log))).float()

@@ -1,12 +1,13 @@
 """Spherical harmonics of large scenes, left in the scene's file until a view needs them.
 
-They make up three quarters of a scene of degree 3, never change, and each view reads them once. The file is read in
-blocks, into a buffer that stays in the CPU cache. The operating system's page cache holds the file: it uses memory that
-is otherwise free, and all processes that read the file share it.
+The coefficients above degree 0 make up three quarters of a scene of degree 3. They never change, and each view reads
+them once. The file is read in blocks, into a buffer that stays in the CPU cache. The operating system's page cache
+holds the file: it uses memory that is otherwise free, and all processes that read the file share it.
 
 The file is not memory-mapped. If another program truncates or rewrites a mapped file, the next access to its pages
 kills the process (SIGBUS), and a user's file may be overwritten at any time during a job of several hours. A short
-read, in contrast, raises an ordinary error. Reading takes a tenth of a second longer for 4 million Gaussians.
+read, in contrast, raises an ordinary error. Reading 4 million Gaussians takes a tenth of a second longer than mapping
+them.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from sgsst_core.errors import SceneError
 #: Bytes per read; a block stays in the L2 cache of one core until it has been used.
 BLOCK_BYTES = 1 << 20
 
-#: Callback for a block. Arguments: index of the first of a run of Gaussians, coefficients [R, K, 3] float32 of all rows
-#: of the block, and rows [n] int32 of the block that belong to these Gaussians. The coefficients are overwritten after
-#: it returns.
+#: Callback for a block of file rows that contains n consecutive Gaussians of the scene. Arguments: index of the first
+#: of these Gaussians, coefficients [R, K, 3] float32 of all rows of the block, and the row [n] int32 of each Gaussian
+#: in the block. The coefficients are overwritten after the callback returns.
 BlockWork = Callable[[int, NDArray[np.float32], NDArray[np.int32]], None]
 
 
@@ -61,7 +62,7 @@ class RowLayout:
 
 
 class RowFile:
-    """File with shared readers that stays open until the last of them is gone.
+    """File that several readers share; it is closed once nothing refers to it any more.
 
     Raises:
         SceneError: If it cannot be opened.
@@ -82,12 +83,12 @@ class RowFile:
         return status.st_size, status.st_mtime_ns
 
     def check_unchanged(self, stamp: tuple[int, int]) -> None:
-        """Raise SceneError if the file has changed since its stamp was taken."""
+        """Raise SceneError if the file's size or modification time differs from an earlier `stamp`."""
         if self.stamp != stamp:
             raise changed(self.path)
 
     def read(self, offset: int, buffer: NDArray[np.uint8]) -> None:
-        """Fill a buffer from a byte offset on.
+        """Fill a buffer with the bytes of the file from `offset` on.
 
         Raises:
             SceneError: If the file is too short or cannot be read.
@@ -150,7 +151,7 @@ class StoredHarmonics:
         return self.layout, self._chosen, self.shape[1], None, self._factor
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the arguments without the file, which another process opens itself."""
+        """Pickle the constructor arguments; the process that unpickles them opens the file itself."""
         return StoredHarmonics, self.arguments
 
     def __len__(self) -> int:
@@ -175,7 +176,7 @@ class StoredHarmonics:
         return StoredHarmonics(self.layout, chosen, self.shape[1], self._file, self._factor)
 
     def first(self, coefficients: int) -> StoredHarmonics:
-        """Return only the first coefficients of each color channel."""
+        """Return only the first `coefficients` of each color channel."""
         return StoredHarmonics(self.layout, self._chosen, coefficients, self._file, self._factor)
 
     def times(self, factor: float) -> StoredHarmonics:
@@ -187,7 +188,7 @@ class StoredHarmonics:
         return self if torch.device(device).type == "cpu" else self.tensor(device)
 
     def tensor(self, device: torch.device | str = "cpu") -> Tensor:
-        """Load all coefficients, [N, K, 3]; they are never in CPU memory twice."""
+        """Load all coefficients, [N, K, 3], without a second copy in CPU memory."""
         values = torch.empty(self.shape, device=device)
 
         def copy(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
@@ -207,9 +208,9 @@ class StoredHarmonics:
         return found
 
     def used_coefficients(self) -> int:
-        """Return how many leading coefficients cover all non-zero ones.
+        """Return the number of coefficients per channel up to the last one that is non-zero for any Gaussian.
 
-        Reads no further than necessary.
+        Reading stops as soon as the result is known.
         """
         step, used = self._rows_at_a_time() * 16, 0
         for start in range(0, len(self), step):
@@ -225,7 +226,7 @@ class StoredHarmonics:
 
         Args:
             work: Callback, called by several threads at once and with blocks in any order.
-            threads: Number of threads, instead of PyTorch's; a single thread gets the blocks in order.
+            threads: Number of threads; None for PyTorch's. A single thread processes the blocks in order.
 
         Raises:
             SceneError: If the file was changed after it was first read.
@@ -237,7 +238,7 @@ class StoredHarmonics:
             self._work_through(work, bounds)
         else:
             with ThreadPoolExecutor(threads, thread_name_prefix="harmonics") as pool:
-                # Threads read neighboring parts of the file at the same time, because it may have to come from a disk.
+                # Blocks are interleaved, so that threads read neighboring parts of a file that may be on a disk.
                 for done in [pool.submit(self._work_through, work, bounds[i::threads]) for i in range(threads)]:
                     done.result()
         self._file.check_unchanged(self.layout.stamp)
@@ -246,7 +247,7 @@ class StoredHarmonics:
         return max(1, BLOCK_BYTES // self.layout.row_bytes)
 
     def _work_through(self, work: BlockWork, bounds: list[int]) -> None:
-        """Process the blocks that start at some rows of the file."""
+        """Call `work` for the blocks that start at the file rows `bounds`."""
         layout, step = self.layout, self._rows_at_a_time()
         buffer = np.empty(step * layout.row_bytes, np.uint8)
         every = np.arange(step, dtype=np.int32)

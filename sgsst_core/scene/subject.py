@@ -14,7 +14,8 @@ from torch import Tensor
 from sgsst_core.scene.gaussians import Scene, sampled_rows
 from sgsst_core.scene.rotations import rotations
 
-#: Gaussians sampled for computing the extent, accurate to well under a percent, and points stored of them.
+#: Number of Gaussians sampled to compute the extent, which is then accurate to well under 1 %, and maximum number of
+#: points stored in a `Subject`.
 _SAMPLE, _POINTS = 100_000, 20_000
 #: Weight quantile at which areas and lengths are capped, so that a few needles or sheets do not dominate.
 _LARGEST = 0.98
@@ -41,8 +42,8 @@ class Subject:
 
     Attributes:
         points: [P, 3], means of a sample of its Gaussians.
-        weights: [P], surface that each of them represents, opacity times area; the sum is 1.
-        hull: [D, 3], outermost points of these Gaussians, including their extents, in all directions.
+        weights: [P], surface area that each point represents (opacity times area), normalized to a sum of 1.
+        hull: [D, 3], outermost point of the subject in each of D directions, including the extents of Gaussians.
         left_out: Fraction of the scene's weight that is stray or background.
     """
 
@@ -57,7 +58,7 @@ class Subject:
         return float(torch.cdist(self.hull, self.hull).amax())
 
     def holds(self, means: Tensor) -> Tensor:
-        """Return which of some points [N, 3] lie in the bounding box of the subject, [N] bool."""
+        """Return the mask [N] bool of points [N, 3] that lie in the bounding box of the subject."""
         low, high = self.hull.amin(0), self.hull.amax(0)
         return ((means >= low.to(means)) & (means <= high.to(means))).all(1)
 
@@ -66,7 +67,7 @@ def find_subject(scene: Scene) -> Subject:
     """Find the subject of a scene with at least one Gaussian."""
     rows = sampled_rows(len(scene), _SAMPLE)
     points = scene.means[rows].double()
-    # beyond e^60 a length is practically infinite, and its square still fits
+    # a length of e^60 is practically infinite, and its square does not overflow
     lengths = scene.scales[rows].double().clamp(-60, 60).exp()
     opacities = torch.sigmoid(scene.opacities[rows].double())
     ordered = lengths.sort(dim=1).values
@@ -104,13 +105,13 @@ def spread_directions(count: int) -> Tensor:
 
 
 def _without_strays(points: Tensor, weights: Tensor) -> Tensor:
-    """Return which of the points [P, 3] are neither background nor in isolated pieces, [P] bool."""
+    """Return the mask [P] bool of points [P, 3] that are neither background nor in isolated pieces."""
     middle = torch.tensor([quantile(points[:, axis], weights, 0.5) for axis in range(3)], dtype=torch.float64)
     distances = (points - middle).norm(dim=1)
     median = quantile(distances, weights, 0.5)
     reach = _REACH * median if median > 0 else quantile(distances, weights, 0.99)
     kept: Tensor = distances <= reach
-    while True:  # without distant parts, the grid becomes finer and may separate more pieces
+    while True:  # each removal makes the grid finer, which may separate more pieces
         rows = kept.nonzero()[:, 0]
         whole = _pieces(points[rows], weights[rows])
         if bool(whole.all()) or float(weights[rows[whole]].sum()) < _LEAST_LEFT * float(weights[rows].sum()):
@@ -119,7 +120,7 @@ def _without_strays(points: Tensor, weights: Tensor) -> Tensor:
 
 
 def _pieces(points: Tensor, weights: Tensor) -> Tensor:
-    """Return which points belong to pieces with enough weight, [P] bool; pieces are connected cells of a grid."""
+    """Return the mask [P] bool of points in pieces with enough weight; a piece is a connected set of grid cells."""
     low = points.amin(0)
     side = float((points.amax(0) - low).amax())
     cells = min(_CELLS, max(4, round(len(points) ** (1 / 3))))  # keeps random points connected
@@ -150,7 +151,7 @@ def _hull(points: Tensor, turned: Tensor, reach: Tensor) -> Tensor:
     # in batches, because each direction needs a value per Gaussian
     for directions in spread_directions(_DIRECTIONS).split(16):
         along = points @ directions.T
-        # all others end before the center of another one in all of these directions
+        # skip Gaussians that end before the center of another one in all of these directions
         rows = (along + largest[:, None] >= along.amax(0)).any(1).nonzero()[:, 0]
         ends = torch.einsum("pij,di->pdj", turned[rows], directions)
         widths = ends.norm(dim=2)

@@ -16,20 +16,21 @@ from sgsst_core.scene.subject import Subject, quantile
 USUAL_UP = (0.0, -1.0, 0.0)
 #: Directions this close to a world axis are replaced by it, because captures are mostly aligned by hand.
 _SNAP = math.cos(math.radians(10))
-#: Thickness of a layer as a fraction of the subject's size, and its maximum distance from the end, as fractions of the
-#: subject's size and of its height.
+#: Thickness of a ground layer as a fraction of the subject's size, and its maximum distance from the subject's end, as
+#: fractions of the subject's size and of its height.
 _LAYER, _END, _END_OF_HEIGHT = 0.01, 0.12, 0.25
-#: Minimum fraction of the subject that the ground lies under, and the maximum of the layer at the other end relative to
-#: it.
+#: Minimum fraction of the subject's area, seen from above, that the ground must lie under. Maximum of the same fraction
+#: for a layer at the opposite end, relative to the ground's.
 _GROUND, _OTHER_END = 0.7, 0.6
 #: Cells along the longer side of a grid over a layer.
 _CELLS = 24
-#: A scene with a larger fraction of background or strays is not an object that could stand.
+#: A scene with a larger fraction of background or strays is not taken for a standing object.
 _WHOLE = 0.03
 #: A subject counts as standing if its length is at least this multiple of its width (by standard deviation).
 _STANDS = 1.6
-#: Standing subjects have a foot: thickness of the layer at the ends as a fraction of the length, minimum ratio of its
-#: area to that at the other end, and minimum fraction of the area of the whole seen from above.
+#: A standing subject has a foot at its lower end. Thickness of the layers at both ends as a fraction of the length,
+#: minimum ratio of the foot's area to that of the other end, and minimum fraction of the whole subject's area seen from
+#: above.
 _FOOT, _WIDER, _LEAST_FOOT = 0.015, 1.3, 0.05
 #: Minimum foot area, as a fraction of the whole, of a subject that lies along its length, such as a car on its wheels.
 _LIES = 0.5
@@ -42,7 +43,7 @@ class Up:
     Attributes:
         direction: [3] float64, unit length.
         reason: Display text, such as "a flat layer lies under all of it".
-        sure: Whether it is derived from the scene; False if it is only the usual convention.
+        sure: Whether the scene determines the direction; False if it relies on the usual convention.
         ground: Whether there is a ground under the subject, which hides it from below.
     """
 
@@ -62,7 +63,7 @@ class Up:
 
 
 def find_up(subject: Subject) -> Up:
-    """Find up from the ground, else from the long axis of the subject and its wider end, else by convention (-y)."""
+    """Find up from the ground, else from the subject's long axis and its wider end, else by convention (-y)."""
     axes = _principal_axes(subject)
     ground = _ground(subject, [*axes.T, *torch.eye(3, dtype=torch.float64)])
     if ground is not None:
@@ -90,7 +91,7 @@ def _times(larger: float, smaller: float) -> str:
 
 
 def _habit(direction: Tensor) -> float:
-    """Return a positive number for the more common sense of an axis: -y (COLMAP), z (Blender, nerfstudio), x."""
+    """Return a positive number if a direction has the usual sense along its axis: -y (COLMAP), +z (Blender) or +x."""
     x, y, z = (float(value) for value in direction)
     return -y if abs(y) >= max(abs(x), abs(z)) else z if abs(z) >= abs(x) else x
 
@@ -126,7 +127,7 @@ def _axes_of(points: Tensor, weights: Tensor) -> Tensor:
 
 
 def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Tensor | None:
-    """Return up [3] from a flat layer at one end of a candidate axis; None if there is none, or more than one."""
+    """Return up [3] from a flat layer at an end of an axis; None if there is none, or if layers disagree."""
     found: list[tuple[float, Tensor]] = []
     for axis in candidates:
         for up in (axis, -axis):
@@ -143,7 +144,7 @@ def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Tensor | None:
 
 
 def _levelled(subject: Subject, up: Tensor) -> Tensor | None:
-    """Return the normal of the flat layer at the lower end, near `up` [3]; None if it deviates too much."""
+    """Return the normal [3] of the flat layer at the lower end; None if it deviates too much from `up` [3]."""
     level = up
     for _ in range(4):
         rows, _ = _layer(subject, level)
@@ -155,7 +156,7 @@ def _levelled(subject: Subject, up: Tensor) -> Tensor | None:
 
 
 def _layer(subject: Subject, up: Tensor) -> tuple[Tensor, float]:
-    """Return the heaviest layer near the lower end: its rows [P] bool, and the fraction of the subject above it."""
+    """Return the heaviest layer near the lower end: its points [P] bool, and the fraction of the area above it."""
     heights = subject.points @ up
     heights = heights - heights.amin()
     thickness = _LAYER * subject.size
@@ -172,7 +173,7 @@ def _layer(subject: Subject, up: Tensor) -> tuple[Tensor, float]:
 
 
 def _share_under(points: Tensor, up: Tensor, rows: Tensor) -> float:
-    """Return the fraction of the area of all points [P, 3], seen from above, that some of them ([P] bool) cover.
+    """Return the fraction of the area of points [P, 3], seen from above, that the points `rows` ([P] bool) cover.
 
     Areas are counted in grid cells.
     """
@@ -187,7 +188,7 @@ def _share_under(points: Tensor, up: Tensor, rows: Tensor) -> float:
 
 
 def _foot(subject: Subject, up: Tensor) -> float:
-    """Return the area of the hull of the lowest points, relative to that of the subject, both seen from above."""
+    """Return the convex hull area of the lowest points relative to the whole subject's, both seen from above."""
     heights = subject.points @ up
     flat = subject.points @ _across(up)
     # quantiles, so that a few strays do not count as a foot

@@ -20,8 +20,8 @@ class PhotosAhead:
     only once the device has reached that event. At most one photo is prefetched at a time, and the thread exists only
     between `begin` and `end`.
 
-    The thread may allocate pinned memory while a graph is being captured, which CUDA treats as an error of the capture
-    unless it is restricted to its own thread (`capture_error_mode="thread_local"`).
+    The thread may allocate pinned memory while a graph is being captured, which invalidates the capture, unless the
+    capture is restricted to its own thread (`capture_error_mode="thread_local"`).
 
     Args:
         load: Function that reads a photo; also called in the thread.
@@ -47,7 +47,7 @@ class PhotosAhead:
         self._next = index, self._thread.submit(self._pinned, index)
 
     def __call__(self, index: int) -> Tensor:
-        """Return a photo [H, W, 3] on the device: the prefetched one, or another one that is read now.
+        """Return a photo [H, W, 3] on the device; it is read now unless it has been prefetched.
 
         Raises:
             ImageError: If reading fails, in the thread or here.

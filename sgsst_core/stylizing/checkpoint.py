@@ -1,6 +1,7 @@
 """Checkpoints: safetensors files with everything that a resumed run needs, tied to their job by a fingerprint.
 
-The last two are stored. Each contains a digest of its content. If one is damaged, the previous one is used.
+The last two checkpoints of a job are stored. Each contains a digest of its content. If the newer one is damaged, the
+older one is used.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Checkpoints:
         return self.latest.exists() or self.previous.exists()
 
     def save(self, checkpoint: Checkpoint, job: str) -> None:
-        """Write a new checkpoint and keep the previous one. There is a complete one at any moment.
+        """Write a new checkpoint and keep the previous one. A complete checkpoint exists at any moment.
 
         Raises:
             OutputError: If the file cannot be written; the newest existing checkpoint remains.
@@ -297,9 +298,9 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors = {
         "plan.total_weights": plan.survey.total_blend_weights,
         "plan.optimized": plan.optimized,
-        "plan.seen": plan.seen.clone(),  # may be the same tensor, which the format does not accept twice
+        "plan.seen": plan.seen.clone(),  # may be `optimized`; the format rejects shared tensors
     }
-    nothing = torch.empty(0)  # `asdict` would copy them
+    nothing = torch.empty(0)  # placeholder for tensors, which `asdict` would copy
     refinement = plan.refinement
     if refinement is not None:
         tensors["plan.pieces"] = refinement.pieces

@@ -3,9 +3,9 @@
 Along a single axis the optimal transport is known: sorted values map to sorted target values, so the minimum maps to
 the minimum and the median to the median. Repeating this for three perpendicular axes, then for three others, and so on,
 makes the distributions converge (Pitié, Kokaram and Dahyot, "Automated color grading using color distribution
-transfer", 2007). The result is a function of color, so equal colors stay equal. It maps almost into the convex hull of
-the target colors, so nothing is clipped: a dark scene also gets the dark strokes of a bright style, whereas matching
-only mean and spread would end in white.
+transfer", 2007). The result is a function of color, so equal colors stay equal. Results lie almost within the convex
+hull of the target colors, so hardly anything is clipped: a dark scene also gets the dark strokes of a bright style.
+Matching only mean and spread would turn such a scene mostly white.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sgsst_core.stylizing import color_transport_kernels
 
 #: Number of rounds, each with its own axes; enough to reduce the remaining distance to that between samples.
 ROUNDS = 16
-#: Maximum number of colors sampled from each side, and number of knots per axis (a power of 2).
+#: Maximum number of colors sampled from each distribution, and number of knots per axis (a power of 2).
 _SAMPLES = 1 << 16
 _KNOTS = 1 << 9
 #: Values closer to each other than this count as equal: a flat scene must not be stretched by its rounding errors.
@@ -38,7 +38,7 @@ _Map = tuple[Tensor, Tensor]
 
 
 def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
-    """Transform colors to the distribution of other colors.
+    """Transform colors so that their distribution matches that of the `wanted` colors.
 
     Args:
         colors: [N, 3] float64, finite.
@@ -54,7 +54,7 @@ def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
 
 
 def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
-    """Return the axes [3, 3] of each round with the maps along them, given samples [n, 3] of both sides."""
+    """Return the axes [3, 3] of each round and the maps along them, given samples [n, 3] of both distributions."""
     found: list[tuple[Tensor, list[_Map]]] = []
     for axes in _turns():
         axes = axes.to(source.device)
@@ -65,7 +65,7 @@ def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
 
 
 def _through(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
-    """Transform colors [n, 3] by some rounds."""
+    """Apply the maps of some rounds to colors [n, 3]."""
     for axes, maps in rounds:
         along = zip((colors @ axes).unbind(1), maps, strict=True)
         colors = torch.stack([_mapped(values, *map_) for values, map_ in along], dim=1) @ axes.T
@@ -89,9 +89,9 @@ def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]
 
 
 def _drawn(weights: Tensor) -> Tensor:
-    """Return indices [_SAMPLES] of colors with frequencies proportional to their weights.
+    """Return indices [_SAMPLES] of colors, sampled in proportion to their weights.
 
-    They are at equal steps of the cumulative weights.
+    Samples are taken at equal steps of the cumulative weights.
     """
     running = weights.cumsum(0)
     steps = (torch.arange(_SAMPLES, dtype=running.dtype, device=running.device) + 0.5) * (running[-1] / _SAMPLES)
@@ -110,7 +110,7 @@ def _turns() -> Iterator[Tensor]:
 
 
 def _along(values: Tensor, wanted: Tensor) -> _Map:
-    """Return the transport along one axis from values [n] to others [m].
+    """Return the transport along one axis that maps values [n] to the distribution of `wanted` values [m].
 
     Equal values map to the mean of all their targets.
     """

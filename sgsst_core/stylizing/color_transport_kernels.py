@@ -10,8 +10,7 @@ import numpy as np
 
 from sgsst_core.compiled import compiled
 
-#: Number of colors that pass through the rounds together; they and the maps of a round stay in a core's L1 and L2
-#: caches.
+#: Number of colors that are processed together; they and the maps of a round fit in a core's L1 and L2 caches.
 _TOGETHER = 512
 
 

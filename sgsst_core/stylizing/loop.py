@@ -1,7 +1,7 @@
 """Optimization loop: run all steps of a job, and decide when to stop early.
 
-The loop neither prints nor writes; whatever is to be displayed or saved goes through `Callbacks`. With several ranks,
-each runs the loop, and the first one decides when it stops.
+The loop neither prints nor writes files; `Callbacks` display and save results. With several ranks, each rank runs the
+loop, and the first rank decides when it stops.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interr
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a job, as for a progress bar.
+    """Progress of a job after a step.
 
     Attributes:
         stage: Phase of the completed step, "coarse" or "sos"; "measuring" if a measurement follows it.
@@ -68,7 +68,7 @@ class Measuring(Protocol):
 class Callbacks:
     """Optional callbacks of the loop, called between iterations.
 
-    `measure` must be the same on every rank; the others are only for the first rank.
+    `measure` must be the same on every rank; give the other callbacks to the first rank only.
 
     Attributes:
         progress: Called after every iteration.
@@ -77,7 +77,8 @@ class Callbacks:
         checkpoint_seconds: Seconds between checkpoints.
         preview: Called with the stylizer before the first step and about every `preview_seconds`.
         preview_seconds: Seconds between previews.
-        measure: Called with the stylizer after each step for which it is due; its time does not count as the job's.
+        measure: Called with the stylizer after each step for which it is due; its time does not count toward
+            `Stylizer.seconds`.
     """
 
     progress: Callable[[Progress], None] | None = None
@@ -98,7 +99,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
 
 
 def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
-    """Iterate as `run` does, without its cleanup."""
+    """Do the work of `run`, without its cleanup."""
     last_checkpoint = last_preview = time.perf_counter()
     pace = _pace(stylizer)
     if callbacks.preview and not stylizer.step:
@@ -124,7 +125,7 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
 
 
 def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
-    """Return whether the user or the clock ends the run before the next step; ranks may disagree."""
+    """Return the reason if the user or the time limit ends the run before the next step. Ranks may disagree."""
     if callbacks.stop and callbacks.stop():
         return "interrupted"
     seconds = stylizer.settings.max_seconds
@@ -132,7 +133,7 @@ def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
 
 
 def _enough(stylizer: Stylizer) -> Stopped | None:
-    """Return whether the losses end the run before the next step; ranks always agree."""
+    """Return the reason if the losses end the run before the next step. Ranks always agree."""
     settings = stylizer.settings
     if not (settings.target_loss or settings.early_stop):
         return None
@@ -147,10 +148,10 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
 
 
 def _losses_on_background(stylizer: Stylizer) -> list[float]:
-    """Return the current loss on the plain background, evaluated like the initial loss; empty within a round.
+    """Return the current loss over the settings' background color, once per step of a round; empty within a round.
 
-    Losses of steps with different backgrounds are not comparable. At the end of a round, the loss is repeated for each
-    of its steps.
+    Losses of steps with different backgrounds are not comparable, so the loss is evaluated at the end of each round, in
+    the same way as the initial loss.
     """
     if stylizer.step % stylizer.round_length:
         return []
@@ -159,7 +160,7 @@ def _losses_on_background(stylizer: Stylizer) -> list[float]:
 
 
 def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
-    measured = stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step  # before a resume
+    measured = stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step  # by an earlier session
     if callbacks.measure and not measured and callbacks.measure.due(stylizer.step):
         callbacks.measure(stylizer)
 

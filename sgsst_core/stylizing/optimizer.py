@@ -55,7 +55,7 @@ class ColorOptimizer:
         self._steps = torch.zeros((), dtype=torch.float32, device=colors.device if self._fused else None)
 
     def update(self, gradient: Tensor, learning_rate: float) -> Tensor:
-        """Make one step. If the gradient [n, 3] is not finite or exceeds `LARGEST_GRADIENT`, nothing changes.
+        """Make one step, or skip it if the gradient [n, 3] is not finite or exceeds `LARGEST_GRADIENT`.
 
         Returns:
             Largest magnitude in the gradient, in units of a 0-255 input: a scalar on the colors' device. The caller
@@ -105,7 +105,7 @@ class ColorOptimizer:
     def _constrain(self, largest: Tensor) -> None:
         """Project colors to their constraints: range and chroma.
 
-        Frozen colors do not change, and neither does any color if no step was made.
+        Frozen colors do not change. If the step was skipped, no color changes.
         """
         if not self._bounded and self._chroma_of is None:
             return
@@ -120,7 +120,7 @@ class ColorOptimizer:
         return self._first.cpu().clone(), self._second.cpu().clone()
 
     def load_moments(self, step: int, first: Tensor, second: Tensor) -> None:
-        """Resume after at least one step, with its moments [n, 3]."""
+        """Restore the moments [n, 3] after a number of steps, at least one."""
         self._steps.fill_(step)
         self._first.copy_(first)
         self._second.copy_(second)

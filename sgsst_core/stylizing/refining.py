@@ -1,8 +1,9 @@
 """Refinement: split large Gaussians before a job, without changing the unstylized image.
 
-It surveys the views, determines from the loss where finer Gaussians are needed, splits, and verifies the image. Nothing
-is stylized yet. The gradient is computed once per view, for colors that already have the style's mean and spread in
-closed form: this is what the first steps would reach, so the rest of the gradient asks for texture.
+It surveys the views, determines from the gradient of the loss where finer Gaussians are needed, splits Gaussians, and
+verifies the images. Nothing is stylized yet. The gradient is computed once per view, after the colors have been given
+the style's mean and covariance in closed form. The first steps would reach such colors anyway, so the remaining
+gradient shows where texture is needed.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ GRADIENT_VIEWS = 24
 MEASURED_VIEWS = 6
 #: Steps for fitting the colors of split Gaussians to the unstylized image.
 _FITTING_STEPS = 5
-#: Maximum number of rounds in which Gaussians are restored until the image is close enough, and fraction of the error
-#: that the Gaussians restored in a round account for.
+#: Splits are undone in rounds until the images are close enough: maximum number of rounds, and fraction of the error
+#: that the splits undone in a round account for.
 _ROUNDS, _TAKEN_BACK = 24, 0.25
 
 
@@ -100,7 +101,7 @@ class _Change:
         psnr: PSNR in dB of all views together.
         lowest: PSNR in dB of the worst view.
         sh_dc: [M, 3], fitted colors of the split scene.
-        squared: [N] float64, squared change under each Gaussian, weighted by blend weights.
+        squared: [N] float64, squared change of the pixels that each Gaussian contributes to, weighted by blend weights.
     """
 
     psnr: float
@@ -113,7 +114,7 @@ class _Refining:
     """Refinement of one scene.
 
     Args:
-        workshop: Planning context of the scene.
+        planning_context: Planning context of the scene.
         style: Style of the job as given; styles of regions are not considered.
         collectives: Ranks of the job.
         kept: [N] bool, frozen Gaussians, which are not split; None for none.
@@ -165,9 +166,9 @@ class _Refining:
     def _as_far_as_the_picture_stays(
         self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]
     ) -> tuple[Tensor, _Change | None]:
-        """Reduce the pieces until the image of some views is preserved. Return them with the remaining change.
+        """Undo splits until the images of `views` are preserved. Return the remaining pieces, and the remaining change.
 
-        Colors of split Gaussians are first fitted to other views. The change is None if nothing is split or remains
+        Colors of split Gaussians are first fitted to the views `fitted`. The change is None if no Gaussian remains
         split.
         """
         for _ in range(_ROUNDS):
@@ -227,7 +228,7 @@ class _Refining:
         return cancels, there_is
 
     def _change(self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]) -> _Change:
-        """Return the effect of pieces [N, 3] on the unstylized image of some views, with colors fitted to others."""
+        """Return the effect of pieces [N, 3] on the unstylized image of `views`, with colors fitted to `fitted`."""
         scene, name = split(self._scene, pieces), self._rasterizer.name
         options = rasterizer_options(name, self._settings, self._planning_context.machine.memory)
         rasterizer = make_rasterizer(name, scene, **options)
@@ -265,7 +266,7 @@ class _Refining:
         return scene
 
     def _without_the_worst(self, pieces: Tensor, change: _Change) -> Tensor:
-        """Restore the Gaussians under which the image changes most, up to a fraction of the total change."""
+        """Undo the splits that change the images most, up to a fraction of the total change."""
         parents = (piece_counts(pieces) > 1).nonzero()[:, 0]
         density = change.squared[parents] / self._footprints.weights[parents].clamp_min(1.0)
         order = torch.argsort(density, descending=True, stable=True)

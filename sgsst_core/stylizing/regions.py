@@ -24,9 +24,9 @@ class JobStyles:
     """Styles of a job, prepared as its settings require.
 
     Attributes:
-        own: Default style; if a single region is everything, the style of that region.
+        own: Default style; if one region contains everything that the views show, the style of that region.
         regions: Regions of the scene; None if there are none.
-        each: Style of each region in `active`; empty if views need no region maps.
+        each: Style of each region in `Regions.active`; empty if views need no region maps.
     """
 
     own: StyleMixture
@@ -147,7 +147,7 @@ class RegionMaps:
     def render(self, camera: Camera, rows: Rows | None = None) -> Tensor:
         """Return the maps [h, w, regions] in 0..1 of a view, or of some of its rows.
 
-        They are exactly 0 where a region has no Gaussian.
+        They are exactly 0 where a region is not visible.
         """
         behind = self._pass(camera, rows, ())
         parts = [
@@ -170,7 +170,7 @@ class RegionMaps:
 def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:
     """Return color changes for the Gaussians that are not optimized: those of their neighbors in the same region.
 
-    In a region without optimized Gaussians, neighbors of any region count. Frozen Gaussians have no change.
+    If a region has no optimized Gaussians, neighbors in all regions count. The change of frozen Gaussians is 0.
 
     Args:
         means: [N, 3], see `neighbors_change`.

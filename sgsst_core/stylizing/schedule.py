@@ -13,7 +13,7 @@ from sgsst_core.settings import Settings
 
 @dataclass(frozen=True)
 class Phase:
-    """Part of the schedule.
+    """Phase of the schedule.
 
     Attributes:
         stage: Name of the phase: "coarse" (phase 1) or "sos" (phase 2) in every preset.
@@ -27,7 +27,7 @@ class Phase:
     scale: int | None = None
 
     def scales(self, chosen: Sequence[int]) -> list[int]:
-        """Return the scales to optimize among a view's scales with a weight, which are sorted finest first."""
+        """Return the scales to optimize, given a view's scales with a positive weight (`chosen`), finest first."""
         return list(chosen) if self.scale is None else [chosen[max(len(chosen) - 1 - self.scale, 0)]]
 
 
@@ -37,7 +37,7 @@ def planned_phases(plan: Plan, settings: Settings) -> list[Phase]:
 
 
 def phase_at(schedule: Sequence[Phase], step: int) -> Phase:
-    """Return the phase of the step after `step` others; the last phase if all steps are done."""
+    """Return the phase of the step after `step` completed steps; the last phase if all steps are done."""
     for phase in schedule:
         if step < phase.steps:
             return phase
@@ -46,7 +46,7 @@ def phase_at(schedule: Sequence[Phase], step: int) -> Phase:
 
 
 def drawn_round(covered: Sequence[int], generator: torch.Generator) -> list[int]:
-    """Return every view once in random order; it is consumed from the end."""
+    """Return every view once in random order, for taking views from the end of the list."""
     return [covered[i] for i in torch.randperm(len(covered), generator=generator).tolist()]
 
 

@@ -1,8 +1,8 @@
-"""Estimate of the remaining time of a job, from the time of its steps and the plan's predictions for the others.
+"""Estimate of the remaining time of a job, from its steps so far and the plan's predictions for later steps.
 
 The first visit of a view in a phase takes longer than later ones, because its tile intersections, coverage and content
 features are computed then. Steps are therefore counted separately by phase, and first visits separately from others.
-After a resume, every view has to be visited for the first time again.
+After a resume, caches are empty, so every view has a first visit again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-#: Number of latest steps of each kind and phase that count.
+#: Number of latest steps of each phase that are used, separately with and without first visits.
 _LATEST = 101
 
 
@@ -39,7 +39,7 @@ class _FirstVisits:
 
     seconds: float
     views: int
-    prepared: float  # part of the seconds known to belong to first visits
+    prepared: float  # portion of `seconds` known to be spent on first visits
 
 
 class _Stage:
@@ -54,7 +54,7 @@ class _Stage:
         return [*self.known, *(step.seconds for step in self.first)]
 
     def extra(self, known: float) -> float:
-        """Return the additional time in seconds of a first visit, given the time of a step without any."""
+        """Return the additional time in seconds of a first visit, given the time of a step without first visits."""
         return max(median((step.seconds - known) / step.views for step in self.first), 0.0)
 
 
@@ -78,11 +78,12 @@ class SecondsLeft:
         self._views_per_step = views_per_step
         self._steps = {phase.stage: _Stage() for phase in phases}
         self._visited: dict[str, set[int]] = {phase.stage: set() for phase in phases}
-        #: Total seconds of steps, and of checkpoints and the like, which recur in proportion to the steps.
+        #: Total seconds of steps, and of checkpoints and previews, which are assumed to stay in proportion to the
+        #: steps.
         self._seconds = self._beside = 0.0
 
     def add_step(self, stage: str, views: Collection[int], seconds: float, prepared: float = 0.0) -> None:
-        """Record a step. `prepared` is the part of its seconds known to belong to first visits."""
+        """Record a step. `prepared` is the portion of `seconds` known to be spent on first visits."""
         fresh = len(set(views) - self._visited[stage])
         self._visited[stage].update(views)
         if fresh:
@@ -92,9 +93,9 @@ class SecondsLeft:
         self._seconds += seconds
 
     def resume(self) -> None:
-        """Mark all steps so far as another session's.
+        """Assign all steps so far to an earlier session of the job.
 
-        Their times remain valid, but every view must be visited again.
+        Their times are still used, but every view has a first visit again.
         """
         self._visited = {phase.stage: set() for phase in self._phases}
         self._seconds = self._beside = 0.0
@@ -128,7 +129,7 @@ class SecondsLeft:
     def _first_visits(self, stage: str, queue: Sequence[int], steps: int) -> float:
         """Return the number of first visits in the next steps of a phase.
 
-        It is an expected value where it depends on the random order.
+        Visits after those in the queue count with their probability, because their order is random.
         """
         visits = steps * self._views_per_step
         unknown = self._views - self._visited[stage]
@@ -156,9 +157,10 @@ class SecondsLeft:
         return min(phase.seconds * self._ratio(), most) if phase.seconds else most
 
     def _ratio(self) -> float:
-        """Return the ratio of measured to predicted step times, in the latest phase that has revisited a view.
+        """Return the ratio of measured to predicted step times, from the latest phase with a step without first visits.
 
-        Before that, the ratio is 1: predictions were timed on this machine, while the time of first visits is a guess.
+        If there is no such step yet, the ratio is 1. Predictions are based on measurements on this machine, whereas the
+        additional time of first visits is only a guess.
         """
         for phase in reversed(self._phases):
             known = self._steps[phase.stage].known

@@ -23,7 +23,7 @@ class StepRecord:
         stage: Name of the phase: "coarse" or "sos".
         view: Index of the camera; of the first one if the step has several views.
         seconds: Wall-clock seconds of all iterations so far, in all sessions of a resumed job.
-        loss: E before the step, mean over its views.
+        loss: Loss before the step, mean over the step's views.
         terms: Loss by scale, split into terms.
         parts: Time in seconds of this step by activity.
         memory: Physical memory of the process after the step, in bytes.
@@ -45,7 +45,7 @@ class StepRecord:
 
 @dataclass
 class StylizerState:
-    """State from which a run resumes bit for bit."""
+    """State from which a run resumes with bit-identical results."""
 
     sh_dc: Tensor  # [N, 3]
     first_moment: Tensor  # [N, 3]

@@ -19,7 +19,7 @@ from sgsst_core.stylizing.warm_start import in_colors_of, in_luminance_of
 
 
 def prepared_style(style: StyleMixture, settings: Settings, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
-    """Prepare a style as the settings require. The style itself is returned if they require nothing.
+    """Prepare a style as the settings require. If they require nothing, return the style itself.
 
     Args:
         style: Images [H, W, 3] in 0..1.
@@ -82,8 +82,8 @@ def turned(style: Tensor, degrees: float) -> Tensor:
 def _inside(height: int, width: int, angle: float) -> tuple[int, int]:
     """Return the sides of the largest upright rectangle inside one that is rotated by 0 to pi/2; at least 1.
 
-    Either two of its corners lie on one long side of the rotated rectangle, with half of the short side above it as the
-    limit, or each of its corners lies on a different side.
+    If the rotated rectangle is narrow, two corners of the result lie on one of its long sides, and half of its short
+    side is the limit. Otherwise, each corner of the result lies on a different side.
     """
     sine, cosine = math.sin(angle), math.cos(angle)
     shorter, longer = min(height, width), max(height, width)

@@ -1,6 +1,6 @@
-"""Stylizer: Adam on the DC colors, in a coarse phase followed by one on all scales.
+"""Stylizer: Adam on the DC colors, in a coarse phase followed by a phase on all scales.
 
-It makes one step at a time; `loop.run` makes them all.
+Each call of `Stylizer.run_step` makes one step; `loop.run` makes all steps.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Stylizer:
         plan: Plan for this scene, these cameras and settings: from `make_plan`, or from an earlier run of the same job.
         scene: Scene to stylize, refined if the plan says so.
         cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
-        style: Image [H, W, 3] in 0..1, or several with weights.
+        style: Image [H, W, 3] in 0..1, or a mixture of several images.
         settings: Settings of the job.
         weights: Weights of the feature network.
         photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
@@ -71,7 +71,7 @@ class Stylizer:
         collectives: Ranks that stylize the scene together. Every rank has a stylizer with the same arguments, and calls
             the same methods in the same order. Methods that only read, such as `state` and `stylized`, may be called by
             a single rank.
-        workshop: Planning context of the plan; None to create one.
+        planning_context: Planning context of the plan; None to create its objects again.
         regions: Regions for which the plan was made, each with its own style or frozen; None for one style everywhere.
 
     Attributes:
@@ -105,7 +105,7 @@ class Stylizer:
         self.history: list[StepRecord] = []
         #: Measurements between steps (`loop.Callbacks.measure`), JSON-serializable and preserved by a resume.
         self.measured: list[dict[str, Any]] = []
-        #: Time in seconds for the style's statistics, in the steps that first needed them.
+        #: Time in seconds spent on the style's statistics, which are computed in the first step that needs them.
         self.style_seconds = 0.0
         #: Views of the latest step.
         self.latest: list[int] = []
@@ -124,14 +124,15 @@ class Stylizer:
         self.network.search = plan.search
         self._team = Team(plan, settings, collectives)
         self.collectives, self.group = self._team.everybody, self._team.group
-        #: It determines the partition, and thereby rounding, so it is identical on all ranks.
+        #: Memory budget of all ranks on one machine together, in bytes. It determines the partition, and thereby
+        #: rounding, so it is identical on all ranks.
         self.memory_limit = settings.memory_limit or plan.memory_limit
         self.memory = self.memory_limit // sharing_memory(self.collectives, plan.device)
         self.loss = self._loss()
         #: Replacement for `loss` in steps, if the plan uses graphs.
         self.graphs = LossGraphs(self.loss) if plan.graphs and self.group.size == 1 else None
         self.sh_degree = scene.sh_degree
-        #: With the SH attenuation of the settings applied.
+        #: Scene with the SH attenuation of the settings applied.
         self.scene = scene = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
         seen = scene if plan.seen.all() else scene.subset(plan.seen)
         seen = seen if "sh" in settings.keep else seen.without_zero_bands()
@@ -154,7 +155,7 @@ class Stylizer:
         )
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
-        #: Number of steps before a resume whose views' blend weights have not been cached again yet.
+        #: Number of steps before a resume whose blend weights have yet to be cached again.
         self._visited_before = 0
         self.schedule = planned_phases(plan, settings)
         self.total = sum(phase.steps for phase in self.schedule)
@@ -179,7 +180,7 @@ class Stylizer:
     ) -> Self:
         """Plan a job and create its stylizer; see `make_plan` for `weights`, `rasterizer` and exceptions.
 
-        If the settings refine the scene, the stylizer has the refined one.
+        If the settings request refinement, the stylizer contains the refined scene.
         """
         weights = weights or load_network_weights("auto")
         mixture = StyleMixture.of(style)
@@ -231,16 +232,19 @@ class Stylizer:
         own = self.scene.sh_dc[seen] if own is None else own
         weights = self.plan.survey.total_blend_weights[seen]
         found = self.styles.transferred(own, weights, seen, keep_chroma=self._keeps_chroma)
-        # Colors that no view determines follow from the others: see `stylized`.
+        # `stylized` derives colors that no view determines from those of their neighbors.
         return torch.where(self.plan.optimized[seen][:, None], found, own)
 
     @property
     def transfers_last(self) -> bool:
-        """Whether results get the style's colors once more: see `ends_with_transfer`."""
+        """Whether the style's colors are transferred to results once more: see `ends_with_transfer`."""
         return ends_with_transfer(self.settings, warm=self.plan.warm_start)
 
     def _transferred_last(self, optimized: Tensor) -> Tensor:
-        """Return the output for optimized colors [n, 3]; before the first step they already are the style's."""
+        """Return optimized colors [n, 3] after the final transfer, if the job has one.
+
+        Before the first step, colors need no transfer, because they already are the style's.
+        """
         if not (self.transfers_last and self.step):
             return optimized
         found = self.transferred(optimized)
@@ -330,7 +334,7 @@ class Stylizer:
 
     @property
     def style(self) -> StyleMixture:
-        """Style of everything without a region of its own."""
+        """Style of all Gaussians that are not in a region with its own style."""
         return self.styles.own
 
     @property
@@ -339,7 +343,7 @@ class Stylizer:
         return phase_at(self.schedule, self.step)
 
     def share_done(self) -> float:
-        """Return the completed fraction of the schedule, 0 to 1, which the learning rate follows."""
+        """Return the completed fraction of the schedule, 0 to 1, which determines the learning rate."""
         return self.step / max(self.total - 1, 1)
 
     @property
@@ -349,7 +353,7 @@ class Stylizer:
 
     @property
     def round_length(self) -> int:
-        """Number of steps in which every view comes once."""
+        """Number of steps in which every view is visited once."""
         return math.ceil(len(self.views.covered) / self.settings.views_per_step)
 
     def scale_count(self, index: int) -> int:
@@ -477,7 +481,7 @@ class Stylizer:
             results: Results of this group's views.
 
         Raises:
-            DivergedError: If that magnitude was too large for a step.
+            DivergedError: If `largest` is too large for a step.
         """
         # The rasterizer, and with it the colors, may be on the CPU while the network is on a GPU.
         first = largest.double()[None].to(self.network.device)
@@ -504,14 +508,14 @@ class Stylizer:
         )
 
     def _balance(self) -> None:
-        """Divide the work once, in the phase on all scales, in proportion to the measured speeds of the ranks."""
+        """Divide the work again, once in phase 2, in proportion to the measured speeds of the ranks."""
         speeds = self._team.compare_speeds(self._cost, self.timer.seconds)
         if speeds:
             self.loss.speeds = speeds
             self.views.uncached_fraction()
 
     def _next_view(self) -> int:
-        """Return a random view without replacement: every view comes once before any comes again."""
+        """Return a random view without replacement: every view is visited once before any is visited again."""
         if not self._queue:
             self._queue = drawn_round(self.views.covered, self._generator)
         return self._queue.pop()
@@ -519,7 +523,8 @@ class Stylizer:
     def _look_ahead(self, left: Sequence[int], phase: Phase) -> None:
         """Announce the view that this group processes next, so that its data can be read while the device works.
 
-        The queue is only inspected, not refilled: the order of views is drawn when it is needed, as checkpoints expect.
+        The queue is only inspected, not refilled: a new round is drawn only when it is needed, because checkpoints
+        contain the queue and the random state.
 
         Args:
             left: Remaining views of this group in the present step.
@@ -539,7 +544,9 @@ class Stylizer:
         return self._queue[::-1]
 
     def evaluate(self, indices: Sequence[int], sh_dc: Tensor | None = None) -> Evaluation:
-        """Return the mean SOS loss over views, split by scale. Changes nothing, and its time does not count.
+        """Return the mean SOS loss over views, split by scale.
+
+        This does not affect steps, and its time is not recorded.
 
         Args:
             indices: Indices of the views.
@@ -552,7 +559,7 @@ class Stylizer:
     def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
         """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its time in seconds.
 
-        Targets are prepared before timing starts. Changes nothing.
+        Targets are prepared before timing starts. This does not affect steps.
         """
         self._keep_visited()
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
@@ -586,7 +593,8 @@ class Stylizer:
     def keep_weights(self, index: int, scales: Sequence[int]) -> None:
         """Cache a view's blend weights for some scales, if they fit, as its first step does.
 
-        Only steps cache weights. Renderings in between, whose timing varies, therefore do not change any of their bits.
+        Only steps cache weights. Renders between steps happen at varying times, and must not affect the results of
+        steps.
         """
         self.views.keep_weights(index, self._rasterizer_for(scales))
 
@@ -609,7 +617,7 @@ class Stylizer:
                         self.keep_weights(index, scales)  # weights of a finished phase are not needed
 
     def _rasterizer_for(self, scales: Sequence[int]) -> Rasterizer:
-        """Return the rasterizer of a view for some scales: the coarse one if it is cached for their only scale."""
+        """Return the rasterizer of a view for some scales: the coarse one in phase 1, if cached."""
         if self._coarse is not None and len(scales) == 1 and scales[0] > 0:
             return self._coarse.at(scales[0])
         return self.views.rasterizer
@@ -641,23 +649,24 @@ class Stylizer:
         return self._stylized
 
     def shown(self) -> Tensor:
-        """Return sh_dc [n, 3] of the rendered Gaussians, on the rasterizer's device, as output by a job that ends now.
+        """Return sh_dc [n, 3] of the rendered Gaussians in the output of a job that ends now.
 
-        In contrast to `sh_dc`, from which steps continue, it includes the final transfer if there is one.
+        It is on the rasterizer's device. In contrast to `sh_dc`, from which steps continue, it includes the final
+        transfer, if the job has one.
         """
         if not self.transfers_last:
             return self.sh_dc.detach()
         return self.stylized()[self.plan.seen].to(self.sh_dc.device)
 
     def set_colors(self, sh_dc: Tensor) -> None:
-        """Replace the present colors with sh_dc [N, 3] of the whole scene, to evaluate them on these views."""
+        """Replace the present colors with sh_dc [N, 3] of the whole scene, for example to evaluate them."""
         self._stylized = None
         with torch.no_grad():
             self.sh_dc.copy_(sh_dc[self.plan.seen])
 
     @contextmanager
     def with_colors(self, sh_dc: Tensor) -> Iterator[None]:
-        """Use sh_dc [N, 3] of the whole scene inside a `with` block, then restore the present colors bit for bit."""
+        """Use sh_dc [N, 3] of the whole scene inside a `with` block, then restore the present colors exactly."""
         present, stylized = self.sh_dc.detach().clone(), self._stylized
         self.set_colors(sh_dc)
         try:

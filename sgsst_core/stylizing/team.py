@@ -25,7 +25,7 @@ _NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics", "matching")
 
 
 class Team:
-    """Position of this rank among the ranks that the plan uses.
+    """Ranks that the plan uses, and the position of this rank among them.
 
     Args:
         plan: Plan of the job.
@@ -34,7 +34,7 @@ class Team:
 
     Attributes:
         everybody: Ranks that take part.
-        groups: Number of groups they form; each group processes its own views.
+        groups: Number of groups that these ranks form; each group processes its own views.
         group: Ranks that process the same views as this one.
 
     Raises:

@@ -3,8 +3,8 @@
 A scan without background covers only part of each image, and features near its silhouette also see what is behind it. A
 constant color would become part of what the loss compares, and the object's colors would compensate for it.
 
-A color depends only on the job's seed, the step and the view. There is no state: runs repeat and resume bit for bit,
-and all ranks agree.
+A color depends only on the job's seed, the step and the view. There is no random state: repeated and resumed runs are
+bit-identical, and all ranks agree.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ _BITS = 53  # bits of a float64's fraction
 
 
 def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style: Tensor | StyleMixture) -> Color | None:
-    """Return the background color of a view in the step after `step` others; None for the background of the settings.
+    """Return the background color of a view in one step; None for the background of the settings.
 
     Args:
         kind: "random" for a uniform color, "palette" for the color of a random style pixel.
         seed: Seed of the job, non-negative.
-        step: Number of previous steps.
+        step: Number of completed steps.
         view: Index of the view's camera.
-        style: Image [H, W, 3] in 0..1 on the CPU, or a mixture, of which one image is drawn by weight.
+        style: Image [H, W, 3] in 0..1 on the CPU, or a mixture, from which an image is drawn with probability equal to
+            its weight.
     """
     if kind == "background":
         return None
@@ -44,7 +45,7 @@ def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style:
 
 
 def _drawn_picture(style: StyleMixture, number: float) -> Tensor:
-    """Draw an image by weight, given a number in [0, 1)."""
+    """Return the image of a mixture that a random number in [0, 1) selects, with probabilities equal to the weights."""
     for picture, weight in zip(style.pictures, style.weights, strict=True):
         number -= weight
         if number < 0:

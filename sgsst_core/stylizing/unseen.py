@@ -18,7 +18,7 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     """Return color changes for the Gaussians that no view sees.
 
     Each takes the mean change of its nearest seen neighbors, weighted by their total blend weights: the change of a
-    hardly visible Gaussian was determined by hardly any pixel.
+    hardly visible Gaussian is determined by only a few pixels.
 
     Args:
         means: [N, 3].
@@ -42,9 +42,9 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
 
 
 def _near_each_other(places: Tensor) -> Tensor:
-    """Return an order [U] of points [U, 3] by the cells of a coarse grid.
+    """Return the indices [U] that sort points [U, 3] by the cells of a coarse grid.
 
-    Consecutive neighbor searches then read the same part of a tree.
+    Consecutive neighbor searches then read the same part of the search tree.
     """
     places = places.double()
     lowest = places.amin(dim=0)
@@ -59,6 +59,6 @@ def _votes(nearest: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     `nearest` [U, K] are their indices into `change` [S, 3] and `weights` [S].
     """
     own = weights[nearest]
-    # Relative to the largest of the eight, so that eight tiny weights still have a mean.
+    # Relative to the largest weight, so that tiny weights do not underflow.
     share = own / own.amax(dim=1, keepdim=True)
     return (change[nearest].double() * share[:, :, None]).sum(dim=1) / share.sum(dim=1, keepdim=True)

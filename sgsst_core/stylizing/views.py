@@ -28,10 +28,10 @@ from sgsst_core.stylizing.training_background import Color, put_behind
 
 
 class Views:
-    """Renderer of views that prepares their targets at first use.
+    """Renderer of a job's views, which also prepares their targets at first use.
 
-    With several ranks, each renders a band of rows. What is cached depends only on sizes that are identical on all
-    ranks, so they all have a view's targets cached or none has: preparing targets involves all ranks.
+    With several ranks, each renders a band of rows. Preparing targets involves all ranks, so a view's targets must be
+    cached on all ranks or on none. What is cached therefore depends only on sizes that are identical on all ranks.
 
     Args:
         scene: Scene that provides the frozen part of the colors and the content (the unstylized render).
@@ -47,7 +47,8 @@ class Views:
         clamp_aware_gradient: Whether to use the clamp-aware gradient (`view_colors_gradient`).
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
         background: Background color of the rasterizer.
-        drawn: Whether steps use other background colors; content images are then cached instead of features.
+        drawn: Whether the background color changes from step to step; content images are then cached instead of
+            features.
         maps: Renderer of region maps; None if the scene has no regions.
         collectives: Ranks that render each view together, the same as in `loss`.
     """
@@ -74,7 +75,7 @@ class Views:
         self.scene = scene
         self.cameras = list(cameras)
         self.rasterizer = rasterizer
-        #: For values that are cached over many steps: they are bit-identical whenever they are computed.
+        #: Rasterizer for values that are cached over many steps; its results do not depend on what is cached.
         self._repeatable = repeatable(rasterizer)
         self.loss = loss
         self.collectives = collectives
@@ -180,7 +181,7 @@ class Views:
     def lending_weights(self, index: int, rasterizer: Rasterizer) -> AbstractContextManager[None]:
         """Use in a `with` block the blend weights that `keep_weights` would cache, even if they are not cached.
 
-        Coarse weights are exact, so they are not lent.
+        A coarse rasterizer renders the same image with and without cached weights, so nothing is done for it.
         """
         band = self._own_band(index)
         if isinstance(rasterizer, CachedRasterizer) and band[0] < band[1]:
@@ -188,7 +189,7 @@ class Views:
         return nullcontext()
 
     def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
-        """Return the sum [N, 3] of all ranks' gradients, which are 0 except for the Gaussians that the view shows."""
+        """Return the sum [N, 3] of all ranks' gradients, which are 0 for all Gaussians but those in `shown`."""
         with self.loss.timer("communication"):
             if shown is None or not shown.sparse:
                 return self.collectives.all_reduce(gradient)
@@ -198,7 +199,7 @@ class Views:
     def _shown_by(self, index: int, rasterizer: Rasterizer, rows: Tensor, band: Rows | None) -> ShownGaussians | None:
         """Return the Gaussians that any rank's band of a view shows.
 
-        They are agreed on at the first visit, using the blend weights of the gradients themselves: those of another
+        Ranks agree on them at the first visit, using the same blend weights as gradients do. Blend weights of another
         rasterizer, or of the whole view instead of its bands, may differ by rounding at the smallest opacity.
 
         Args:
@@ -208,7 +209,7 @@ class Views:
             band: Rows of the band.
 
         Returns:
-            The Gaussians; None with a single rank, or without memory for them.
+            The Gaussians; None if there is only one rank, or if they do not fit in the cache.
         """
         key, size = (index, rasterizer.scale), ShownGaussians.nbytes(len(self.scene))
         if self.collectives.size == 1 or not self._shown.holds(key, size):
@@ -225,7 +226,7 @@ class Views:
         return self._shown.get(key, look, size)
 
     def _nothing(self, *shape: int) -> Tensor:
-        """Return the contribution of a rank without rows."""
+        """Return zeros: the contribution of a rank that has no rows of a view."""
         return torch.zeros(shape, dtype=self.rasterizer.dtype, device=self.rasterizer.device)
 
     def _own_band(self, index: int) -> Rows:

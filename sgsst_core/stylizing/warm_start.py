@@ -6,8 +6,9 @@ Kokaram, "The Linear Monge-Kantorovitch Linear Color Mapping for Example-Based C
 
     A = S^-1/2 (S^1/2 T S^1/2)^1/2 S^-1/2,   c -> A (c - m) + m_style
 
-where S and m are the scene's covariance and mean, and T the style's covariance. Colors that it moves out of 0..1 are
-clipped; for a dark object and a bright style of two colors, only a pale gray would be left.
+where S and m are the scene's covariance and mean, and T the style's covariance. Colors that this map moves out of 0..1
+are clipped. For a dark object and a bright style of two colors, only a pale gray would be left, which is why
+`warm_start` does not use it.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
 from sgsst_core.stylizing.color_transport import transported
 
-#: A direction in which the scene's colors vary by less than this fraction of their largest variance has no spread to be
-#: stretched to the style's. It stays flat, because stretching would amplify rounding errors.
+#: A direction counts as flat if the variance of the colors along it is less than this fraction of their largest
+#: variance. It is not stretched to the style's spread, which would amplify rounding errors.
 _FLAT = 1e-9
 #: Maximum number of pixels that represent a style.
 _PIXELS = 1 << 16
