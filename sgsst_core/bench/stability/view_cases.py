@@ -28,7 +28,8 @@ from sgsst_core.scene.gaussians import Scene
 
 _IMAGE = "image, coverage, gradient against float64"
 _LOSS = "loss and pixel gradient, relative to float64"
-#: Bound on memory growth. Python and caches grow by themselves; the refused allocation would be tens of gigabytes.
+#: Upper bound in bytes on memory growth when an allocation of tens of gigabytes is refused. It allows for the growth of
+#: Python and caches.
 _SMALL_MEMORY = 300 << 20
 
 
@@ -56,7 +57,10 @@ def _size(width: int, height: int, full: bool) -> CaseResult:
 
 
 def _stylized_size(width: int, height: int, full: bool) -> CaseResult:
-    """Check the loss of a view of this size; layers without a cell do not count. Quick runs shorten long views."""
+    """Check the loss of a view of this size, without layers whose output is empty.
+
+    Quick runs limit the width to 512 pixels.
+    """
     width = width if full else min(width, 512)
     image, style, content = texture(height, width, 1), texture(40, 32, 2), texture(height, width, 3)
     return compare_losses(image, style, content, untiled=min(width, height) >= 16)
@@ -124,7 +128,7 @@ def _too_many_intersections(full: bool) -> CaseResult:
 
 
 def _too_much_memory(full: bool) -> CaseResult:
-    """Check that intersections that can be addressed but exceed the free memory are refused.
+    """Check that intersections are refused if 32-bit indices can address them but free memory cannot hold them.
 
     On machines with more than 40 GB of free memory, nothing is checked.
     """
