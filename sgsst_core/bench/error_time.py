@@ -38,7 +38,7 @@ from sgsst_core.stylizing.stylizer import Stylizer
 #: Number of slices of the time budget. Variants take turns slice by slice, so that a temporary slowdown of the machine
 #: affects all of them.
 SLICES = 32
-#: Slices after which the variants are evaluated.
+#: Numbers of slices after which the variants are evaluated.
 MOMENTS = (1, 2, 4, 8, 16, 32)
 #: Fraction of the time for phase 1, if a variant has one: about as much as in the standard preset.
 PHASE_1 = 0.15
@@ -128,7 +128,7 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class Point:
-    """Losses of a variant at one moment, relative to the unstylized scene."""
+    """Losses of a variant at one evaluation, relative to the unstylized scene."""
 
     seconds: float
     step: int
@@ -271,7 +271,7 @@ def _reason_to_leave_out(settings: Settings, stylizer: Stylizer) -> str | None:
 
 
 def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point]]:
-    """Return the points that no other point beats in both seconds and loss, ordered by seconds."""
+    """Return the points that no other point dominates in seconds and loss, ordered by seconds."""
     front: list[tuple[str, Point]] = []
     points = [(curve.variant.name, point) for curve in curves for point in curve.points]
     for name, point in sorted(points, key=lambda item: (item[1].seconds, item[1].relative)):

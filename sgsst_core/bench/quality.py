@@ -101,7 +101,7 @@ class Quality:
     style: Tensor
 
     def front(self) -> list[Outcome]:
-        """Return the stylized outcomes that no other one beats in both style and content, ordered by style."""
+        """Return the stylized outcomes that no other outcome dominates in style and content, ordered by style."""
         front: list[Outcome] = []
         stylized = [outcome for outcome in self.outcomes if outcome.name != UNSTYLIZED]
         for outcome in sorted(stylized, key=lambda one: (one.judgment.style, one.judgment.content)):

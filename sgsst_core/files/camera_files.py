@@ -38,8 +38,8 @@ _PINHOLE_NAMES = (None, "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADI
 def read_cameras(path: Path) -> list[Camera]:
     """Detect the format of a camera file or folder, and read its cameras.
 
-    A folder may be a COLMAP sparse model, a data set with one in sparse/0 or sparse, or a folder with transforms.json
-    or cameras.json. Cameras from JSON keep their order; COLMAP's images are sorted by name.
+    A folder may be a COLMAP sparse model, may hold such a model in sparse/0 or sparse, or may hold a transforms.json or
+    cameras.json. Cameras from JSON keep their order; COLMAP's images are sorted by name.
 
     nerfstudio trains in a coordinate frame of its own. To match a scene exported by nerfstudio, cameras must be
     transformed by the `dataparser_transforms.json` of its training run. If that file lies beside the transforms.json,
@@ -271,7 +271,7 @@ def _exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
 def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
     """Convert a pose from camera-to-world to world-to-camera.
 
-    The rotation is replaced by the nearest exact one; the camera's position does not change.
+    The 3x3 block is replaced by the nearest rotation; the camera's position does not change.
     """
     if not np.isfinite(pose).all():
         raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")

@@ -374,7 +374,7 @@ class _Columns:
 
     Attributes:
         arrays: float32 arrays by the names of the scene's tensors.
-        flaws: Invalid values of each block that has some.
+        flaws: Invalid values of each block that contains any.
     """
 
     def __init__(self, count: int, degree: int, stored: RowLayout | None) -> None:

@@ -33,7 +33,7 @@ class ShAttenuation:
 
     @staticmethod
     def of(header: PlyHeader, attenuation: float) -> ShAttenuation | None:
-        """Return the attenuation for a file's vertices; None if nothing changes."""
+        """Return the attenuation for a file's vertices; None if no coefficient changes."""
         names = tuple(prop.name for prop in header.vertex.properties if re.fullmatch(r"f_rest_\d+", prop.name))
         factor = attenuation_factor(attenuation)
         return ShAttenuation(names, factor) if names and factor != 1 else None

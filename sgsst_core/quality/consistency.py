@@ -76,7 +76,7 @@ class Consistency:
 
     @property
     def lpips(self) -> float | None:
-        """Mean LPIPS, or None if no pair has one."""
+        """Mean LPIPS, or None if no pair has an LPIPS value."""
         return _mean([pair.lpips for pair in self.pairs])
 
     @property
@@ -130,8 +130,8 @@ def consistency(
     """
     views: dict[int, tuple[Tensor, DepthMap]] = {}
     results = []
-    # Pairs are visited chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...). Each pair shares a view with the one
-    # before it, so every view is rendered once and only two are in memory, whatever the gap.
+    # Pairs are visited chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...). Each pair shares a view with the
+    # previous pair, so every view is rendered once and only two views are in memory, regardless of the gap.
     for i, j in sorted(view_pairs(len(cameras), gap, at_most), key=lambda pair: (pair[0] % gap, pair[0])):
         views = {k: views.get(k) or _image_and_depth(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
         (image, depth), (other, other_depth) = views[i], views[j]

@@ -182,7 +182,7 @@ class Judge:
 
 
 class _StyleJudge:
-    """Judge of images by one style."""
+    """Judge that compares images with one style."""
 
     def __init__(self, lpips: Lpips, style: StyleMixture) -> None:
         self._lpips = lpips
@@ -241,7 +241,7 @@ def frechet_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]
 
     Args:
         first: Mean [3] and covariance [3, 3] of colors in 0 to 1.
-        second: Same for the other distribution.
+        second: Mean and covariance of the other distribution.
     """
     (mean, covariance), (other_mean, other) = first, second
     other_mean, other = other_mean.to(mean), other.to(covariance)

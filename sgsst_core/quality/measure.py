@@ -176,7 +176,7 @@ class Measurements:
         measured = novel_views.measure(colors.to(novel_views.rasterizer.device))
         if not start and (
             not stylizer.measured or stylizer.measured[0]["step"]
-        ):  # without a measured start, there is nothing to compare with
+        ):  # relative values require a measured start
             measured = replace(measured, gram_relative=None)
         return measured.as_dict(0, 0.0) if start else measured.as_dict(stylizer.step, stylizer.seconds)
 

@@ -61,7 +61,7 @@ _COSINE_ROUNDING = 1e-6
 
 
 def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
-    """Return the pairs of neighboring cameras to place novel cameras between.
+    """Return the pairs of neighboring cameras between which novel cameras are placed.
 
     Adjacent cameras of the list are paired. If most of them are not neighbors (see `JUMP` and `LARGEST_TURN`), the list
     is assumed not to be in capture order, and a greedy walk to the nearest remaining camera replaces it. Pairs with the
@@ -123,7 +123,7 @@ class NovelViewMoment:
         gram: Gram distance by scale: sum over layers of w_G mean((G - G_v)^2), averaged over views (see
             `sgsst_core.loss`).
         gram_relative: Mean of `gram` over scales, relative to the run's first measurement; None if there are no views.
-        short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
+        short, long: Consistency of pairs of views 1 and 7 apart; None if there is no such pair.
     """
 
     gram: dict[int, float]
@@ -147,7 +147,7 @@ class NovelViews:
 
     Args:
         cameras: Cameras of the job.
-        covered: Indices of the cameras that see anything.
+        covered: Indices of the cameras that see at least one Gaussian.
         scene: Scene to stylize. Gaussians missing from it are missing in the novel views too.
         rasterizer: Rasterizer of the scene, preferably not shared with the job: in a shared `cached` rasterizer, blend
             weights of novel views would evict those of the job's own views.
@@ -328,7 +328,7 @@ def _outlook(camera: Camera, scene: Scene, rasterizer: Rasterizer) -> tuple[floa
 
 
 def _alike(value: float, others: list[float]) -> bool:
-    """Return whether a value is within or near the range of the others; true if there are no others."""
+    """Return whether a value is within `LIKENESS` of the range of `others`; true if `others` is empty."""
     return not others or min(others) / LIKENESS <= value <= LIKENESS * max(others)
 
 

@@ -57,7 +57,7 @@ def measure_packed(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     near: float,
 ) -> PackedLoss:
-    """Read a compressed file back and compare small renders of some views on the CPU.
+    """Read a compressed file back, and compare small CPU renders of some views with the original scene.
 
     Args:
         path: Compressed file.

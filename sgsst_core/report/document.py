@@ -145,10 +145,10 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
 
 
 def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
-    """Return the style images as they were used, with their weights."""
+    """Return the style images that the job used, with their sizes and weights."""
     style, regions, paths = stylizer.style, stylizer.regions, sources.styles
     if regions is not None and not regions.mapped and regions.every[regions.active[0]].style is not None:
-        paths = tuple(map(Path, style.names))  # a single region with a style of its own covers everything
+        paths = tuple(map(Path, style.names))  # a single active region with its own style covers the whole scene
     return [
         {"path": str(path), "width": picture.shape[1], "height": picture.shape[0], "weight": weight}
         for path, picture, weight in zip(paths, style.pictures, style.weights, strict=True)

@@ -20,7 +20,7 @@ _LONG_DECIMAL = re.compile(r"(\.\d\d)\d+")
 
 
 def inline(figure: Figure, name: str, label: str) -> str:
-    """Return a figure as an <svg> element that can share a page with others.
+    """Return a figure as an <svg> element that can share a page with other figures.
 
     Its element IDs are prefixed with `name`, and it contains no style sheet.
     """

@@ -125,7 +125,7 @@ def ordinary(count: int = 80, *, seed: int = 0, degree: int = 0) -> Scene:
 
 
 def among_ordinary(extreme: Scene, *, count: int = 80) -> Scene:
-    """Return the extreme Gaussians followed by ordinary ones, whose pixels must stay correct."""
+    """Return the extreme Gaussians followed by ordinary Gaussians, whose pixels must stay correct."""
     rest = ordinary(count, degree=extreme.sh_degree)
     return Scene(*(torch.cat([getattr(extreme, name), getattr(rest, name)]) for name in Scene.__dataclass_fields__))
 
@@ -171,7 +171,7 @@ def compare_rasterizers(
         scene: Scene to render.
         view: Camera to render with.
         near: Distance of the near plane in world units.
-        colors: Colors [N, 3]; None for random ones in 0 to 2.
+        colors: Colors [N, 3]; None for random colors in 0 to 2.
         expected_scene: Scene that the reference renders: the rows `keep` of `scene`, whose other rows must contribute
             nothing. None for `scene`.
         keep: Mask [N] bool of the rows in `expected_scene`; None for all.
@@ -193,7 +193,7 @@ def compare_rasterizers(
         fast = make_rasterizer(name, scene, near=near)
         shown = torch.cat([fast.render(colors, view) / brightest, fast.coverage(view)[..., None]], dim=-1).cpu()
         off = (shown.double() - torch.cat([image / brightest, coverage[..., None]], dim=-1)).abs().amax(-1)
-        # A jump that a cutoff explains is not an error; any larger one is.
+        # A jump that a cutoff explains is not an error; a larger one is.
         explained = band & (off > IMAGE_BOUND) & (off <= LARGEST_STEP)
         flipped += int(explained.sum())
         error = _worst(error, off[~explained])
@@ -336,7 +336,7 @@ def texture(height: int, width: int, seed: int = 0) -> Tensor:
 
 
 def without(scene: Scene, rows: Tensor) -> tuple[Scene, Tensor]:
-    """Return the scene without some rows ([N] bool), and the mask [N] bool of the remaining ones."""
+    """Remove rows ([N] bool) from a scene; return the new scene, and the mask [N] bool of the remaining rows."""
     kept = ~rows
     columns = {name: getattr(scene, name)[kept] for name in Scene.__dataclass_fields__}
     return replace(scene, **columns), kept

@@ -101,7 +101,7 @@ def _packed(make: Callable[[], Scene], form: PackedForm, full: bool) -> CaseResu
 def _sorted(values: torch.Tensor, scene: Scene) -> torch.Tensor:
     """Return rows ordered by position.
 
-    Compressed PLY files may reorder Gaussians; the order among those at one position does not matter.
+    Compressed PLY files may reorder Gaussians. The order of Gaussians at the same position does not matter.
     """
     order = np.lexsort(scene.means.double().numpy().round(3).T)
     return values.double()[torch.from_numpy(order)]

@@ -1,4 +1,4 @@
-"""Hard cases of Gaussians, mixed with ordinary ones whose pixels must stay correct."""
+"""Hard cases of extreme Gaussians, mixed with ordinary Gaussians whose pixels must stay correct."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def _camera() -> Camera:
 
 
 def _walls(*walls: tuple[float, int]) -> Scene:
-    """Return walls of Gaussians, one behind the other, each of which fills the view.
+    """Return several walls of Gaussians at increasing depth, each of which fills the view.
 
     Args:
         walls: Logit of the opacity and number of Gaussians per side, for each wall.

@@ -86,7 +86,7 @@ def views(width: int = 24, height: int = 20) -> tuple[Camera, ...]:
 
 
 def crowd(count: int = 60, *, seed: int = 0, degree: int = 0) -> Scene:
-    """Return Gaussians that cover most of each view, as trained ones do."""
+    """Return Gaussians that cover most of each view, as in trained scenes."""
     scene = ordinary(count, seed=seed, degree=degree)
     return replace(scene, scales=scene.scales + 2.2, sh_dc=0.6 * scene.sh_dc)
 

@@ -109,7 +109,7 @@ _VIEWS: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 
 
 def _blind(full: bool) -> CaseResult:
-    """Check that views that see nothing are left out, and that a clear error is raised if all are."""
+    """Check that views that see nothing are skipped, and that an error is raised if all views are skipped."""
     scene = repeated(5)
     behind = replace(camera(), name="blind", world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1]).double()))
     rasterizer = make_rasterizer("cpu", scene)
@@ -130,7 +130,7 @@ def _too_many_intersections(full: bool) -> CaseResult:
 def _too_much_memory(full: bool) -> CaseResult:
     """Check that intersections are refused if 32-bit indices can address them but free memory cannot hold them.
 
-    On machines with more than 40 GB of free memory, nothing is checked.
+    This is not checked on machines with more than 40 GB of free memory.
     """
     view = camera(16384, 16384, focal=8000.0)
     fitting = 2**31 // 1024**2 - 8
