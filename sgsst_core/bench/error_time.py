@@ -1,10 +1,10 @@
-"""Error against run time: variants of one job with the same time budget, measured by the same exact loss.
+"""Error against run time: variants of one job with the same time budget, evaluated by the same exact loss.
 
-Every variant gets the same seconds of optimization. At the same moments its colors are evaluated on all views by the
-float32 loss of all scales (`exact.Float32Reference`), which is the paper's loss, whatever the variant itself optimizes.
-Evaluation does not count as run time. Neither does preparing each view once, which would dominate a short budget; its
-time is reported separately. All variants are in memory at the same time. A variant on the Pareto front reaches its
-error sooner than every other one.
+Every variant optimizes for the same number of seconds. At fixed times, its colors are evaluated on all views by the
+float32 loss of all scales (`exact.Float32Reference`). This is the paper's loss, regardless of the loss that the variant
+optimizes. Run time excludes these evaluations. It also excludes the one-time preparation of each view, which would
+dominate a short budget and is reported separately. All variants are in memory at the same time. A variant is on the
+Pareto front if it reaches some loss sooner than all other variants.
 """
 
 from __future__ import annotations
@@ -35,18 +35,19 @@ from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.schedule import Phase
 from sgsst_core.stylizing.stylizer import Stylizer
 
-#: Number of slices of the time budget. Variants take turns slice by slice, so a slow phase of the machine affects all
-#: of them.
+#: Number of slices of the time budget. Variants take turns slice by slice, so that a temporary slowdown of the machine
+#: affects all of them.
 SLICES = 32
-#: Slices after which the variants are evaluated.
+#: Numbers of slices after which the variants are evaluated.
 MOMENTS = (1, 2, 4, 8, 16, 32)
 #: Fraction of the time for phase 1, if a variant has one: about as much as in the standard preset.
 PHASE_1 = 0.15
-#: Threshold of the variant with pruning: Gaussians whose blend weights in all views sum to less than a pixel.
+#: Threshold of the `pruned` variant: Gaussians are pruned if their blend weights in all views sum to less than one
+#: pixel.
 PRUNE_WEIGHT = 1.0
 
-#: Function that returns the phases of a variant for n scales, as (name, scale counted from the coarsest or None for
-#: all, fraction of the time).
+#: Function that returns the phases of a variant, given the number of scales. A phase is (name, scale counted from the
+#: coarsest or None for all scales, fraction of the time).
 Shares = Callable[[int], list[tuple[str, int | None, float]]]
 
 
@@ -76,8 +77,8 @@ class Variant:
 
     Attributes:
         name: Name for `--variants`.
-        what: Description for people.
-        shares: Function that returns the phases.
+        what: Human-readable description.
+        shares: Function that returns the phases of the variant.
         settings: Settings that override the standard preset.
     """
 
@@ -127,7 +128,7 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class Point:
-    """Losses of a variant at one moment, relative to the unstylized scene."""
+    """Losses of a variant at one evaluation, relative to the unstylized scene."""
 
     seconds: float
     step: int
@@ -137,7 +138,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """Results of a variant; without points if it was skipped, for the reason in `left_out`."""
+    """Results of a variant. If it was skipped, `points` is empty and `left_out` states the reason."""
 
     variant: Variant
     points: list[Point]
@@ -154,7 +155,7 @@ class _TimedStylizer(Stylizer):
 
     @property
     def phase(self) -> Phase:
-        """Phase at the present time."""
+        """Phase at the elapsed optimization time."""
         end = 0.0
         for stage, scale, share in self.shares[:-1]:
             end += share * self.budget
@@ -232,7 +233,11 @@ def _begin(
     base: Settings,
     weights: BackboneWeights | None,
 ) -> tuple[Curve, _TimedStylizer | None]:
-    """Return a variant that is ready to run, or a curve with the reason why it is skipped."""
+    """Prepare a variant to run.
+
+    Returns an empty curve, and the stylizer of the variant. If the variant is skipped, the stylizer is None and the
+    curve states the reason.
+    """
     settings = base.model_copy(update=variant.settings)
     stylizer = _TimedStylizer.planned(*inputs, settings, weights=weights)
     reason = _reason_to_leave_out(settings, stylizer)
@@ -244,7 +249,7 @@ def _begin(
 
 
 def _prepare(stylizer: _TimedStylizer) -> float:
-    """Prepare every view and the style as the first steps would. Returns the seconds it took."""
+    """Prepare the style and every view as the first steps would; return the elapsed seconds."""
     started = time.perf_counter()
     for index in stylizer.views.covered:
         chosen = stylizer.scales(index)
@@ -266,7 +271,7 @@ def _reason_to_leave_out(settings: Settings, stylizer: Stylizer) -> str | None:
 
 
 def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point]]:
-    """Return the points that no other point beats in both seconds and loss, ordered by seconds."""
+    """Return the points that no other point dominates in seconds and loss, ordered by seconds."""
     front: list[tuple[str, Point]] = []
     points = [(curve.variant.name, point) for curve in curves for point in curve.points]
     for name, point in sorted(points, key=lambda item: (item[1].seconds, item[1].relative)):
@@ -302,12 +307,13 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
     }
 
 
-#: Their number has no divisor in common with the number of colors, so 42 variants have distinct pairs of both.
+#: Markers of curves. Their number (7) and the number of colors (6) have no common divisor, so up to 42 variants have
+#: distinct combinations of marker and color.
 _MARKERS = "osD^vP*"
 
 
 def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
-    """Write a PNG of loss against seconds, both axes logarithmic: the mean over scales, and each scale beside it.
+    """Write a PNG of loss against seconds on logarithmic axes: a panel for the mean over scales, and one per scale.
 
     Raises:
         OutputError: If the file cannot be written.
@@ -330,7 +336,7 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], scale: int | None) -> Floats:
-    """Draw loss against seconds, one line per curve. Returns the losses.
+    """Draw loss against seconds with one line per curve; return the drawn losses.
 
     Args:
         axes: Axes to draw on.

@@ -1,8 +1,8 @@
-"""Quality of the results of several ways to run one job, with the same time budget each.
+"""Quality comparison of several ways to run one job, each with the same time budget.
 
-Variants are those of `error_time`. Their results are judged on novel views by a network that none of them optimizes
-(`Judge`), along with the remaining loss. The unstylized scene and a transfer of colors alone are judged for comparison.
-A variant is on the front if no other has both more style and more content.
+The variants are those of `error_time`. Their results are judged on novel views by a network that no variant optimizes
+(`Judge`), and their remaining loss is reported. For comparison, the unstylized scene and a plain color transfer are
+judged too. A variant is on the Pareto front if no other variant is better in both style and content.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.warm_start import warm_start
 
-#: Names of the outcomes that are judged along with the variants.
+#: Names of the outcomes that are judged for comparison with the variants.
 UNSTYLIZED, TRANSFER = "unstylized", "transfer"
-#: Number of views on the sheet.
+#: Number of views in each row of the contact sheet.
 _SHOWN = 3
 
 
@@ -48,7 +48,7 @@ class Outcome:
 
     Attributes:
         name: Name of the variant, or `UNSTYLIZED`, or `TRANSFER`.
-        what: Description for people.
+        what: Human-readable description.
         sh_dc: Colors [N, 3].
         judgment: Judgment on the novel views.
         short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
@@ -90,8 +90,8 @@ class Quality:
 
     Attributes:
         outcomes: Unstylized scene, color transfer, and the variants.
-        curves: Losses of the variants against seconds, or the reason why one could not run.
-        judge: Judge for further colors of the scene.
+        curves: Losses of each variant against seconds, or the reason why it was skipped.
+        judge: Judge of the scene's colors; it can judge further colors.
         style: Style image [H, W, 3].
     """
 
@@ -101,7 +101,7 @@ class Quality:
     style: Tensor
 
     def front(self) -> list[Outcome]:
-        """Return the stylized outcomes that no other one beats in both style and content, ordered by style."""
+        """Return the stylized outcomes that no other outcome dominates in style and content, ordered by style."""
         front: list[Outcome] = []
         stylized = [outcome for outcome in self.outcomes if outcome.name != UNSTYLIZED]
         for outcome in sorted(stylized, key=lambda one: (one.judgment.style, one.judgment.content)):
@@ -182,7 +182,7 @@ def compare_quality(
 
 
 def make_novel_views(stylizer: Stylizer) -> NovelViews:
-    """Make the novel views of a job, with its whole scene."""
+    """Create the novel views of a job, with all Gaussians of its scene."""
     exact = ExactLoss(stylizer, "sos")
     return NovelViews(
         stylizer.views.cameras,
@@ -197,7 +197,7 @@ def make_novel_views(stylizer: Stylizer) -> NovelViews:
 
 
 def write_plot(path: Path, quality: Quality, title: str) -> None:
-    """Write a PNG of style against content, with the front dashed; lower left is better.
+    """Write a PNG of style against content, with the Pareto front as a dashed line; lower left is better.
 
     Raises:
         OutputError: If the file cannot be written.

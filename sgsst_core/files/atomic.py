@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sgsst_core.errors import OutputError
 
-#: Error numbers of a full disk. Other errors inside `atomic_path` keep their type.
+#: Error numbers of a full disk. Other errors in an `atomic_path` block are raised unchanged.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -55,7 +55,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(target: Path) -> None:
-    """Delete temporary files of killed writers of `target`. No process may be writing it at the same time."""
+    """Delete temporary files that killed processes left for `target`; no process may be writing `target` meanwhile."""
     final = Path(os.path.realpath(target))
     for path in final.parent.glob(f".sgsst-{_tag(final)}-*.part*"):
         path.unlink(missing_ok=True)
@@ -72,7 +72,7 @@ def ensure_writable_folder(path: Path) -> None:
     except OSError as error:
         reason = "there is a file of that name" if isinstance(error, FileExistsError) else error.strerror
         raise OutputError(f"{path}: cannot be used as output folder: {reason}. Choose another folder.") from error
-    # os.access is no proof: it returns True for root, and for read-only network mounts.
+    # os.access is unreliable: it returns True for root, and for read-only network mounts.
     _reserve(path / "trial").unlink()
 
 
@@ -91,13 +91,13 @@ def _reserve(final: Path) -> Path:
 def _tag(final: Path) -> str:
     """Return the common part of the names of a target's temporary files.
 
-    It is a hash, because a name with an affix could exceed the maximum length of file names.
+    It is a hash of the target's name, because the name plus a suffix could exceed the maximum length of file names.
     """
     return hashlib.sha256(os.fsencode(final.name)).hexdigest()[:8]
 
 
 def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDWR)  # read-only is not enough for fsync on every system
+    descriptor = os.open(path, os.O_RDWR)  # fsync requires write access on some systems
     try:
         os.fsync(descriptor)
     finally:

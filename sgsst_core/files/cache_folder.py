@@ -1,4 +1,4 @@
-"""Cache folder for files that are fetched once for all jobs of a user."""
+"""Cache folder for files that are downloaded once and shared by all jobs of a user."""
 
 from __future__ import annotations
 

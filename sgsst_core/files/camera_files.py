@@ -1,7 +1,7 @@
 """Readers of camera files: INRIA `cameras.json`, COLMAP sparse models, nerfstudio and Blender `transforms.json`.
 
-All formats are converted to `Camera`: pinhole, world to camera, x right, y down, z forward, pixel centers at +0.5. This
-is COLMAP's convention; the JSON formats share it for the principal point.
+All formats are converted to `Camera`: a pinhole camera with a world-to-camera pose, axes x right, y down, z forward,
+and pixel centers at half-integers. This is COLMAP's convention; the JSON formats share it for the principal point.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from sgsst_core.files.colmap_model import UNDISTORT, read_model
 from sgsst_core.files.images import image_size
 from sgsst_core.scene.camera import Camera
 
-#: Largest entry of R R^T - 1 that is attributed to rounding in the file. Such matrices are replaced by exact rotations.
+#: Largest entry of R R^T - I that is attributed to rounding in the file. Such a matrix R is replaced by the nearest
+#: rotation.
 ROTATION_TOLERANCE = 1e-3
 #: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
 QUATERNION_TOLERANCE = 0.01
 
 _FORMS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
-#: Change of camera axes from OpenGL (x right, y up, z backward) to ours.
+#: Change of camera axes from OpenGL (x right, y up, z backward) to those of `Camera`.
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 #: Camera models of transforms.json that are pinholes if all their distortion coefficients are 0.
@@ -35,15 +36,15 @@ _PINHOLE_NAMES = (None, "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADI
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Read the cameras of a file or folder, whose format is detected.
+    """Detect the format of a camera file or folder, and read its cameras.
 
-    A folder may be a COLMAP sparse model, a data set with one in sparse/0 or sparse, or a folder with transforms.json
-    or cameras.json. Cameras from JSON keep their order; COLMAP's images are sorted by name.
+    A folder may be a COLMAP sparse model, may hold such a model in sparse/0 or sparse, or may hold a transforms.json or
+    cameras.json. Cameras from JSON keep their order; COLMAP's images are sorted by name.
 
-    nerfstudio trains in its own coordinate frame, so a scene that it exported fits these cameras only together with the
-    `dataparser_transforms.json` of the training run. If a file of that name lies beside the transforms.json, it is
-    applied, and `applied_transform` and `applied_scale` are taken into account as nerfstudio does. Otherwise the poses
-    are used as they are, which is correct for scenes that were trained in the file's own frame.
+    nerfstudio trains in a coordinate frame of its own. To match a scene exported by nerfstudio, cameras must be
+    transformed by the `dataparser_transforms.json` of its training run. If that file lies beside the transforms.json,
+    it is applied as in nerfstudio, along with `applied_transform` and `applied_scale`. Otherwise poses are used
+    unchanged, which is correct for scenes trained in the coordinate frame of the camera file.
 
     Raises:
         CameraError: If the file is missing, its format is unknown, it holds no cameras, a camera has distortion, or a
@@ -132,7 +133,10 @@ def _refuse_distortion(where: str, values: Mapping[str, Any]) -> None:
 
 
 def _transforms_size(where: str, image: Path, values: Mapping[str, Any]) -> tuple[int, int]:
-    """Return width and height from the file, else from the image. Blender's format has neither sizes nor suffixes."""
+    """Return width and height as given in the file, or else those of the image.
+
+    Blender's format omits both the sizes and the extensions of image files.
+    """
     if "w" in values and "h" in values:
         return _size(where, values, "w", "h")
     for candidate in (image, *(image.with_name(image.name + suffix) for suffix in (".png", ".jpg", ".jpeg"))):
@@ -217,7 +221,7 @@ def _read_colmap(folder: Path) -> list[Camera]:
 
 
 def _rotation_matrix(where: str, quaternion: tuple[float, float, float, float]) -> NDArray[Any]:
-    """Convert a unit quaternion wxyz to a matrix [3, 3], rounded as COLMAP rounds it."""
+    """Convert a unit quaternion wxyz to a matrix [3, 3], with the same rounding as COLMAP."""
     w, x, y, z = quaternion
     if not abs(math.hypot(w, x, y, z) - 1) <= QUATERNION_TOLERANCE:  # length 0 would give the identity
         raise CameraError(f"{where}: its quaternion has length {math.hypot(w, x, y, z):.3g}, not 1. Export it again.")
@@ -238,7 +242,7 @@ def _camera(
     intrinsics: tuple[float, float, float, float],
     world_to_camera: NDArray[Any],
 ) -> Camera:
-    """Return the camera after the checks that apply to all formats."""
+    """Check values as required for all formats, and return the camera."""
     fx, fy, cx, cy = intrinsics
     for key, value in (("width", size[0]), ("height", size[1]), ("focal length x", fx), ("focal length y", fy)):
         _positive(where, key, value)
@@ -251,7 +255,7 @@ def _camera(
 def _exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
     """Return `matrix` [4, 4] with its upper left 3x3 replaced by the nearest rotation (polar decomposition).
 
-    The two must agree within `ROTATION_TOLERANCE`.
+    The original 3x3 matrix must be a rotation within `ROTATION_TOLERANCE`.
     """
     rotation = matrix[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
@@ -267,7 +271,7 @@ def _exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
 def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
     """Convert a pose from camera-to-world to world-to-camera.
 
-    The rotation is replaced by the nearest exact one; the camera's position does not change.
+    The 3x3 block is replaced by the nearest rotation; the camera's position does not change.
     """
     if not np.isfinite(pose).all():
         raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")

@@ -131,7 +131,7 @@ def _binary_camera(data: mmap.mmap, position: int) -> tuple[int, ColmapCamera, i
 
 
 def _binary_image(data: mmap.mmap, position: int) -> tuple[int, ColmapImage, int]:
-    """Read an image: ID (uint32), pose (7 float64), camera (uint32), name (ends with a 0 byte), points.
+    """Read an image: ID (uint32), pose (7 float64), camera (uint32), name (null-terminated), points.
 
     The points are a count (uint64) and 24 bytes each; they are skipped.
     """
@@ -156,7 +156,10 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
-    """Yield images from pairs of lines: ID, quaternion, translation, camera ID and name; then points, if any."""
+    """Yield images from pairs of lines.
+
+    The first line holds ID, quaternion, translation, camera ID and name. The second holds points and is skipped.
+    """
     lines = _lines(path, points_follow=True)
     for where, line in lines:
         words = line.split(maxsplit=9)
@@ -167,9 +170,9 @@ def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
 
 
 def _lines(path: Path, *, points_follow: bool = False) -> Iterator[tuple[str, str]]:
-    """Yield the location of each line, for messages, and its text.
+    """Yield the location of each line (for error messages) and its text.
 
-    Blank lines and comments are skipped, and with `points_follow` also the line after each yielded one.
+    Blank lines and comments are skipped. If `points_follow` is set, the line after each yielded line is skipped too.
     """
     with path.open("rb") as file:
         numbered = enumerate(file, start=1)

@@ -1,4 +1,4 @@
-"""Stylized colors alone, for clients that already have the scene: 6 bytes per Gaussian."""
+"""Writer of stylized colors alone, for clients that already have the scene: 6 bytes per Gaussian."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def write_colors(path: Path, sh_dc: Tensor) -> None:
     """Write f_dc_0..2 of each Gaussian in order, as an N x 3 array of little-endian float16 without a header.
 
     Values are rounded to the nearest float16. The relative error is at most 2^-11, or the absolute error at most 2^-25
-    for values below 2^-14. For colors between black and white that is less than 0.04 gray levels of 255. Values beyond
-    +-65504 are clamped. The file is written atomically.
+    for values below 2^-14. For displayable colors, the error is less than 0.04 of an 8-bit level. Values beyond +-65504
+    are clamped. The file is written atomically.
 
     Args:
         path: File to write.

@@ -1,8 +1,9 @@
-"""PlayCanvas' compressed PLY: 16 bytes per Gaussian, and one byte per SH coefficient above degree 0.
+"""Reader and writer of PlayCanvas' compressed PLY.
 
-Positions and log scales have 11, 10 and 11 bits, and colors have 8 bits per channel, relative to bounds that a chunk of
-256 Gaussians shares. Opacities have 8 bits, rotations three times 10 bits. SH coefficients are bytes for the range -4
-to 4. The layout is that of `splat-transform` (https://github.com/playcanvas/splat-transform).
+A Gaussian takes 16 bytes, and one byte per SH coefficient above degree 0. Positions and log scales are quantized to 11,
+10 and 11 bits, and colors to 8 bits per channel, within bounds shared by a chunk of 256 Gaussians. Opacities have 8
+bits. Rotations have three components of 10 bits each. SH coefficients are bytes that cover the range -4 to 4. The
+layout is that of `splat-transform` (https://github.com/playcanvas/splat-transform).
 """
 
 from __future__ import annotations
@@ -36,7 +37,10 @@ _LARGEST_SCALE = 20.0
 
 
 def _harmonics() -> NDArray[np.float64]:
-    """Return the value of each byte: the center of its step, or for the first and last byte the end of the range."""
+    """Return the SH coefficient for each byte.
+
+    It is the center of the byte's quantization step, or an end of the range for 0 and 255.
+    """
     middle = (np.arange(256) + 0.5) / 256
     middle[0], middle[-1] = 0, 1
     return 8 * (middle - 0.5)
@@ -85,7 +89,7 @@ def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
             np.stack([chunks[name].astype(np.float64) for name in side], axis=1)[chunk]
             for side in (names[:3], names[3:])
         )
-        with np.errstate(invalid="ignore", over="ignore"):  # non-finite results are found later
+        with np.errstate(invalid="ignore", over="ignore"):  # non-finite results are reported later
             return low * (1 - share) + high * share
 
     with np.errstate(over="ignore"):
@@ -111,7 +115,10 @@ def _unpack_harmonics(rows: NDArray[Any], into: NDArray[np.float32]) -> None:
 
 
 def write_compressed_ply(output: BinaryIO, arrays: Arrays) -> None:
-    """Write the arrays of a scene. Gaussians are sorted along a curve, so that chunks are compact and bounds tight."""
+    """Write the arrays of a scene as a compressed PLY.
+
+    Gaussians are sorted along a space-filling curve, so that chunks are compact and their bounds are tight.
+    """
     count, coefficients = arrays["sh_rest"].shape[:2]
     order = _along_curve(arrays["means"])
     output.write(_header(count, coefficients))
@@ -125,7 +132,7 @@ def write_compressed_ply(output: BinaryIO, arrays: Arrays) -> None:
         output.write(values.tobytes())
     if coefficients:
         for rows in blocks:
-            # all coefficients of a channel together, as in PLY
+            # channel-major, as in PLY
             rest = arrays["sh_rest"][rows].astype(np.float64).transpose(0, 2, 1)
             output.write(np.clip(np.floor(rest * 32 + 128), 0, 255).astype(np.uint8).tobytes())
 
@@ -160,7 +167,7 @@ def _header(count: int, coefficients: int) -> bytes:
 
 
 def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return the bounds [chunks, 18] and packed values [n, 4] of Gaussians, the first of which starts a chunk."""
+    """Return the bounds [chunks, 18] and compressed values [n, 4] of Gaussians that start at a chunk boundary."""
     starts = np.arange(0, len(arrays["means"]), CHUNK_ROWS)
     chunk = np.arange(len(arrays["means"])) // CHUNK_ROWS
     scales = np.clip(arrays["scales"], -_LARGEST_SCALE, _LARGEST_SCALE)

@@ -1,4 +1,4 @@
-"""Readers and writers of images, which are float32 tensors [H, W, 3] of sRGB values in 0..1 in memory."""
+"""Readers and writers of images as float32 tensors [H, W, 3] of sRGB values in 0..1."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from sgsst_core.errors import ImageError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.scene.camera import Camera
 
-#: Maximum number of pixels: Pillow's own limit against decompression bombs, twice its warning level of 2^30 / 4 / 3.
-#: 179 megapixels are more than the largest camera backs have, and 2 GB as float32.
+#: Maximum number of pixels: Pillow's limit against decompression bombs, which is twice its warning threshold. These 179
+#: megapixels exceed the largest camera sensors, and take 2 GB as float32.
 MAX_PIXELS = 2 * ((1 << 30) // 4 // 3)
-#: Formats whose decoding time is bounded by the pixels and bytes of a file. Pillow's other formats are refused: some
-#: have decoders in Python, or start other programs.
+#: Accepted formats, whose decoding time is bounded by the number of pixels and bytes of a file. Pillow's other formats
+#: are refused, because some are decoded in Python or by external programs.
 FORMATS = ("JPEG", "PNG", "GIF", "BMP", "WEBP", "TIFF", "AVIF")
 #: Maximum number of scans of a progressive JPEG. A scan of a few bytes makes the decoder process all pixels again.
 #: Encoders write about 10.
 MAX_JPEG_SCANS = 100
-#: Maximum relative difference between the aspects of a photo and its camera. A larger one means a wrong or cropped
-#: photo.
+#: Maximum relative difference between the aspect ratios of a photo and its camera. A larger difference indicates a
+#: wrong or cropped photo.
 ASPECT_TOLERANCE = 0.01
 
 _JPEG_QUALITY = 95
@@ -170,7 +170,7 @@ def save_jpg(path: Path, image: Tensor) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """Open an image and check its size. All errors of decoding inside the block become ImageError."""
+    """Open an image and check its size. Decoding errors inside the block are raised as ImageError."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
@@ -196,7 +196,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 def _check_scans(path: Path) -> None:
     """Check the number of scans of a JPEG file.
 
-    Searching for markers is reliable, because entropy-coded data contains no other markers than restarts.
+    Searching for markers is reliable, because entropy-coded data contains no markers except restarts.
     """
     data = path.read_bytes()
     scans = position = 0
@@ -228,7 +228,10 @@ def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:
 
 
 def _full_scale(mode: str, largest: float) -> float:
-    """Return the value of white. For float and 32-bit images it is the smallest usual range that holds all values."""
+    """Return the pixel value of white.
+
+    For float and 32-bit images, it is the smallest common maximum (1, 255 or 65535) that no pixel exceeds.
+    """
     if mode.startswith("I;16"):
         return 65535.0
     ranges = (1.0, 255.0, 65535.0) if mode == "F" else (65535.0,)
@@ -236,7 +239,7 @@ def _full_scale(mode: str, largest: float) -> float:
 
 
 def _index_photos(folder: Path) -> dict[tuple[str, ...], list[Path]]:
-    """Index all image files below a folder by every suffix of their relative path without extension."""
+    """Index all image files below a folder by every trailing part of their relative path, without extension."""
     extensions = Image.registered_extensions()
     index: dict[tuple[str, ...], list[Path]] = {}
     for path in sorted(folder.rglob("*")):
@@ -250,7 +253,7 @@ def _index_photos(folder: Path) -> dict[tuple[str, ...], list[Path]]:
 def _matching(index: dict[tuple[str, ...], list[Path]], folder: Path, name: str) -> list[Path]:
     """Return the photos that match a camera's name best.
 
-    The longest matching path wins, then files that are not in a further subfolder, then those with the exact extension.
+    The longest matching path wins, then files outside deeper subfolders, then files with the exact extension.
     """
     whole = PurePosixPath(name.replace("\\", "/"))
     known = whole.suffix.lower() in Image.registered_extensions()
@@ -264,7 +267,7 @@ def _matching(index: dict[tuple[str, ...], list[Path]], folder: Path, name: str)
 
 
 def _check_aspect(path: Path, size: tuple[int, int], camera: Camera) -> None:
-    # the camera's sides are rounded to whole pixels, which changes the aspect of a small camera
+    # a camera's size is rounded to whole pixels, which changes the aspect ratio of a small camera
     allowed = ASPECT_TOLERANCE + 0.5 / min(camera.width, camera.height)
     if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > allowed:
         raise ImageError(

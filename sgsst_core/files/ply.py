@@ -1,11 +1,11 @@
-"""Reader of 3DGS scene files, and writer of PLYs that changes the colors and nothing else.
+"""Reader of 3DGS scene files, and writer of stylized PLYs that changes only the colors.
 
 The properties are those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023): x y z,
 f_dc_0..2, f_rest_* (channel-major: all coefficients of red first), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
 They may have any order and numeric type, and a file may have further properties.
 
-Compressed scenes (`scene_headers`) are read as well. With new colors, they are written as PLYs with the layout of
-trainers.
+Compressed formats (see `scene_headers`) are read as well. Their stylized scenes are written as PLYs with the layout of
+3DGS trainers.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.split import Refinement, piece_counts
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
-#: Rows per block. 64k rows of 62 floats are 16 MB: that needs little memory, and the columns of a block are taken from
-#: the CPU cache rather than in one pass over the file each.
+#: Number of rows per block. 64k rows of 62 floats take only 16 MB. The columns of a block are copied from the CPU
+#: cache, instead of in one pass over the file per column.
 BLOCK_ROWS = 1 << 16
 
-#: Bytes per read, which stay in the L2 cache of a core while they are split into columns.
+#: Number of bytes per read. They stay in a core's L2 cache while they are split into columns.
 READ_BYTES = 1 << 20
 #: Maximum bytes of SH coefficients above degree 0 in memory: those of 1.4 million Gaussians of degree 3.
 HELD_BYTES = 1 << 28
@@ -67,12 +67,12 @@ class SceneFile:
 
     Attributes:
         path: Path of the file.
-        scene: Gaussians of the file without dropped ones.
+        scene: Gaussians of the file, without dropped ones.
         header: PLY header; None for other formats.
-        kept: Whether the scene contains each row of the file, [rows] bool; None if it contains all.
+        kept: Mask [rows] bool of the file's rows that the scene contains; None if it contains all.
         stamp: Size in bytes and modification time in ns of the file when it was read.
         form: Format of the file.
-        copies: Number of Gaussians into which each Gaussian was split, [N] int64; None if none was split.
+        copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
     """
 
     path: Path
@@ -119,8 +119,8 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
         drop_invalid: Whether to drop Gaussians with NaN or infinite values, or with a quaternion of length 0, from the
             scene and the stylized file. If False, such a file is refused. Properties that 3DGS does not use are not
             checked.
-        held_bytes: Maximum bytes of SH coefficients above degree 0 in memory. Larger ones stay in the file
-            (`StoredHarmonics`) if its layout allows that; see `stays_in_file`. None is `HELD_BYTES`.
+        held_bytes: Maximum bytes of SH coefficients above degree 0 in memory. If they take more, they stay in the file
+            (`StoredHarmonics`), provided that its layout allows this; see `stays_in_file`. None for `HELD_BYTES`.
 
     Raises:
         SceneError: If the file cannot be read, is truncated, is not a 3DGS scene, has a wrong header, no Gaussians or
@@ -196,11 +196,11 @@ def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
     """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
 
-    Even a color keeps its bytes if its value in float32 does not change. The rest of the file changes in three cases:
+    A color keeps its bytes too if its float32 value does not change. The rest of the file changes in three cases:
 
     - With an SH attenuation, f_rest_* change.
     - Dropped rows are absent, and the count in the header is adjusted.
-    - Each piece of a split Gaussian has its own row with its own position, scale and opacity; so the count changes too.
+    - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
 
     A scene in another format is written as a PLY by `write_scene`.
 
@@ -256,7 +256,7 @@ def write_scene(path: Path, scene: Scene) -> None:
             for part in parts:
                 width = part[0].numel()
                 block = part[start : start + len(rows)] if len(part) == len(scene) else part
-                if block.ndim == 3:  # all coefficients of a channel together
+                if block.ndim == 3:  # channel-major
                     block = block.transpose(1, 2)
                 rows[:, column : column + width] = block.detach().cpu().reshape(len(block), width).numpy()
                 column += width
@@ -353,9 +353,9 @@ class _Flaws:
 
     Attributes:
         start: First row of the block.
-        valid: Whether each row has only valid values, [n] bool.
-        counts: Numbers of NaN and infinite values, by property with invalid values.
-        unrotated: Whether the quaternion of each row has length 0, which is no rotation, [n] bool.
+        valid: Mask [n] bool of rows with valid values only.
+        counts: Numbers of NaN and of infinite values, for each property that has any.
+        unrotated: Mask [n] bool of rows with a quaternion of length 0, which is not a rotation.
     """
 
     start: int
@@ -365,7 +365,7 @@ class _Flaws:
 
 
 class _Columns:
-    """Arrays of a scene, filled with blocks of the file's rows, and the invalid values that were found.
+    """Arrays of a scene, filled block by block from the rows of a file, and the invalid values found in them.
 
     Args:
         count: Number of rows.
@@ -374,7 +374,7 @@ class _Columns:
 
     Attributes:
         arrays: float32 arrays by the names of the scene's tensors.
-        flaws: Invalid values of each block that has some.
+        flaws: Invalid values of each block that contains any.
     """
 
     def __init__(self, count: int, degree: int, stored: RowLayout | None) -> None:
@@ -400,7 +400,10 @@ class _Columns:
         self.check(start, len(rows), rows)
 
     def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:
-        """Record invalid values in `count` rows from `start` on; `rows` is required if columns stay in the file."""
+        """Record invalid values of `count` rows from `start` on.
+
+        `rows` is required if SH coefficients stay in the file.
+        """
         part = slice(start, start + count)
         blocks = [array[part] for array in self.arrays.values()]
         if self._stored is not None and rows is not None:
@@ -448,7 +451,10 @@ def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: _Columns) 
 
 
 class _AsciiHeader(io.BufferedReader):
-    """File whose header has only ASCII characters, as plyfile requires. Comments may contain others."""
+    """File that replaces non-ASCII characters in a PLY header, which plyfile does not accept.
+
+    Such characters may occur in comments.
+    """
 
     def __init__(self, path: Path, header_bytes: int) -> None:
         super().__init__(io.FileIO(path))
@@ -469,7 +475,7 @@ def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
             )
     try:
         with _AsciiHeader(path, len(header.raw)) as stream, warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an empty list in text
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # for an empty list in text
             vertices: NDArray[Any] = PlyData.read(stream)["vertex"].data
             return vertices
     except (PlyParseError, ValueError, OverflowError) as error:
@@ -477,7 +483,10 @@ def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
 
 
 def _valid_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool) -> NDArray[np.bool_] | None:
-    """Return whether each row is valid, [count] bool, or None if all are; raise an error if rows may not be dropped."""
+    """Return the mask [count] bool of valid rows, or None if all are valid.
+
+    Raises SceneError if invalid rows may not be dropped, or if no valid rows remain.
+    """
     if not flaws:
         return None
     kept = np.ones(count, dtype=np.bool_)
@@ -526,12 +535,12 @@ def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
     return raw[:start] + str(len(source.scene)).encode() + raw[stop:]
 
 
-#: Values of all Gaussians of the scene by name of the property.
+#: New values of all Gaussians, by property name.
 _NewColumns = dict[str, NDArray[np.float32]]
 
 
 def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
-    """Return the columns that may differ from the file: the new colors and, for a refined scene, the shapes."""
+    """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes."""
     columns = dict(zip(_DC, colors.numpy().T, strict=True))
     if source.copies is not None:
         columns["opacity"] = source.scene.opacities.numpy()
@@ -541,7 +550,7 @@ def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
 
 
 def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
-    """Yield for each block of the file's rows: their number, how often each is written, and the slice of Gaussians."""
+    """Yield, for each block of file rows, its length, the number of copies of each row, and the slice of Gaussians."""
     position = gaussian = 0
     for start in range(0, rows, BLOCK_ROWS):
         count = min(BLOCK_ROWS, rows - start)
@@ -634,9 +643,10 @@ def _changed_line(
 
     Args:
         line: Row of text.
-        slots: Index and NumPy code of each changed token: those of `values` first, then those to attenuate.
+        slots: Token index and NumPy type code of each value to replace: those of `values` first, then those to
+            attenuate.
         values: New values of the first slots.
-        attenuation: SH attenuation of the other slots; None if there are none.
+        attenuation: SH attenuation of the remaining slots; None if there are none.
     """
     tokens = list(re.finditer(r"\S+", line))
     if attenuation is not None:

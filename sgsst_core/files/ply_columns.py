@@ -11,7 +11,8 @@ from sgsst_core.files.ply import SceneFile, file_stamp, text_vertices
 from sgsst_core.files.ply_header import element_offsets
 from sgsst_core.scene.stored_harmonics import changed
 
-#: Properties of every scene by their names in PLY files: field of `Scene`, and column of its tensor.
+#: Standard 3DGS properties by their names in PLY files: field of `Scene`, and column of its tensor (None for a 1D
+#: tensor).
 _OWN = {
     **{name: ("means", column) for column, name in enumerate("xyz")},
     **{f"scale_{column}": ("scales", column) for column in range(3)},
@@ -24,7 +25,7 @@ _OWN = {
 def read_property(file: SceneFile, name: str) -> Tensor:
     """Return a property of the scene's Gaussians, [N].
 
-    Properties that every scene has are float32. Others have the file's dtype, except integers, which become float64.
+    Standard 3DGS properties are float32. Other properties keep the file's dtype, except that integers become float64.
 
     Raises:
         SceneError: If the file has no such numeric property, or has changed since it was read.

@@ -30,7 +30,7 @@ _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": "
 
 @dataclass(frozen=True)
 class PlyProperty:
-    """Property of an element; `kind` and `length_kind` are NumPy codes such as f4, the latter for lists only."""
+    """Property of an element; `kind` and `length_kind` (for lists only) are NumPy type codes such as f4."""
 
     name: str
     kind: str
@@ -39,7 +39,7 @@ class PlyProperty:
 
 @dataclass(frozen=True)
 class PlyElement:
-    """Element with its properties; `count_span` is the position of its count in the bytes of the header."""
+    """Element with its properties; `count_span` is the (start, end) of its count in the bytes of the header."""
 
     name: str
     count: int
@@ -171,11 +171,11 @@ def _check_elements(path: Path, elements: tuple[PlyElement, ...]) -> None:
 def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
     """Check that a file is as long as its header declares, without allocating memory for the data.
 
-    Rows of text have no fixed length, so text files are only checked against a lower bound. Parsing the rows reveals
-    other errors.
+    Rows of text have no fixed length, so text files are only checked against a lower bound. Other errors are found when
+    the rows are parsed.
 
     Returns:
-        Byte offset of each element's rows by name in a binary file; empty for text.
+        Byte offset of each element's rows in a binary file, by element name; empty for text files.
 
     Raises:
         SceneError: If the file is shorter than declared.
@@ -204,7 +204,10 @@ def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
 
 
 def _end_of_lists(path: Path, element: PlyElement, byte_order: str, position: int) -> int:
-    """Return the end of an element with lists. Each list's length is read and checked against the size of the file."""
+    """Return the byte offset at which an element with lists ends.
+
+    The length of each list is read, and checked against the size of the file.
+    """
     steps = [
         (struct.Struct(byte_order + np.dtype(prop.length_kind).char) if prop.length_kind else None, np.dtype(prop.kind))
         for prop in element.properties

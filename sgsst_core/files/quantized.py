@@ -1,4 +1,4 @@
-"""Quantization that compressed scene formats share: opacities, and rotations as their smallest three components.
+"""Quantization shared by compressed scene formats: opacities, and rotations by their three smallest components.
 
 All computations use float64, so that the format's own rounding is the only loss.
 """
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: SH basis function of degree 0: contribution of a coefficient to a color.
+#: SH basis function of degree 0: factor between a coefficient and its contribution to a color.
 SH_C0 = 0.28209479177387814
 
 #: Opacities of exactly 0 and 1 have no finite logit, so they are read as 0.25/255 and 1 - 0.25/255. The difference is
@@ -20,7 +20,7 @@ _LEAST_THREE = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def byte_table(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Convert the value of each byte to float32, [256]."""
+    """Convert a table of the value of each byte, [256], to float32."""
     return values.astype(np.float32)
 
 
@@ -40,7 +40,7 @@ def opacity_bytes(logits: NDArray[Any]) -> NDArray[Any]:
 
 
 def to_steps(values: NDArray[Any], most: int) -> NDArray[np.uint32]:
-    """Quantize values in 0..1 to the nearest of the steps 0..most, as uint32. Other values are clamped."""
+    """Quantize values to uint32 steps 0..most, which cover the range 0..1. Values outside it are clamped."""
     steps: NDArray[np.uint32] = np.rint(np.clip(values, 0, 1) * most).astype(np.uint32)
     return steps
 

@@ -20,13 +20,13 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.ply_header import PlyElement, PlyHeader, element_offsets, read_header
 
 Form = Literal["ply", "compressed.ply", "spz", "splat"]
-#: Compressed formats that can be written beside a PLY, by the ending of the file name.
+#: Compressed formats that can be written in addition to a PLY, named by their file extension.
 PackedForm = Literal["compressed.ply", "spz"]
 PACKED_FORMS: tuple[PackedForm, ...] = ("compressed.ply", "spz")
 
 #: SH coefficients per color channel above degree 0, by SH degree.
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
-#: Gaussians per chunk of a compressed PLY, which share their bounds.
+#: Number of Gaussians per chunk of a compressed PLY. Each chunk has its own quantization bounds.
 CHUNK_ROWS = 256
 #: Bytes per Gaussian in a .splat file.
 SPLAT_BYTES = 32
@@ -35,20 +35,20 @@ SPLAT_BYTES = 32
 _DEFLATE_RATIO = 1032
 _CONVERT = "Convert it first: `splat-transform scene.{form} scene.ply` (https://github.com/playcanvas/splat-transform)."
 _SPZ_MAGIC = b"NGSP"
-#: Bytes from which the format is detected. For .splat they hold 256 records.
+#: Number of leading bytes that are used to detect the format: 256 records of a .splat file.
 _HEAD_BYTES = 256 * SPLAT_BYTES
 _KSPLAT_HEADER_BYTES = 4096
 
 
 def form_of_name(name: str) -> Form | None:
-    """Return the format of an output file by the ending of its name; None if the ending is not supported."""
+    """Return the format of an output file by its file extension; None if the extension is not supported."""
     lower = name.lower()
     packed: Form | None = next((form for form in PACKED_FORMS if lower.endswith(f".{form}")), None)
     return packed or ("ply" if lower.endswith(".ply") else None)
 
 
 def packed_name(ply: str, form: PackedForm) -> str:
-    """Return the name of the compressed file beside a PLY."""
+    """Return the name of the compressed file that accompanies a PLY."""
     return f"{ply.removesuffix('.ply')}.{form}"
 
 
@@ -68,7 +68,8 @@ class SpzHeader:
     Attributes:
         version: Version of the format, 1 to 4.
         fractional_bits: Fractional bits of the fixed-point positions; unused in version 1, which has 16-bit floats.
-        sections: Decompressed bytes of positions, opacities, colors, scales, rotations and spherical harmonics.
+        sections: Decompressed sizes in bytes of positions, opacities, colors, scales, rotations and spherical
+            harmonics.
         streams: Streams of version 4, one per section that is not empty. Empty for other versions, which have one gzip
             stream.
     """
@@ -86,7 +87,7 @@ class SceneHeader:
     Attributes:
         form: Format of the file.
         count: Number of Gaussians; 0 for a PLY without any, which `read_scene` refuses.
-        sh_degree: SH degree, 0 to 3; always 0 for a plain PLY, where it is not determined here.
+        sh_degree: SH degree, 0 to 3; always 0 for a plain PLY, whose SH degree is not determined here.
         size: Size of the file in bytes.
         ply: PLY header of a plain or compressed PLY; None for other formats.
         spz: SPZ header; None for other formats.
@@ -108,7 +109,8 @@ class SceneHeader:
 def read_scene_header(path: Path) -> SceneHeader:
     """Detect the format of a scene file from its content, and read its header.
 
-    The size of a compressed scene is checked against its header. That of a plain PLY is not: see `element_offsets`.
+    The size of a compressed scene is checked against its header. The size of a plain PLY is not checked here; see
+    `element_offsets`.
 
     Raises:
         SceneError: If the file cannot be read, is truncated, has a wrong header, or has an unsupported format.
@@ -180,7 +182,7 @@ def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, .
 
 
 def _sh_degree(path: Path, header: PlyHeader, count: int) -> int:
-    """Return the SH degree of a compressed PLY, given its separate element of SH coefficients."""
+    """Return the SH degree of a compressed PLY, which follows from its element `sh`."""
     if "sh" not in header.names:
         return 0
     element = header.elements[header.names.index("sh")]
@@ -245,7 +247,10 @@ def _spz_4(path: Path, head: bytes, size: int) -> SceneHeader:
 
 
 def _spz_header(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, tuple[int, ...]]:
-    """Parse the common header: version, number of Gaussians, SH degree, fractional bits, and bytes of all sections."""
+    """Parse the header fields that all versions share.
+
+    Returns version, number of Gaussians, SH degree, fractional bits, and decompressed bytes of all sections.
+    """
     if len(head) < 16:
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
     version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)

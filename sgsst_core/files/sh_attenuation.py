@@ -1,6 +1,6 @@
 """SH attenuation of written scenes: `f_rest_*` are multiplied by one factor in float32.
 
-The written coefficients equal those that the job optimized with, since `Scene.attenuated` multiplies the same float32
+The written coefficients equal those that the job optimized with, because `Scene.attenuated` multiplies the same float32
 values by the same factor.
 """
 
@@ -25,7 +25,7 @@ class ShAttenuation:
 
     Attributes:
         names: Names of the SH properties in the file's order.
-        factor: Factor, rounded to float32. With 0, all coefficients become positive zeros.
+        factor: Factor of all coefficients, rounded to float32. If it is 0, all coefficients become positive zeros.
     """
 
     names: tuple[str, ...]
@@ -33,7 +33,7 @@ class ShAttenuation:
 
     @staticmethod
     def of(header: PlyHeader, attenuation: float) -> ShAttenuation | None:
-        """Return the attenuation for a file's vertices; None if nothing changes."""
+        """Return the attenuation for a file's vertices; None if no coefficient changes."""
         names = tuple(prop.name for prop in header.vertex.properties if re.fullmatch(r"f_rest_\d+", prop.name))
         factor = attenuation_factor(attenuation)
         return ShAttenuation(names, factor) if names and factor != 1 else None
@@ -49,7 +49,7 @@ class ShAttenuation:
             dtype[name] == np.dtype("<f4") and dtype.fields[name][1] == first + 4 * place
             for place, name in enumerate(self.names)
         )
-        if packed and first % 4 == 0 and dtype.itemsize % 4 == 0:  # the layout of trainers: one pass over the rows
+        if packed and first % 4 == 0 and dtype.itemsize % 4 == 0:  # layout of 3DGS trainers: one pass over the rows
             table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
             part = table[:, first // 4 : first // 4 + len(self.names)]
             part[:] = self.attenuated(part)
@@ -67,7 +67,8 @@ def check_sh_attenuation(path: Path, header: PlyHeader | None, attenuation: floa
 
     Args:
         path: Path of the file, for messages.
-        header: Header of the file; None if it is not a PLY. Such scenes are written as a float32 PLY.
+        header: Header of the file; None if it is not a PLY. Scenes from other formats are written as a float32 PLY,
+            which can store them.
         attenuation: SH attenuation, 0 to 1.
 
     Raises:

@@ -32,7 +32,7 @@ def read_splat(file: RowFile, header: SceneHeader, into: Arrays) -> None:
         file.read(start * SPLAT_BYTES, data)
         rows = splat_rows(data)
         into["means"][part] = rows["position"]
-        with np.errstate(divide="ignore", invalid="ignore"):  # invalid values are found later
+        with np.errstate(divide="ignore", invalid="ignore"):  # invalid values are reported later
             into["scales"][part] = np.log(rows["scale"].astype(np.float64))
         into["sh_dc"][part] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
         into["opacities"][part] = OPACITY_LOGITS[rows["color"][:, 3]]

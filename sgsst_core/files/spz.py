@@ -1,8 +1,9 @@
-"""Niantic's SPZ: 16 to 20 bytes per Gaussian and one byte per SH coefficient above degree 0, all compressed.
+"""Reader and writer of Niantic's SPZ.
 
-Positions are 24-bit fixed-point numbers. Log scales, colors, opacities and SH coefficients have 8 bits, rotations three
-times 8 bits or, from version 3 on, 10 bits. The file stores one attribute after the other. They are converted while the
-stream is decompressed, so the decompressed data is never in memory as a whole. The layout is that of
+A Gaussian takes 16 to 20 bytes before compression, and one byte per SH coefficient above degree 0. Positions are 24-bit
+fixed-point numbers. Log scales, colors, opacities and SH coefficients have 8 bits. Rotations have three components of 8
+bits, or of 10 bits from version 3 on. The file stores one attribute after the other. Attributes are converted during
+decompression, so the decompressed data is never in memory as a whole. The layout is that of
 https://github.com/nianticlabs/spz.
 
 The axes of SPZ are x right, y up, z backward; those of a 3DGS PLY are x right, y down, z forward. Positions, rotations
@@ -41,12 +42,13 @@ _FLIP_QUATS = np.array([1, 1, -1, -1], np.float32)
 _FLIP_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 _SCALES = byte_table(np.arange(256) / 16 - 10)
-#: SH coefficients of degree 0, whose range exceeds that of the colors 0..1.
+#: SH coefficient of degree 0 for each byte. Their range exceeds that of colors in 0..1.
 _COLORS = byte_table((np.arange(256) / 255 - 0.5) / 0.15)
 _HARMONICS = byte_table((np.arange(256) - 128) / 128)
 _FIRST_BYTES = byte_table(np.arange(256) / 127.5 - 1)
 
-#: Maximum number of fractional bits in written positions. In a scene of a few units, they are finer than float32.
+#: Maximum number of fractional bits in written positions. With 20 bits, positions in a scene of a few units are finer
+#: than in float32.
 _MOST_BITS = 20
 
 #: Compression level. Files are 2 % larger than at zlib's default level 6 but take a third of the time, because
@@ -95,7 +97,7 @@ def read_spz(path: Path, file: RowFile, header: SceneHeader, into: Arrays) -> No
 
 
 def _gzip_stream(path: Path, file: RowFile, size: int, sections: int) -> Iterator[Take]:
-    """Yield a reader of the one gzip stream for each section."""
+    """Yield, for each section, a function that reads its bytes from the common gzip stream."""
     inflate = zlib.decompressobj(31)
     position = 0
 
@@ -131,7 +133,7 @@ def _gzip_stream(path: Path, file: RowFile, size: int, sections: int) -> Iterato
 
 
 def _zstd_streams(path: Path, file: RowFile, streams: tuple[SpzSection, ...]) -> Iterator[Take]:
-    """Yield a reader of each section's own stream, and check that the stream ends with its section."""
+    """Yield, for each section, a function that reads its own zstd stream; check that the stream ends there."""
     for stream in streams:
         decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
         with decompressor.stream_reader(_Part(file, stream), read_size=_READ_BYTES) as reader:  # type: ignore[arg-type]

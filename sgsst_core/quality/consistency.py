@@ -1,12 +1,11 @@
 """Multi-view consistency: how much the images of two cameras differ where both see the same surface.
 
-View j is warped into view i by the rendered depth and compared where both see the same surface: by RMSE, and by LPIPS
-averaged over the same pixels. Short range compares adjacent views, long range views 7 apart (the two ranges of Huang et
-al., "Learning to Stylize Novel Views", ICCV 2021).
+View j is warped into view i using rendered depth. The images are then compared over the pixels where both views see the
+same surface, by RMSE and by LPIPS averaged over these pixels. Short range compares adjacent views; long range compares
+views 7 apart (the two ranges of Huang et al., "Learning to Stylize Novel Views", ICCV 2021).
 
-The distance of an unstylized scene is above zero too, for three reasons: colors depend on the view, interpolation
-smooths the warped view a little, and depth is a mean over translucent Gaussians. Compare the values before and after
-stylization.
+Even the views of an unstylized scene differ, for three reasons: colors depend on the view, interpolation smooths the
+warped view a little, and depth is a mean over translucent Gaussians. Compare the values before and after stylization.
 """
 
 from __future__ import annotations
@@ -23,23 +22,23 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 
-#: Distance of a pair's two views in the list of views.
+#: Index difference of the two views of a pair.
 SHORT_RANGE, LONG_RANGE = 1, 7
 #: Coverage above which a pixel's depth counts as known. With less coverage, the background mixes into its color.
 COVERED = 0.9
-#: Maximum relative difference of the depths of one surface in two views. In scans of objects, color errors grow from
-#: 0.01 on, where one limb hides another. In a scene trained from few photos, whose translucent Gaussians have no single
-#: depth, they grow only from 0.05 on; smaller values compare fewer pixels and give nearly the same RMSE.
+#: Maximum relative difference between the depths of one surface in two views. In object scans, values above 0.01
+#: increase color errors where one limb occludes another. In scenes trained from few photos, whose translucent Gaussians
+#: have no well-defined depth, only values above 0.05 increase them; smaller values compare fewer pixels at nearly the
+#: same RMSE.
 DEPTH_TOLERANCE = 0.02
-#: Maximum weight, in an interpolated pixel, of source pixels that do not count (outside the view, uncovered, or on
-#: another surface). It allows for the rounding error of positions at pixel centers, and is too small to be visible in 8
-#: bits.
+#: Maximum interpolation weight of invalid source pixels (outside the view, uncovered, or on another surface) in a valid
+#: pixel. It tolerates the rounding of positions at pixel centers, and is invisible in 8-bit images.
 _FOREIGN_SHARE = 1e-3
 #: Fraction of comparable pixels below which a pair has no RMSE or LPIPS.
 MINIMUM_COMPARED = 0.01
-#: Pixels warped at a time. Each needs memory for some twenty values.
+#: Number of pixels warped at a time. Each takes memory for about twenty values.
 _BAND_PIXELS = 1 << 20
-#: Gaussians whose depths are computed at a time.
+#: Number of Gaussians whose depths are computed at a time.
 _GAUSSIANS = 1 << 18
 
 ImageSource = Callable[[int], Tensor]
@@ -77,12 +76,12 @@ class Consistency:
 
     @property
     def lpips(self) -> float | None:
-        """Mean LPIPS, or None if no pair has one."""
+        """Mean LPIPS, or None if no pair has an LPIPS value."""
         return _mean([pair.lpips for pair in self.pairs])
 
     @property
     def compared(self) -> float:
-        """Mean fraction of pixels that could be compared, over all pairs; 0 without pairs."""
+        """Mean fraction of pixels that could be compared, over all pairs; 0 if there are no pairs."""
         return _mean([pair.compared for pair in self.pairs]) or 0.0
 
 
@@ -93,7 +92,7 @@ class DepthMap:
     Attributes:
         depth: Mean camera-space z [H, W] of the Gaussians in each pixel, weighted by blend weight, in world units,
             float32; 1 where unknown.
-        known: Mask [H, W] bool of the pixels covered by more than `COVERED`.
+        known: Mask [H, W] bool of the pixels whose coverage exceeds `COVERED`.
     """
 
     depth: Tensor
@@ -118,7 +117,7 @@ def consistency(
         cameras: Camera of each view; cameras adjacent in the list are close in space.
         rasterizer: Rasterizer of the scene's geometry.
         scene: Scene whose geometry determines where views overlap.
-        gap: Distance of two compared views in the list: `SHORT_RANGE`, `LONG_RANGE` or any other, at least 1.
+        gap: Index difference of two compared views: `SHORT_RANGE`, `LONG_RANGE` or any other, at least 1.
         lpips: LPIPS network; None skips LPIPS.
         at_most: Maximum number of pairs, evenly spread over the list; None compares all.
 
@@ -131,8 +130,8 @@ def consistency(
     """
     views: dict[int, tuple[Tensor, DepthMap]] = {}
     results = []
-    # Pairs are visited chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...). Each pair shares a view with the one
-    # before it, so every view is rendered once and only two are in memory, whatever the gap.
+    # Pairs are visited chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...). Each pair shares a view with the
+    # previous pair, so every view is rendered once and only two views are in memory, regardless of the gap.
     for i, j in sorted(view_pairs(len(cameras), gap, at_most), key=lambda pair: (pair[0] % gap, pair[0])):
         views = {k: views.get(k) or _image_and_depth(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
         (image, depth), (other, other_depth) = views[i], views[j]
@@ -142,7 +141,7 @@ def consistency(
 
 
 def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[int, int]]:
-    """Return the pairs (i, i + gap) of `count` views, or `at_most` of them, evenly spread.
+    """Return all pairs (i, i + gap) of `count` views, or at most `at_most` evenly spread ones.
 
     Raises:
         SettingsError: If `gap` or `at_most` is below 1.
@@ -156,16 +155,16 @@ def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[i
 def expected_depth(scene: Scene, camera: Camera, rasterizer: Rasterizer) -> DepthMap:
     """Render the depth of a view.
 
-    Rendering is linear in the colors, and z can be rendered like a color. The weighted sum of z and the sum of weights
-    are two channels of one image, so rounding errors of the blend weights cancel in their ratio. The image of black
-    Gaussians is subtracted to remove the background.
+    Rendering is linear in the colors, so z is rendered like a color. Two channels of one image hold the sum of z
+    weighted by blend weights, and the sum of the blend weights. Rounding errors of the blend weights cancel in the
+    ratio of both. The image of all-black Gaussians is subtracted to remove the background.
     """
     pose = camera.world_to_camera.double()
     colors = torch.zeros((len(scene), 3), dtype=rasterizer.dtype)
     colors[:, 1] = 1
     for start in range(0, len(scene), _GAUSSIANS):
         part = slice(start, start + _GAUSSIANS)
-        # In float64, because both terms are large in a world far from its origin.
+        # Computed in float64, because both terms are large if the scene is far from the origin.
         colors[part, 0] = (scene.means[part].double() @ pose[2, :3] + pose[2, 3]).to(rasterizer.dtype)
     sums = rasterizer.render(colors, camera) - rasterizer.render(torch.zeros_like(colors), camera)
     weighted, weights = sums[..., 0], sums[..., 1]
@@ -180,10 +179,10 @@ def project_pixels(
     camera: Camera,
     other: Camera,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the positions in another view of pixel centers at a given depth.
+    """Project pixel centers, at the given depths, into another view.
 
-    The result is x and y in pixels and z, each [h, W] float64. If z <= 0 (behind the other camera), x and y are
-    meaningless but finite.
+    Returns x and y in pixels, and z in the other camera's space, each [h, W] float64. Where z <= 0 (behind the other
+    camera), x and y are finite but meaningless.
     """
     device = depth.device
     pose, other_pose = camera.world_to_camera.double(), other.world_to_camera.double()
@@ -201,15 +200,15 @@ def project_pixels(
 
 @dataclass(frozen=True)
 class Warp:
-    """Pixels of a view that another view sees too, and how to interpolate them there.
+    """Mapping from the pixels of a view to interpolated pixels of another view that sees the same surface.
 
-    A warp depends on the geometry alone, so it holds for all colors of a scene.
+    A warp depends only on geometry, so it can be reused when the colors of the scene change.
 
     Attributes:
         size: (H, W) of the view.
-        pixels: Indices [P] of the view's pixels, row by row, int64.
-        sources: Indices [4, P] of the four surrounding pixels in the other view, int32.
-        weights: Interpolation weights [4, P], with sum 1 per pixel, float32.
+        pixels: Row-major indices [P] of the view's pixels with a match in the other view, int64.
+        sources: Row-major indices [4, P] of the four surrounding pixels in the other view, int32.
+        weights: Interpolation weights [4, P] that sum to 1 for each pixel, float32.
     """
 
     size: tuple[int, int]
@@ -223,7 +222,7 @@ class Warp:
         return sum(t.numel() * t.element_size() for t in (self.pixels, self.sources, self.weights))
 
     def apply(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Warp the other view's image [H', W', 3]. Returns an image [H, W, 3] and a mask [H, W] of its valid pixels."""
+        """Warp the other view's image [H', W', 3]; return an image [H, W, 3] and the mask [H, W] of valid pixels."""
         flat = image.reshape(-1, 3)
         colors = flat.new_zeros((len(self.pixels), 3))
         for source, weight in zip(self.sources, self.weights, strict=True):
@@ -246,10 +245,11 @@ def find_warp(
 ) -> Warp:
     """Compute the warp of another view into the view of `camera`.
 
-    Each pixel's point, at its own depth, is projected into the other view, and the four pixels around it are
-    interpolated. One of the four counts only if it lies within the view, has a known depth, and that depth agrees with
-    the point's within the relative tolerance. Otherwise the other view sees something else there (occlusion), or an
-    edge runs between the four. If those that do not count have more than a trace of the weight, the pixel is omitted.
+    Each pixel is unprojected by its depth and projected into the other view, where the four surrounding pixels are
+    interpolated. A source pixel is valid if it lies within the other view, its depth is known, and its depth matches
+    that of the projected point within the relative tolerance. A mismatch means that the other view sees another surface
+    there (occlusion), or that a depth edge runs between the four pixels. If more than a negligible fraction of the
+    interpolation weight falls on invalid source pixels, the pixel is omitted.
     """
     pixels, sources, weights = [], [], []
     step = max(1, _BAND_PIXELS // camera.width)
@@ -275,9 +275,10 @@ def warp(
     *,
     tolerance: float = DEPTH_TOLERANCE,
 ) -> tuple[Tensor, Tensor]:
-    """Warp another view's image into the view of `camera`: image [H, W, 3] in its dtype, and validity mask [H, W] bool.
+    """Warp another view's image into the view of `camera`; see `find_warp`.
 
-    See `find_warp`. Invalid pixels are 0.
+    Returns the warped image [H, W, 3] in the dtype of `image`, which is 0 at invalid pixels, and the mask [H, W] bool
+    of valid pixels.
     """
     return find_warp(other_depth, other, depth, camera, tolerance=tolerance).apply(image)
 
@@ -291,7 +292,7 @@ def _around(
 ) -> tuple[Tensor, Tensor]:
     """Return the indices [4, P] int32 and weights [4, P] float32 of the four pixels around each position.
 
-    Weights are 0 if the depths disagree.
+    The weight of an invalid pixel is 0: outside the view, of unknown depth, or at a depth that differs from z.
     """
     height, width = depth.depth.shape
     left, top = (x - 0.5).floor(), (y - 0.5).floor()
@@ -315,7 +316,7 @@ def shown(image: Tensor, camera: Camera, device: torch.device) -> Tensor:
     """Return an image [H, W, 3] of a view as a screen shows it: clamped to 0 to 1, on the given device.
 
     Raises:
-        ValueError: If it does not have the camera's size, or contains NaN or infinity.
+        ValueError: If the image does not have the camera's size, or contains NaN or infinity.
     """
     image = image.detach().to(device)
     if tuple(image.shape) != (camera.height, camera.width, 3):
@@ -330,7 +331,7 @@ def shown(image: Tensor, camera: Camera, device: torch.device) -> Tensor:
 def compare(
     first: int, second: int, image: Tensor, warped: Tensor, valid: Tensor, lpips: Lpips | None
 ) -> PairConsistency:
-    """Compare a view's image [H, W, 3] with another one warped into it, where the mask `valid` [H, W] is true."""
+    """Compare a view's image [H, W, 3] with another view's warped image, where the mask `valid` [H, W] is true."""
     count = int(valid.sum())
     compared = count / valid.numel()
     if count == 0 or compared < MINIMUM_COMPARED:
@@ -338,7 +339,7 @@ def compare(
     rmse = float((image[valid].double() - warped[valid].double()).square().mean().sqrt())
     distance = None
     if lpips is not None and min(valid.shape) >= lpips.minimum_side:
-        # Invalid pixels are filled with the view's own, so the features of valid pixels see no edge of a hole.
+        # Fill invalid pixels with the view's own image: holes would add edges to the features of valid pixels.
         filled = torch.where(valid[..., None], warped, image)
         distances = lpips.distance(image, filled).map
         distance = float(distances[valid.to(distances.device)].mean(dtype=torch.float64))

@@ -1,7 +1,7 @@
 """Exact loss and gradient of a job, as the reference for measuring its approximations.
 
-Features are float32, every Gaussian with any blend weight in a view counts, and blend weights are recomputed at each
-use. float32 itself is within 1e-6 of the float64 reference (tests/sgsst_core/loss/test_sos.py).
+Features are float32, no Gaussian with a nonzero blend weight is pruned, and blend weights are recomputed instead of
+cached. The result is within 1e-6 of the float64 reference (tests/sgsst_core/loss/test_sos.py).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sgsst_core.stylizing.views import Views
 
 
 def approximations(stylizer: Stylizer) -> list[str]:
-    """List the approximations that change a job's gradient by more than rounding; empty if there are none."""
+    """Return the names of a job's approximations whose gradient error exceeds rounding; empty if there are none."""
     found = []
     if stylizer.network.precision != "float32":
         found.append("TF32 convolutions" if stylizer.network.tf32 else f"{stylizer.network.precision} features")
@@ -43,13 +43,16 @@ def approximations(stylizer: Stylizer) -> list[str]:
 
 
 def uncached_rasterizer(stylizer: Stylizer) -> Rasterizer:
-    """Return the rasterizer that computes the job's blend weights, without a cache in front of it."""
+    """Return the job's underlying rasterizer, which computes blend weights without caching them."""
     rasterizer = stylizer.views.rasterizer
     return rasterizer.uncached if isinstance(rasterizer, CachedRasterizer) else rasterizer
 
 
 def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
-    """Make a rasterizer of another scene with the job's settings, whose cache fits beside the job's in memory."""
+    """Create a rasterizer of another scene with the job's settings.
+
+    It shares the job's memory budget for tile intersections, with lower priority.
+    """
     settings, job = stylizer.settings, uncached_rasterizer(stylizer)
     options: dict[str, Any] = {"background": settings.background, "near": settings.near}
     if isinstance(job, CpuRasterizer | TritonRasterizer) and job.name == stylizer.plan.uncached:
@@ -64,10 +67,10 @@ class GradientError:
     Attributes:
         step: Number of steps before the measurement.
         view: Name of the camera.
-        relative_error: |g - exact| / |exact| in the Euclidean norm, over the optimized Gaussians.
-        cosine: Cosine of the angle between the two.
-        seconds: Time to compute the gradient as the job does.
-        seconds_exact: Time to compute the exact gradient.
+        relative_error: |g - exact| / |exact| in the Euclidean norm, over the gradients g of all optimized Gaussians.
+        cosine: Cosine of the angle between the two gradients.
+        seconds: Seconds to compute the gradient with the job's approximations.
+        seconds_exact: Seconds to compute the exact gradient.
     """
 
     step: int
@@ -86,8 +89,8 @@ class ExactLoss:
     """Loss of a job in float32.
 
     Args:
-        stylizer: Job, which is not changed.
-        style_loss: Style loss, to compare jobs that use different ones; None for the job's own.
+        stylizer: Job to evaluate; not modified.
+        style_loss: Style loss to evaluate, for comparing jobs with different style losses; None for the job's own.
     """
 
     def __init__(self, stylizer: Stylizer, style_loss: StyleLossName | None = None) -> None:
@@ -119,9 +122,9 @@ class Float32Reference(ExactLoss):
     """Exact loss and gradient of a job's colors.
 
     Args:
-        stylizer: Job, which is not changed.
+        stylizer: Job to evaluate; not modified.
         memory: Memory budget in bytes for view targets.
-        style_loss: Style loss, as for `ExactLoss`.
+        style_loss: Style loss to evaluate; see `ExactLoss`.
     """
 
     def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
@@ -153,7 +156,7 @@ class Float32Reference(ExactLoss):
         """Compute dE/dsh_dc [N, 3] for colors [N, 3] of the whole scene.
 
         Returns:
-            The gradient, and the seconds it took, not counting the view's targets.
+            Gradient, and the seconds to compute it without the view's targets.
         """
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
         gradient = torch.zeros_like(sh_dc)
@@ -167,10 +170,10 @@ class Float32Reference(ExactLoss):
         return gradient, time.perf_counter() - started
 
     def gradient_error(self, *, start: bool = False) -> GradientError:
-        """Compare the job's gradient for its latest view with the exact one, at the colors the job would return now.
+        """Compare the job's gradient for its latest view with the exact one, at the job's current result colors.
 
         Args:
-            start: Whether to compare at the unstylized colors instead, for the first view.
+            start: Whether to use the unstylized colors and the first view instead.
         """
         stylizer = self._stylizer
         if start or not stylizer.history:

@@ -1,7 +1,7 @@
-"""Warnings about extreme values in a scene, its views and its style, to be read before a long job.
+"""Warnings about extreme values in a scene, its views and its style, shown before a long job.
 
-Each finding has a count, the worst case and its consequence. None of them is an error: input that cannot be used at all
-is refused by the reader.
+Each finding has a count, the worst case and its consequence. Findings are not errors: the file readers reject unusable
+input.
 """
 
 from __future__ import annotations
@@ -27,32 +27,35 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
-#: Plausible lengths of trained quaternions. Outside this range, training or export went wrong.
+#: Plausible range of lengths of trained quaternions. Lengths outside it indicate a failed training or export.
 QUATERNION_LENGTHS = (1e-3, 1e3)
-#: Sizes relative to the scene's extent: larger than the whole scene, and too small for any view to resolve.
+#: Thresholds of Gaussian size relative to the scene's extent. Above the first, a Gaussian is larger than the scene;
+#: below the second, no view can resolve it.
 LARGE_SCALE, SMALL_SCALE = 1.0, 1e-7
-#: Ratio of the longest to the middle axis. Flat discs are common, needles are not.
+#: Ratio of the longest to the middle axis above which a Gaussian counts as a needle. Flat discs are common, needles are
+#: not.
 NEEDLE = 1e3
 #: Log scale above which the determinant of the projected covariance overflows: exp(177)^4 exceeds float64.
 OVERFLOW_SCALE = 177.0
 #: SH coefficients of trained scenes stay within a few units; 20 corresponds to a color of 6.
 LARGE_COEFFICIENT = 20.0
-#: Distance from the world's origin, in scene extents, at which float32 positions are a thousandth of the extent apart.
+#: Distance from the world's origin, in scene extents, at which float32 positions have a spacing of about a thousandth
+#: of the extent.
 FAR_WORLD = 1e4
 #: Total blend weight below which a Gaussian changes no view by a gray level.
 HARDLY_SEEN = 1.0 / 255.0
-#: Fields of view in degrees. Beyond the wide one, perspective is so strong within one Gaussian that its linearization
-#: is inaccurate.
+#: Fields of view in degrees above and below which a view is reported. Above `WIDE`, perspective varies so much within
+#: one Gaussian that its linear approximation is inaccurate.
 WIDE, NARROW = 140.0, 1.0
-#: Fraction of a view without Gaussians from which on it is reported.
+#: Uncovered fraction of a view above which the view is reported.
 UNCOVERED = 0.01
 #: Aspect ratio of a style image beyond which it is reported.
 LONG_STYLE = 4.0
-#: Standard deviation of a style image below which it has no texture: one gray level.
+#: Standard deviation below which a style image counts as untextured: one gray level.
 FLAT_STYLE = 1.0 / 255.0
-#: Number of points that the scene's extent is estimated from.
+#: Number of Gaussians from which the scene's extent is estimated.
 _SAMPLE = 50_000
-#: Gaussians processed at a time; each needs some tens of bytes in float64.
+#: Number of Gaussians processed at a time. Each takes a few tens of bytes in float64.
 _PART = 1 << 17
 
 Subject = Literal["scene", "views", "style"]
@@ -66,7 +69,7 @@ class Finding:
         subject: Part of the input.
         what: Description of the property.
         count, total: Number of affected items, and of all items.
-        worst: Worst item and its value; empty if there is nothing to name.
+        worst: Worst item and its value as text; may be empty.
         done: Consequence for the job.
     """
 
@@ -93,9 +96,9 @@ def findings_of(
         cameras: Cameras of the views.
         style: Style image [H, W, 3] or mixture; None skips the style.
         near: Distance of the near plane in world units.
-        survey: Survey of the cameras, if there is one already; None renders them.
+        survey: Existing survey of the cameras; None renders the views.
     """
-    rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: builds nothing yet
+    rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: nothing is allocated yet
     found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, survey=survey)]
     pictures = () if style is None else StyleMixture.of(style).pictures
     return [*found, *(finding for picture in pictures for finding in style_findings(picture, cameras))]
@@ -114,14 +117,14 @@ def scene_findings(file: SceneFile) -> list[Finding]:
     ]
 
 
-#: Function that checks a slice of n Gaussians. For each question it returns a mask [n] bool of the extreme ones, and
-#: their values [n].
+#: Function that checks a slice of n Gaussians. For each question, it returns a mask [n] bool of extreme Gaussians and
+#: the checked values [n] of all Gaussians.
 _Look = Callable[[slice], Sequence[tuple[Tensor, Tensor]]]
 
 
 @dataclass(frozen=True)
 class _Question:
-    """Property checked for every Gaussian; the worst one has the largest, or the smallest, value."""
+    """Property checked for every Gaussian; its worst value is the largest if `largest` is set, else the smallest."""
 
     what: str
     done: str
@@ -136,7 +139,7 @@ class _Scene:
         self.center, self.extent = scene_extent(file.scene)
 
     def ask(self, look: _Look, *questions: _Question, subject: Subject = "scene") -> list[Finding]:
-        """Check the scene slice by slice, and return a finding for each question that applies to any Gaussian."""
+        """Check the scene slice by slice; return one finding per question with at least one extreme Gaussian."""
         counts = [0] * len(questions)
         worst = [(-math.inf, -1, math.nan)] * len(questions)  # (value to compare, Gaussian, value)
         for part in _parts(len(self.scene)):
@@ -270,14 +273,14 @@ def scene_extent(scene: Scene) -> tuple[Tensor, float]:
 def view_findings(
     file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float, survey: Survey | None = None
 ) -> list[Finding]:
-    """Return the findings about the views, and about the Gaussians that no view shows.
+    """Return the findings about the views, and about Gaussians that the views hardly or never show.
 
     Args:
         file: Scene file.
         cameras: Cameras of the views.
         rasterizer: Rasterizer of the scene.
         near: Distance of the near plane in world units.
-        survey: Survey of the cameras; None renders each of them, forward and backward.
+        survey: Existing survey of the cameras; None renders each view, forward and backward.
     """
     if survey is not None and survey.uncovered is not None:
         shown = [*_uncovered(survey.uncovered, cameras), *_seldom_seen(file, survey.total_blend_weights)]
@@ -289,7 +292,7 @@ def view_findings(
 def _of_views(
     what: str, values: list[float], extreme: list[bool], cameras: Sequence[Camera], done: str
 ) -> list[Finding]:
-    """Return a finding about the extreme views, if there are any; the worst one has the largest value."""
+    """Return a finding that names the extreme view with the largest value; empty if no view is extreme."""
     if not any(extreme):
         return []
     index = max((i for i, is_extreme in enumerate(extreme) if is_extreme), key=lambda i: values[i])
@@ -353,7 +356,7 @@ def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]
 def closer(means: Tensor, centers: Tensor, distance: float) -> list[int]:
     """Count the points [N, 3] within a distance of each center [V, 3] float64.
 
-    Points are first compared with all centers by x alone, which rules out almost all of them.
+    Points are first filtered by their x distance alone, which excludes almost all of them.
     """
     along = centers[:, 0].sort().values.contiguous()
     counts = [0] * len(centers)

@@ -1,9 +1,10 @@
-"""Independent judgment of a stylized scene, by features that no job optimizes.
+"""Independent judgment of a stylized scene, using features that no job optimizes.
 
-A job minimizes its own loss, so that loss cannot show whether the result is good. AlexNet (the network of LPIPS) is
-never optimized: its Gram matrices show how close textures are to the style's, its features how much content is left.
-Plain color statistics show how close the colors are. Only the area that Gaussians cover counts. Every view is judged on
-a black and on a white background, because the background of an object scan is arbitrary.
+A job's own loss cannot show whether its result is good, because the job minimizes this loss. No job optimizes the
+features of AlexNet (the network of LPIPS). Their Gram matrices measure how close textures are to the style; their
+change measures the loss of content. Color statistics measure how close colors are to the style. Only pixels covered by
+Gaussians count. Every view is judged on a black and on a white background, because the background of an object scan is
+arbitrary.
 """
 
 from __future__ import annotations
@@ -30,29 +31,29 @@ from sgsst_core.scene.pyramid import style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.regions import JobStyles
 
-#: Longer side in pixels of judged views. Results for one scene at several resolutions stay comparable, and a view of
-#: many megapixels costs no more than a view of one.
+#: Maximum longer side of judged views in pixels. The limit keeps results at different resolutions comparable, and
+#: bounds the cost of large views.
 JUDGED_SIDE = 1024
-#: Background colors, each judged in turn.
+#: Gray values of the backgrounds that each view is judged on: black and white.
 _BEHIND = (0.0, 1.0)
 #: Minimum coverage of judged views.
 _LEAST_COVERAGE = 1e-3
-#: Color distances are in 8-bit levels.
+#: Factor that converts color distances to 8-bit levels.
 _LEVELS = 255.0
 
 
 @dataclass(frozen=True)
 class Judgment:
-    """Means over views, and over a black and a white background.
+    """Judgment of a scene's colors, averaged over views and over a black and a white background.
 
     Attributes:
-        style: Mean over AlexNet's five layers of |G - G_style| / |G_style|, with Frobenius norms of Gram matrices (mean
-            over positions of F F^T); 0 for the style's own texture.
+        style: Relative distance |G - G_style| / |G_style| (Frobenius norm) of Gram matrices, averaged over AlexNet's
+            five layers. G is the mean of F F^T over positions. 0 for the style's own texture.
         color_distance: Frechet distance of the RGB colors in 8-bit levels: sqrt(|m - m_style|^2 + tr(C + C_style - 2 (C
-            C_style)^1/2)); 0 for the style's own mean and covariance.
-        content: LPIPS (AlexNet) against the unstylized scene; 0 for the same image.
-        features: Mean over layers of 1 - cosine between AlexNet's features and the unstylized scene's.
-        background_sensitivity: Mean over views of the difference in `style` between black and white background.
+            C_style)^1/2)); 0 if mean and covariance equal the style's.
+        content: LPIPS (AlexNet) against the unstylized scene; 0 for identical images.
+        features: 1 - cosine between AlexNet's features of the stylized and the unstylized scene, averaged over layers.
+        background_sensitivity: Absolute difference in `style` between black and white background, averaged over views.
         saturated: Fraction of the Gaussians with a color channel outside [0, 1].
     """
 
@@ -65,13 +66,14 @@ class Judgment:
 
 
 class Judge:
-    """Judge of the colors of one scene by one style.
+    """Judge that compares colors of one scene with one style.
 
     Args:
         lpips: LPIPS with AlexNet.
-        style: Image [H, W, 3] in 0 to 1, or a weighted mixture of several, whose Gram matrices and color statistics are
-            mixed. With regions, `style` and `color_distance` are means over the regions, weighted by their fraction of
-            a view; frozen regions do not count.
+        style: Style image [H, W, 3] in 0 to 1; or a weighted mixture of images, whose Gram matrices and color
+            statistics are averaged; or the styles of the scene's regions. For regions, `Judgment.style` and
+            `Judgment.color_distance` are averaged over regions, weighted by their fraction of a view, and frozen
+            regions are ignored.
         scene: Unstylized scene.
         rasterizer: Rasterizer of the scene.
         cameras: Cameras of the views. Views larger than `JUDGED_SIDE` are judged at that size. Views that see almost
@@ -107,7 +109,7 @@ class Judge:
 
     @torch.no_grad()
     def judge(self, sh_dc: Tensor) -> Judgment | None:
-        """Judge colors `sh_dc` [N, 3]. Returns None if there are no views.
+        """Judge colors `sh_dc` [N, 3]; return None if there are no views to judge.
 
         Raises:
             ValueError: If an image contains NaN or infinity.
@@ -129,7 +131,7 @@ class Judge:
         return [self._on(image, coverage, camera, behind) for behind in _BEHIND]
 
     def _view(self, camera: Camera, sh_dc: Tensor) -> list[tuple[float, float, float, float]]:
-        """Return (style, color_distance, content, features) on black and on white."""
+        """Return (style, color_distance, content, features) of a view, on black and on white background."""
         image, coverage = self._render(sh_dc, camera)
         before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
         weights = coverage.to(self._lpips.device)
@@ -163,13 +165,13 @@ class Judge:
         return self._rasterizer.render(view_colors(sh_dc, rest), camera), self._rasterizer.coverage(camera)
 
     def _on(self, image: Tensor, coverage: Tensor, camera: Camera, behind: float) -> Tensor:
-        """Return the image with another background color."""
+        """Return the image on another background color, clamped to 0 to 1."""
         return shown(image + (1 - coverage)[..., None] * (behind - self._background), camera, self._lpips.device)
 
     def _parts(self, camera: Camera, coverage: Tensor) -> list[tuple[_StyleJudge, Tensor, float]]:
         """Return each style's judge with its position weights [h, w] and its fraction of the judged area.
 
-        There is one entry per region in view, or one for the whole covered area without regions.
+        There is one entry per visible region. If the scene has no regions, one entry covers the whole area.
         """
         if self._maps is None:
             return [(self._judges[0], coverage, 1.0)]
@@ -180,7 +182,7 @@ class Judge:
 
 
 class _StyleJudge:
-    """Judge of images by one style."""
+    """Judge that compares images with one style."""
 
     def __init__(self, lpips: Lpips, style: StyleMixture) -> None:
         self._lpips = lpips
@@ -208,7 +210,10 @@ class _StyleJudge:
         return fmean(distances)
 
     def _grams(self, view: tuple[int, int]) -> list[Tensor]:
-        """Return the style's Gram matrices at the size that the loss uses for such a view, or AlexNet's minimum."""
+        """Return the style's Gram matrices for a view size.
+
+        Style images are resized as in the loss, but not below AlexNet's minimum size.
+        """
         if view not in self._targets:
             every = [self._grams_of(picture, view) for picture in self._style.pictures]
             self._targets[view] = [
@@ -218,7 +223,7 @@ class _StyleJudge:
         return self._targets[view]
 
     def _grams_of(self, picture: Tensor, view: tuple[int, int]) -> list[Tensor]:
-        """Return the Gram matrices of one image of the style."""
+        """Return the Gram matrices of one style image."""
         height, width = style_size((picture.shape[0], picture.shape[1]), view)
         enlarged = max(1.0, self._lpips.minimum_side / min(height, width))
         features = self._lpips.features(resize_area(picture, (round(height * enlarged), round(width * enlarged))))
@@ -236,12 +241,12 @@ def frechet_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]
 
     Args:
         first: Mean [3] and covariance [3, 3] of colors in 0 to 1.
-        second: Same for the other distribution.
+        second: Mean and covariance of the other distribution.
     """
     (mean, covariance), (other_mean, other) = first, second
     other_mean, other = other_mean.to(mean), other.to(covariance)
     root = _square_root(covariance)
-    # Trace of (C C')^1/2. Rounding can make the eigenvalue of a direction without spread negative.
+    # Trace of (C C')^1/2. Rounding can make an eigenvalue of 0 slightly negative.
     shared = torch.linalg.eigvalsh(root @ other @ root).clamp_min(0).sqrt().sum()
     spread = covariance.trace() + other.trace() - 2 * shared
     return _LEVELS * float(((mean - other_mean).square().sum() + spread.clamp_min(0)).sqrt())
@@ -272,7 +277,7 @@ def _pooled(coverage: Tensor, features: Tensor) -> Tensor:
 def _gram(features: Tensor, weights: Tensor) -> Tensor:
     """Return the weighted mean of F F^T over the positions of features [h, w, c], as [c, c] float64.
 
-    Sums run in the precision of the features, which is enough here: they cover one image, and all terms are at least 0.
+    Sums use the precision of the features. This is accurate enough for the nonnegative terms of a single image.
     """
     flat = features.flatten(0, 1)
     weighted = flat * weights.reshape(-1, 1).to(flat)

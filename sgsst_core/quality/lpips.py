@@ -1,11 +1,11 @@
-"""LPIPS, a learned perceptual distance between two images, as a number and as a map.
+"""LPIPS, a learned perceptual distance between two images, as a scalar and as a per-pixel map.
 
 Zhang, Isola, Efros, Shechtman, Wang, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR
 2018, equation 1. Features of five layers are scaled to unit length at every position, and
 
     d(x, y) = sum over layers l of the mean over positions of sum over channels c of w_lc (x_lc - y_lc)^2
 
-with learned weights w >= 0 (version 0.1 of the published heads, the one that papers report).
+with learned weights w >= 0 (version 0.1 of the published weights, which papers report).
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ _VGG16_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
 _ALEX_CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
 #: Convolutions of AlexNet that follow a 3x3 max pool of stride 2, counted from 1.
 _ALEX_POOLED = (2, 3)
-#: Minimum length in pixels of the shorter side. On smaller images the deepest layer has no cell.
+#: Minimum length in pixels of the shorter side. On smaller images, the output of the deepest layer is empty.
 _MINIMUM_SIDE = {"alex": 31, "vgg16": layer_stride("relu5_3")}
-#: Added to the length of feature vectors, as in the published code: zero vectors stay zero instead of becoming 0/0.
+#: Term added to the length of feature vectors, as in the published code: zero vectors stay zero instead of becoming
+#: 0/0.
 _LENGTH_EPS = 1e-10
 
 
@@ -62,8 +63,8 @@ class Lpips:
 
     Raises:
         SettingsError: If the network is unknown.
-        WeightsError: If the weights are missing or corrupt, or belong to a VGG16 with other channels than the published
-            one.
+        WeightsError: If the weights are missing or corrupt, or if the installed VGG16 differs in channels from the
+            published one.
     """
 
     def __init__(

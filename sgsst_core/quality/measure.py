@@ -1,4 +1,4 @@
-"""Measurements between the steps of a run: novel views, and the error of the job's approximations."""
+"""Quality measurements between the steps of a job: novel views, and the error of the job's approximations."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ from sgsst_core.stylizing.stylizer import Stylizer
 
 
 class Measurements:
-    """Measurements of a job; pass an instance as `loop.Callbacks.measure`.
+    """Quality measurements of a job; pass an instance as `loop.Callbacks.measure`.
 
-    Everything is built at first use. Results are appended to `Stylizer.measured`, one JSON-serializable entry per
-    moment: "step", "novel_views" and "approximation" (None if there is nothing to measure), "seconds". The unstylized
-    scene (step 0) is measured together with the next moment, so that the first step need not wait.
+    The job is measured after certain steps, called moments. Each moment appends a JSON-serializable entry to
+    `Stylizer.measured`, with the fields "step", "novel_views" and "approximation" (None if there is nothing to
+    measure), and "seconds". The unstylized scene (step 0) is measured together with the first moment, so that it does
+    not delay the first step. Networks and views are created at first use.
 
-    The plan decides how much is measured. If the first view takes longer than predicted, the first rank reduces this
-    once; the first entry records the decision and the seconds of a later moment ("level", "again"). The last entry
-    holds the `Judgment` of the result ("judged", with "before" and "after") if AlexNet is installed.
+    The plan chooses a level, which determines how much is measured. If the first view takes longer than predicted, the
+    first rank switches to a cheaper level once. The first entry records the level ("level") and the estimated seconds
+    of later moments ("again"). If AlexNet is installed, the last entry holds the `Judgment` of the result as "judged",
+    with the fields "before" and "after".
 
     Args:
         stylizer: Job, at any step.
@@ -61,7 +63,7 @@ class Measurements:
 
     @property
     def level(self) -> Level:
-        """Level that decides how much is measured."""
+        """Level, which determines how much is measured."""
         measured = self._stylizer.measured
         # Checkpoints without a level measured everything.
         return LEVELS[measured[0].get("level", 0) if measured else self._stylizer.plan.measuring]
@@ -77,7 +79,7 @@ class Measurements:
         return step > 0 and step in self.moments
 
     def seconds_left(self, step: int) -> float:
-        """Predict the seconds of the measurements from a step on, including the loss before and after the job."""
+        """Predict the seconds of all measurements from a step on, including the loss before and after the job."""
         expected, measured = self._stylizer.plan.prediction, self._stylizer.measured
         done = {entry["step"] for entry in measured}
         left = sum((moment >= step or not measured) and moment not in done for moment in self.moments)
@@ -93,7 +95,7 @@ class Measurements:
         return left * max(price, 0.0) + losses
 
     def evaluate(self, *, unstylized: bool = False) -> Evaluation:
-        """Return the exact loss on the evaluation views, for the present colors or the unstylized scene."""
+        """Return the exact loss on the evaluation views, for the current colors or the unstylized scene."""
         stylizer = self._stylizer
         if unstylized and not self.approximated:
             return stylizer.start()
@@ -104,7 +106,7 @@ class Measurements:
             return self.exact.evaluate(stylizer.evaluation_views, colors)
 
     def at_the_end(self) -> None:
-        """Measure the last moment, at whatever step the job stopped, unless it has been measured already."""
+        """Measure the step at which the job stopped, if it has not been measured yet, and judge the result."""
         if self.moments:
             with self._stylizer.measuring():
                 self._measure_start()
@@ -114,12 +116,12 @@ class Measurements:
                 self._judge()
 
     def __call__(self, stylizer: Stylizer) -> None:
-        """Measure now. Measure the unstylized scene too if it is due and still missing."""
+        """Measure the current colors if due, and the unstylized scene if it is required and not measured yet."""
         if stylizer.step == stylizer.total:
             stylizer.stylized()  # the result is needed anyway, so its time does not count as measuring
         with stylizer.measuring():
             self._measure_start()
-            if self.due(stylizer.step):  # decided again, because the first view's time can change it
+            if self.due(stylizer.step):  # not cached: timing the first view can change the level
                 self._measure(start=False)
 
     def _judge(self) -> None:
@@ -142,12 +144,12 @@ class Measurements:
             self._measure(start=True)
 
     def _measure(self, *, start: bool) -> None:
-        """Measure one moment: the present colors, or the unstylized scene."""
+        """Measure the current colors or the unstylized scene, and append an entry."""
         stylizer, started = self._stylizer, time.perf_counter()
         approximation = self.exact.gradient_error(start=start).as_dict() if self.approximated else None
         own: dict[str, Any] = {}
         if not stylizer.measured:
-            stylized = stylizer.stylized()  # timed as part of a moment, and cached for the next one
+            stylized = stylizer.stylized()  # timed as part of this moment; later calls return the cached colors
             seconds = time.perf_counter() - started
             own = self._first(stylizer.scene.sh_dc if start else stylized, seconds)
         moment = self._moment(stylizer.scene.sh_dc if start else stylizer.stylized(), own, start=start)
@@ -157,11 +159,11 @@ class Measurements:
         stylizer.measured.append(entry)
 
     def _moment(self, colors: Tensor, own: dict[str, Any], *, start: bool) -> dict[str, Any] | None:
-        """Measure the novel views with colors [N, 3]. Returns None if there are none.
+        """Measure the novel views with the given colors; return None if there are no views.
 
         Args:
             colors: Colors `sh_dc` [N, 3].
-            own: Fields of the first entry, which are completed in place; empty for later entries.
+            own: Additional fields of the first entry, extended in place; empty for later entries.
             start: Whether the colors are those of the unstylized scene.
         """
         stylizer, novel_views = self._stylizer, self._novel_views_of_job()
@@ -174,12 +176,12 @@ class Measurements:
         measured = novel_views.measure(colors.to(novel_views.rasterizer.device))
         if not start and (
             not stylizer.measured or stylizer.measured[0]["step"]
-        ):  # without a measured start, there is nothing to compare with
+        ):  # relative values require a measured start
             measured = replace(measured, gram_relative=None)
         return measured.as_dict(0, 0.0) if start else measured.as_dict(stylizer.step, stylizer.seconds)
 
     def _first(self, colors: Tensor, seconds: float) -> dict[str, Any]:
-        """Decide how much to measure, by timing one view. Returns the fields "level" and "again" of the first entry.
+        """Choose the level by timing one view; return the fields "level" and "again" of the first entry.
 
         Args:
             colors: Colors `sh_dc` [N, 3] to measure with.
@@ -199,7 +201,7 @@ class Measurements:
         return {"level": place, "again": again}
 
     def _trial(self, colors: Tensor, seconds: float) -> tuple[NovelViews, Prices]:
-        """Measure one view, and return it with the time it took.
+        """Measure one novel view; return it with the measured times.
 
         Args:
             colors: Colors `sh_dc` [N, 3] to measure with.
@@ -216,7 +218,7 @@ class Measurements:
         return novel_views, Prices(max(clock[-2] - clock[0] - again, 0.0), again, seconds)
 
     def _affordable(self, place: int, prices: Prices) -> int:
-        """Return the first level, from the plan's on, that is affordable at the measured times.
+        """Return the index of the first affordable level at or after `place`, given the measured times.
 
         The times include no compilation, because some steps have already run.
         """
@@ -224,13 +226,13 @@ class Measurements:
         if expected is None:
             return place
         allowed = novel_view_seconds(stylizer.settings.measure, expected)
-        # One view has been prepared by now, so measuring it at the end costs little.
+        # One view is already prepared, so measuring it at the end is always affordable.
         return min(choose_level(prices, allowed, stylizer.total, place), NOTHING - 1)
 
     def _source_of_statistics(self) -> Stylizer | ExactLoss:
-        """Return the source of network and style targets for Gram distances.
+        """Return the object whose loss and style targets define Gram distances.
 
-        It is exact, and has them even if the job optimizes another loss.
+        Its features are float32, and it has Gram statistics even if the job optimizes another loss.
         """
         if not has_statistics(self._stylizer.settings.style_loss):
             return ExactLoss(self._stylizer, "sos")
@@ -242,7 +244,7 @@ class Measurements:
         return self._novel_views
 
     def _make(self, views: int, lpips: Lpips | None = None) -> NovelViews:
-        """Make novel views, at most `views` of them."""
+        """Create the novel views of the job, at most `views` of them."""
         stylizer = self._stylizer
         if self._seen_by is None:
             scene = stylizer.scene.without_zero_bands()

@@ -1,8 +1,8 @@
 """Quality on novel views, measured at intervals during a run.
 
 Novel views lie halfway between neighboring cameras, so no camera has to be held out of training. Two measures are
-computed: the distance of their style from the style image's (the Gram terms of the SOS loss), and how well they agree
-with each other (multi-view consistency). Geometry is frozen, so coverage and warps never change and are cached.
+computed: the distance of the views from the style (the Gram terms of the SOS loss), and their multi-view consistency.
+Geometry is frozen, so coverage and warps never change and are cached.
 """
 
 from __future__ import annotations
@@ -41,29 +41,31 @@ from sgsst_core.stylizing.regions import RegionMaps
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
 MOST_VIEWS = 4
-#: Distance in median steps beyond which two cameras are not neighbors: the capture was interrupted between them.
+#: Distance, relative to the median distance of consecutive cameras, beyond which two cameras are not neighbors. The
+#: capture was probably interrupted between them.
 JUMP = 4.0
-#: Rotation between two cameras beyond which they are not neighbors, about the field of view of a photo. Halfway between
-#: such cameras, nothing that either sees need be in view.
+#: Rotation between two cameras beyond which they are not neighbors: about the field of view of a photo. A view halfway
+#: between such cameras may show nothing that either of them sees.
 LARGEST_TURN = math.radians(60)
-#: Factor by which the median depth and coverage of a novel view may fall outside the range of its neighbors'. Inside an
-#: object or behind a wall they fall farther outside; on the chord of an arc of 60 degrees they change by at most a
-#: third.
+#: Maximum factor by which the median depth and the coverage of a novel view may lie outside the range of its neighbors'
+#: values. They exceed it inside an object or behind a wall. On the chord between two cameras of a 60-degree arc, they
+#: change by at most a third.
 LIKENESS = 2.0
-#: Longer side in pixels of the small renders for this check.
+#: Longer side in pixels of the small renders that are checked for depth and coverage.
 _OUTLOOK_SIDE = 160
-#: Maximum number of Gaussians in this check. Larger scenes are sampled; the sample is enlarged to cover the same area.
+#: Maximum number of Gaussians in these renders. Larger scenes are sampled, and sampled Gaussians are enlarged to cover
+#: the same area.
 _OUTLOOK_GAUSSIANS = 250_000
 #: Tolerance for the rounding of rotations in camera files.
 _COSINE_ROUNDING = 1e-6
 
 
 def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
-    """Return the pairs of neighboring cameras to place novel cameras between.
+    """Return the pairs of neighboring cameras between which novel cameras are placed.
 
-    Cameras are taken in the order of the list. If most adjacent cameras are not neighbors (see `JUMP` and
-    `LARGEST_TURN`), the list is not in capture order, and a walk that always continues to the nearest remaining camera
-    replaces it. The result is empty for fewer than two cameras, and omits pairs with the same pose.
+    Adjacent cameras of the list are paired. If most of them are not neighbors (see `JUMP` and `LARGEST_TURN`), the list
+    is assumed not to be in capture order, and a greedy walk to the nearest remaining camera replaces it. Pairs with the
+    same pose are omitted. The result is empty for fewer than two cameras.
     """
     if len(cameras) < 2:
         return []
@@ -87,7 +89,7 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
 
 
 def _walk(centers: Tensor, rotations: Tensor) -> list[int]:
-    """Return an order of the cameras that always continues to the nearest one left.
+    """Return the indices of the cameras along a greedy walk to the nearest remaining camera.
 
     Cameras with a similar rotation take precedence.
 
@@ -115,12 +117,13 @@ def _similarly_turned(rotations: Tensor, rotation: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class NovelViewMoment:
-    """Result of one measurement.
+    """Measurement of the novel views after one step.
 
     Attributes:
-        gram: Gram distance by scale: mean over views of the sum over layers of w_G mean((G - G_v)^2) (see `loss`).
-        gram_relative: Mean of `gram` over scales, relative to the run's first measurement; None without views.
-        short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
+        gram: Gram distance by scale: sum over layers of w_G mean((G - G_v)^2), averaged over views (see
+            `sgsst_core.loss`).
+        gram_relative: Mean of `gram` over scales, relative to the run's first measurement; None if there are no views.
+        short, long: Consistency of pairs of views 1 and 7 apart; None if there is no such pair.
     """
 
     gram: dict[int, float]
@@ -144,19 +147,20 @@ class NovelViews:
 
     Args:
         cameras: Cameras of the job.
-        covered: Indices of the cameras that see anything.
+        covered: Indices of the cameras that see at least one Gaussian.
         scene: Scene to stylize. Gaussians missing from it are missing in the novel views too.
-        rasterizer: Rasterizer of the scene, preferably not shared with the job: in a shared `cached` rasterizer,
-            weights of novel views would displace those of views that recur in every round.
-        loss: Loss that supplies network, memory budget and partition. It is not evaluated, so its timer does not run.
-        style_targets: Function that returns the style statistics for views of a camera's size, in the loss's units.
+        rasterizer: Rasterizer of the scene, preferably not shared with the job: in a shared `cached` rasterizer, blend
+            weights of novel views would evict those of the job's own views.
+        loss: Loss that supplies network, memory budget and tile size. A separate loss with the same properties is
+            evaluated, so the timer of this one does not run.
+        style_targets: Function that returns the style targets of `loss` for views of a camera's size.
         weighted: Whether to weight statistics by rendered coverage, as the job does.
         lpips: LPIPS network; None skips LPIPS.
         first: `NovelViewMoment.gram` of the run's first measurement, for a resumed run; None if there is none yet.
         most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
         memory: Memory budget in bytes for coverage, colors, warps and images. What does not fit is recomputed.
-        rasterizer_of: Function that makes a rasterizer of a sample of the scene, for the first check of the views of a
-            large one; None uses the whole scene.
+        rasterizer_of: Function that creates a rasterizer for a sample of the Gaussians, used to check depth and
+            coverage in large scenes; None uses the whole scene.
         maps: Region maps that match `style_targets`; None if the scene has no regions.
 
     Attributes:
@@ -164,7 +168,7 @@ class NovelViews:
         views: Indices of the views whose Gram distance is measured, at most `most`. If empty, there is nothing to
             measure.
         pairs: Pairs of views to compare, at most `most`, by gap.
-        first: As above; set by the first measurement.
+        first: `NovelViewMoment.gram` of the run's first measurement; None before it.
     """
 
     def __init__(
@@ -217,7 +221,7 @@ class NovelViews:
         """Choose the views and pairs to measure, evenly spread; views from inside an object are dropped."""
         count = len(self.cameras)
         pairs = {gap: view_pairs(count, gap, most) for gap in (SHORT_RANGE, LONG_RANGE)}
-        # Views start with the first ones of the short pairs: these are rendered anyway and spread just as evenly.
+        # Use the first views of the short-range pairs: they are rendered anyway, and spread just as evenly.
         views = [i for i, _ in pairs[SHORT_RANGE]] or list(range(min(count, most)))
         used = {*views, *(index for chosen in pairs.values() for pair in chosen for index in pair)}
         rough, rasterizer = self.scene, self.rasterizer
@@ -242,7 +246,7 @@ class NovelViews:
     def _is_clear(
         self, camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[[Camera], tuple[float, float | None]]
     ) -> bool:
-        """Return whether a novel camera sees much the same as its neighbors, not the inside of an object."""
+        """Return whether depth and coverage of a novel view resemble its neighbors', unlike inside an object."""
         (covered, depth), *others = (outlook(view) for view in (camera, *parents))
         return (
             covered > 0
@@ -314,7 +318,7 @@ class NovelViews:
 
 
 def _outlook(camera: Camera, scene: Scene, rasterizer: Rasterizer) -> tuple[float, float | None]:
-    """Return the mean coverage of a view, 0 if it sees nothing, and its median depth, None if unknown."""
+    """Return a view's mean coverage (0 if it sees nothing) and its median depth (None if unknown)."""
     small = resized(camera, min(_OUTLOOK_SIDE, camera.side))
     coverage = rasterizer.coverage(small)
     seen = sees_something(coverage)
@@ -324,7 +328,7 @@ def _outlook(camera: Camera, scene: Scene, rasterizer: Rasterizer) -> tuple[floa
 
 
 def _alike(value: float, others: list[float]) -> bool:
-    """Return whether a value is within or near the range of the others; true if there are no others."""
+    """Return whether a value is within `LIKENESS` of the range of `others`; true if `others` is empty."""
     return not others or min(others) / LIKENESS <= value <= LIKENESS * max(others)
 
 

@@ -20,14 +20,15 @@ _VIEWS, _SIDE = 3, 256
 
 @dataclass(frozen=True)
 class PackedLoss:
-    """Quality loss of a compressed file relative to the scene it contains.
+    """Quality loss of a compressed file relative to the original scene.
 
     Attributes:
         name: Name of the file.
         form: Format of the file.
         size: Size in bytes.
         views: Names of the compared views.
-        psnr: Peak signal-to-noise ratio of their images in dB, with colors clamped to 0 to 1; None if all are equal.
+        psnr: PSNR in dB of these views against those of the original scene, with colors clamped to 0 to 1; None if all
+            are identical.
     """
 
     name: str
@@ -56,7 +57,7 @@ def measure_packed(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     near: float,
 ) -> PackedLoss:
-    """Read a compressed file back and compare small renders of some views on the CPU.
+    """Read a compressed file back, and compare small CPU renders of some views with the original scene.
 
     Args:
         path: Compressed file.

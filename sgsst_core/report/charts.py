@@ -107,7 +107,7 @@ def scale_name(scale: int) -> str:
 
 
 def draw_line(axes: Axes, history: History, against: Against, values: Floats, color: str, label: str) -> None:
-    """Draw a running mean over one round of views, phase by phase, in front of the range of the values [steps]."""
+    """Draw the running mean of values [steps] over one round of views, phase by phase, with their range shaded."""
     for _, part in history.phases:
         line = thinned(history.x[against][part], values[part], history.round_length, history.place_width(against))
         if not len(line.x):
@@ -118,10 +118,9 @@ def draw_line(axes: Axes, history: History, against: Against, values: Floats, co
 
 
 def draw_points(axes: Axes, x: Floats, values: Floats, **look: Any) -> None:
-    """Draw points [n] that may lie on the border of the axes.
+    """Draw points [n] that may lie on the border of the axes; do nothing if `x` is empty.
 
-    Nothing is drawn without points, because matplotlib's layout extends an unclipped empty line to the corner of the
-    figure.
+    matplotlib's layout would extend an empty, unclipped line to the corner of the figure.
     """
     if len(x):
         axes.plot(x, values, clip_on=False, **look)
@@ -162,7 +161,7 @@ def set_log_y(axes: Axes, drawn: Sequence[Floats]) -> None:
 
 
 def _set_ticks(axis: Axis, limits: tuple[float, float]) -> None:
-    """Set ticks with plain numbers: decades, plus 2 and 5 if there are few, and linear ones within a decade."""
+    """Set ticks with plain numbers: at decades, also at 2 and 5 if decades are few, and linearly within one decade."""
     decades = math.log10(limits[1]) - math.log10(limits[0])
     axis.set_minor_locator(NullLocator())
     if decades < 0.8:
@@ -175,7 +174,7 @@ def _set_ticks(axis: Axis, limits: tuple[float, float]) -> None:
 
 
 def draw_legend(figure: Figure, in_row: int = 3) -> None:
-    """Draw a legend below the figure, with each label once; nothing if there are no labels."""
+    """Draw a legend below the figure, with each label once; do nothing if there are no labels."""
     named: dict[str, Artist] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

@@ -24,8 +24,8 @@ _CELL_HEIGHT = 330
 _MAX_CELL_WIDTH = 520
 _GAP = 12
 _LABEL = 18
-#: Sheet of views alone: maximum number of views, their longer side, aspect ratio of the sheet, and maximum number of
-#: Gaussians.
+#: Sheet of views without a style: maximum number of views, their longer side, aspect ratio of the sheet, and maximum
+#: number of Gaussians.
 _MOST_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
 
 
@@ -41,8 +41,7 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
     with torch.no_grad():
         for index in stylizer.evaluation_views:
             dcs = (views.scene.sh_dc.to(device), stylizer.shown())
-            # The rasterizer is called directly: one rank writes the sheet, and the others do not take part in its
-            # renders.
+            # Call the rasterizer directly, because only one rank writes the sheet and the other ranks do not render.
             camera = views.cameras[index]
             renders = [_picture(views.rasterizer.render(views.colors(index, dc), camera)) for dc in dcs]
             pairs.append((camera, renders))
@@ -61,7 +60,7 @@ def write_views(
 ) -> None:
     """Write a JPEG with small renders of at most 48 cameras, spread evenly over the list.
 
-    Large scenes are represented by a sample of their Gaussians (`sampled`).
+    Large scenes are rendered from a sample of their Gaussians (see `sampled`).
 
     Args:
         path: Path of the JPEG.

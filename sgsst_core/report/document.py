@@ -36,7 +36,7 @@ class Sources:
 
     Attributes:
         scene: Scene file.
-        dropped: Number of Gaussians dropped from the file because of non-finite values.
+        dropped: Number of Gaussians dropped from the file because of invalid values.
         styles: Style images.
         cameras: Camera file or folder; None for an orbit.
         photos: Folder of the content images; None for unstylized renders.
@@ -64,7 +64,7 @@ def build_report(
     Args:
         stylizer: Job after its last step.
         sources: Origin of the job's inputs.
-        stopped: Return value of `run`.
+        stopped: Reason why the job stopped, as returned by `loop.run`.
         before: Loss of the unstylized scene on the stylizer's `evaluation_views`.
         after: Loss of the stylized scene on the same views.
         findings: Findings about scene, views and style.
@@ -145,10 +145,10 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
 
 
 def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
-    """Return the style images as they were used, with their weights."""
+    """Return the style images that the job used, with their sizes and weights."""
     style, regions, paths = stylizer.style, stylizer.regions, sources.styles
     if regions is not None and not regions.mapped and regions.every[regions.active[0]].style is not None:
-        paths = tuple(map(Path, style.names))  # a single region with a style of its own covers everything
+        paths = tuple(map(Path, style.names))  # a single active region with its own style covers the whole scene
     return [
         {"path": str(path), "width": picture.shape[1], "height": picture.shape[0], "weight": weight}
         for path, picture, weight in zip(paths, style.pictures, style.weights, strict=True)
@@ -198,17 +198,19 @@ def plan_json(plan: Plan) -> dict[str, Any]:
 
 
 def _graphs_json(stylizer: Stylizer) -> dict[str, Any] | None:
-    """Return the state of the CUDA graphs of the loss; None if the plan has none."""
+    """Return the state of the CUDA graphs of the loss; None if the plan does not use any."""
     graphs = stylizer.graphs
     return None if graphs is None else {"captured": graphs.captured, "problem": graphs.problem}
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:
-    """Return the measured counterparts of the plan's prediction.
+    """Return the measured values that correspond to the plan's prediction.
 
-    Times are the median seconds of a step in either phase, for views visited before; the additional seconds of a first
-    visit; the median seconds spent waiting for other ranks in the second phase; and the seconds spent measuring. The
-    speedup over one rank compares with its predicted time. Memory is the peak of the process and of its GPU in bytes.
+    `seconds` and `seconds_coarse` are the median seconds of a step on a view visited before, in the phase on all scales
+    and on the coarsest one. `first_visit` and `first_visit_coarse` are the additional seconds of first visits.
+    `communication` is the median seconds per step spent waiting for other ranks, in the phase on all scales. `speed_up`
+    is relative to the predicted time of one rank. `measuring` is the total seconds spent on measurements. Peak memory
+    is that of the process and of its GPU, in bytes.
     """
     seconds, first_visits = zip(*(_step_seconds(stylizer, stage) for stage in ("sos", "coarse")), strict=True)
     waited = [record.parts.get("communication", 0.0) for record in stylizer.history if record.stage == "sos"]
@@ -230,9 +232,10 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
 def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float | None]:
     """Return the median seconds of a phase's steps on views visited before, and the extra seconds of first visits.
 
-    The extra seconds are a mean over first visits. If the phase has other first visits, the job's first step is
-    skipped, because it prepares the style too. If no view recurs, or a step takes several views (its record names only
-    one), the first value is the median over all steps, not counting their recorded preparation, and the second is None.
+    The extra seconds are averaged over first visits. The job's first step is excluded if the phase has other first
+    visits, because it also prepares the style. If no view is visited twice, or if steps use several views (records name
+    only one of them), the first value is the median over all steps without their recorded preparation, and the second
+    value is None.
     """
     again: list[float] = []
     first: list[float] = []
@@ -254,7 +257,7 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float |
 
 
 def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
-    """Return what was measured besides the steps, its time, and its fraction of the steps' time."""
+    """Return the number of measurements, their time, and its ratio to the time of the steps."""
     seconds, expected = stylizer.seconds_by_part.get("measuring", 0.0), stylizer.plan.prediction
     share = stylizer.settings.measure
     return {
@@ -272,7 +275,7 @@ def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
 
 
 def sent_json(history: Sequence[StepRecord]) -> dict[str, dict[str, int]] | None:
-    """Return the median bytes per step that the first rank sends, by phase and kind; None for a single rank."""
+    """Return the median bytes that the first rank sends per step, by phase and kind; None for a single rank."""
     found: dict[str, dict[str, int]] = {}
     for stage in ("coarse", "sos"):
         steps = [record.sent for record in history if record.stage == stage and record.sent]
@@ -281,16 +284,18 @@ def sent_json(history: Sequence[StepRecord]) -> dict[str, dict[str, int]] | None
     return found or None
 
 
-#: Relative losses for which the report says when they were reached.
+#: Relative losses for which the report states the time of reaching them.
 _REACHED = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 
 
 def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
-    """Relate loss to time: the mean loss over the last round of views, relative to the start.
+    """Summarize how the loss fell over time.
+
+    The loss is the mean over the last round of views, relative to the unstylized scene.
 
     Returns:
-        `relative`: Loss at the end. `reached`: Seconds and step at which it fell to 0.5, 0.2, 0.1 and so on.
-            `last_tenth`: Change over the last tenth of the time. None if no step was made on all scales.
+        `relative`: Final loss. `reached`: Seconds and step at which the loss first fell to 0.5, 0.2, 0.1 and so on.
+        `last_tenth`: Loss before and after the last tenth of the time. None if no step used all scales.
     """
     records = [record for record in stylizer.history if record.stage == "sos"]
     if not records:
@@ -311,7 +316,7 @@ def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
 
 
 def novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the quality on novel views at each moment; None if there are none."""
+    """Return the quality on novel views at each moment; None if no novel view was measured."""
     moments = [entry["novel_views"] for entry in measured if entry["novel_views"]]
     if not moments:
         return None

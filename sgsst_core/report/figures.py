@@ -51,9 +51,9 @@ class PageFigure:
     """Chart of the page.
 
     Attributes:
-        name: Prefix of identifiers, in lower-case letters.
-        title, caption: Text, not HTML.
-        svg: <svg> element for each x axis.
+        name: Prefix of element IDs in the SVG, in lower-case letters.
+        title, caption: Plain text, not HTML.
+        svg: <svg> element by quantity of the x axis.
     """
 
     name: str
@@ -63,7 +63,7 @@ class PageFigure:
 
 
 def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
-    """Draw the charts that a report has values for; returns none if no step was made."""
+    """Draw the charts that a report has values for; return an empty list if no step was made."""
     if not report["history"]:
         return []
     history = history_of(report)
@@ -127,7 +127,7 @@ def _undrawn(report: dict[str, Any]) -> str:
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[Figure, Against], None], rows: int = 1) -> PageFigure:
-    """Draw a chart for each x axis, at the same size, so that the page does not move when they are switched."""
+    """Draw a chart for each x axis at the same size, so that switching between them does not shift the page."""
     svg = {}
     for against in AGAINST:
         with matplotlib.rc_context(STYLE):
@@ -143,8 +143,8 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
     grid = list(figure.subplots(math.ceil(count / 2), min(count, 2), sharey=True, squeeze=False).flat)
     everything = [values for terms in history.terms.values() for values in terms.values()]
     for axes, (scale, terms) in zip(grid, history.terms.items(), strict=False):
-        # Each panel has its own x axis: after a first phase on the coarsest scale, the others would be a sliver at the
-        # end of a shared one.
+        # Each panel has its own x limits. With shared limits, a first phase on the coarsest scale would squeeze the
+        # curves of all other scales into the end of the axis.
         there = history.x[against][np.any([~np.isnan(values) for values in terms.values()], axis=0)]
         own = replace(history, limits={**history.limits, against: log_limits(there, X_MARGIN)})
         for term, values in terms.items():
@@ -180,7 +180,7 @@ def _draw_consistency(figure: Figure, against: Against, history: History, moment
 def _draw_approximations(figure: Figure, against: Against, history: History, probes: Sequence[dict[str, Any]]) -> None:
     axes = figure.subplots()
     steps = column([probe.get("step") for probe in probes])
-    # The probes' own seconds are the time of one gradient. When they ran follows from their step.
+    # A probe's `seconds` is the duration of one gradient. Its position on the time axis is interpolated from its step.
     x = steps if against == "steps" else np.interp(steps, history.x["steps"], history.x["seconds"])
     errors = column([probe.get("relative_error") for probe in probes])
     shown = drawable(x) & drawable(errors)

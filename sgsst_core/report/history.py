@@ -16,9 +16,10 @@ from sgsst_core.loss.terms import TERMS
 Floats = NDArray[np.float64]
 Against = Literal["seconds", "steps"]
 AGAINST: tuple[Against, ...] = ("seconds", "steps")
-#: Number of bins of an x axis, less than a point of print wide. Steps in the same bin are drawn as one point.
+#: Number of bins of an x axis, each narrower than a typographic point. Steps in the same bin are drawn as one point.
 PLACES = 300
-#: Range of values on logarithmic axes. Ticks are searched some decades beyond it, which must also fit float64.
+#: Range of values on logarithmic axes. matplotlib searches for ticks some decades beyond it, which must fit float64
+#: too.
 _LEAST, _MOST = 1e-200, 1e200
 #: Factor by which the x axis extends beyond the first and the last step.
 X_MARGIN = 1.05
@@ -29,9 +30,9 @@ class Thinned:
     """Steps grouped into bins of an axis, each array [bins] float64.
 
     Attributes:
-        x: Geometric mean of the bin's steps.
-        mean: Geometric mean of their running means.
-        low, high: Minimum and maximum of their values.
+        x: Geometric mean of the x positions of a bin's steps.
+        mean: Geometric mean of the running means at these steps.
+        low, high: Minimum and maximum of the values at these steps.
     """
 
     x: Floats
@@ -42,17 +43,17 @@ class Thinned:
 
 @dataclass(frozen=True)
 class History:
-    """History of a report by column, each array [steps] float64, NaN where there is no value.
+    """History of a report by column. Each array is [steps] float64, with NaN for missing values.
 
     Attributes:
-        x: Seconds and steps so far.
-        limits: Ends of either x axis, including the measurements of novel views.
-        phases: Name and range of each run of equal stages.
+        x: Elapsed seconds, and number of steps.
+        limits: Limits of each x axis, which include the measurements of novel views.
+        phases: Name of each phase's stage, and slice of its steps.
         terms: Loss terms by scale and name.
         relative: Loss by scale, relative to the unstylized scene.
         mean_relative: Mean over scales, relative to the unstylized scene; NaN for steps on a single scale.
         memory: Memory of the process in bytes.
-        device_memory: Peak memory of its tensors on the GPU so far, in bytes.
+        device_memory: Peak memory of the process's tensors on the GPU so far, in bytes.
         round_length: Number of steps in which every view occurs once.
     """
 
@@ -143,12 +144,12 @@ def _phases(stages: Sequence[str]) -> list[tuple[str, slice]]:
 
 
 def drawable(values: Floats) -> NDArray[np.bool_]:
-    """Return which values a logarithmic axis can show."""
+    """Return the mask [n] bool of the values that a logarithmic axis can show."""
     return np.isfinite(values) & (values >= _LEAST) & (values <= _MOST)
 
 
 def log_limits(values: Floats, margin: float) -> tuple[float, float]:
-    """Return the ends of a logarithmic axis for the values; arbitrary ones if there is nothing to show."""
+    """Return the limits of a logarithmic axis that shows the values; arbitrary limits if there is nothing to show."""
     shown = values[drawable(values)]
     if not len(shown):
         return 0.1, 1.0
@@ -182,7 +183,7 @@ def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
 
 
 def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
-    """Return the geometric mean of the `window` values around each index, or of fewer near the ends."""
+    """Return the geometric mean of the `window` values around each index, or of fewer values near the ends."""
     logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
     sums = np.concatenate([[0.0], np.cumsum(logs)])
     places = np.arange(len(logs))

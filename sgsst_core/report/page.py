@@ -28,7 +28,7 @@ from sgsst_core.report.tables import (
 from sgsst_core.report.wording import NOTHING, byte_count, duration, number, percent
 from sgsst_core.stylizing.state import BEFORE_STEPS
 
-#: Maximum number of list members shown in the collapsed section; the rest is counted.
+#: Maximum number of list members shown in the collapsed section, followed by their total number.
 _LIST = 40
 #: Fields of a report that have a section of their own on the page.
 _PLACED = ("history", "novel_views", "approximations", "bought", "findings", "plan", "seconds_by_part")
@@ -73,7 +73,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
     """Render the page as HTML, without external references and without scripts.
 
     Args:
-        report: Report of version 2, from `build_report` or read from report.json.
+        report: Report from `build_report` or report.json.
         sheet: Contact sheet as JPEG; None omits it.
         views: Sheet of all views as JPEG; None omits it.
     """
@@ -91,7 +91,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         against=AGAINST,
         places=PLACES,
         round_length=report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"]),
-        # Text in the figures is fixed or escaped by the XML writer, so they are safe as markup.
+        # All text in the figures is constant or escaped by the XML writer, so the SVGs are safe as markup.
         figures=[(figure, {against: Markup(figure.svg[against]) for against in AGAINST}) for figure in figures],
         losses=loss_table(report),
         novel_views=novel_views_table(report),
@@ -109,7 +109,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
 
 
 def _style_names(report: dict[str, Any]) -> str:
-    """Return the file names of the style images. Old reports have a single one under "style"."""
+    """Return the file names of the style images. Reports of older versions have a single image, under "style"."""
     styles = report.get("styles", [report["style"]])
     names = [PurePath(style["path"]).name for style in styles]
     if len(names) == 1:
@@ -122,7 +122,7 @@ def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None, view
 
     Args:
         path: Path of the page.
-        report: Report of version 2, from `build_report` or read from report.json.
+        report: Report from `build_report` or report.json.
         sheet_path: Contact sheet, JPEG; None omits it.
         views_path: Sheet of all views, JPEG; None omits it.
 
@@ -131,12 +131,12 @@ def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None, view
     """
     page = render_page(report, _sheet_bytes(sheet_path), _sheet_bytes(views_path))
     with atomic_path(path) as temporary:
-        # File names that are not valid Unicode are shown with question marks instead of failing the page.
+        # Invalid Unicode in file names is shown as question marks instead of raising an error.
         temporary.write_bytes(page.encode("utf-8", errors="replace"))
 
 
 def _sheet_bytes(path: Path | None) -> bytes | None:
-    """Read a sheet, or return None if there is none."""
+    """Return the bytes of a sheet, or None if no path is given."""
     try:
         return path.read_bytes() if path else None
     except OSError as error:
@@ -173,7 +173,7 @@ def _result(report: dict[str, Any]) -> dict[str, str]:
 
 
 def _bought(report: dict[str, Any]) -> dict[str, Any] | None:
-    """Describe which loss was reached when, and what the last tenth of the time gained."""
+    """Format when each relative loss was reached, and how the loss changed in the last tenth of the time."""
     bought = report.get("bought")
     if not bought:
         return None
@@ -207,7 +207,7 @@ def _approximations(report: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:
-    """Return the kinds of time with their percentage, longest first."""
+    """Return each kind of time with its seconds and percentage, longest first."""
     found = report.get("seconds_by_part") or {}
     parts = {_PARTS.get(name, name): seconds for name, seconds in found.items()}
     measured = sum(parts.values())
@@ -234,7 +234,7 @@ def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]
 
 
 def _flat(name: str, value: Any) -> Iterable[tuple[str, str]]:
-    """Yield nested objects as (name, value), with names as in the JSON file: `after.scales.0.gram`."""
+    """Yield the values of nested objects as (name, value), with dotted names such as `after.scales.0.gram`."""
     if isinstance(value, dict) and value:
         for key, inner in value.items():
             yield from _flat(f"{name}.{key}" if name else str(key), inner)

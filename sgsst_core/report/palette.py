@@ -25,5 +25,5 @@ PAGE = {
 
 
 def color_of(place: int) -> str:
-    """Return the color of a list index; colors repeat after the last one."""
+    """Return the color of the data series with the given index; colors repeat after the last one."""
     return COLORS[place % len(COLORS)]

@@ -1,4 +1,4 @@
-"""Figures as inline SVG, several of which can share a page.
+"""Conversion of figures to inline SVG that can share a page with other figures.
 
 Colors are CSS variables with the printed color as fallback (`var(--c-222222, #222222)`), so a page can replace them on
 dark screens. Text uses the page's font.
@@ -20,12 +20,12 @@ _LONG_DECIMAL = re.compile(r"(\.\d\d)\d+")
 
 
 def inline(figure: Figure, name: str, label: str) -> str:
-    """Return a figure as an <svg> element that can share a page with others.
+    """Return a figure as an <svg> element that can share a page with other figures.
 
-    Its identifiers are prefixed with its name, and it contains no style sheet.
+    Its element IDs are prefixed with `name`, and it contains no style sheet.
     """
     file = io.BytesIO()
-    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # not needed, and it names other servers
+    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # not needed, and has URLs of other servers
     figure.savefig(file, format="svg", transparent=True, metadata=metadata)
     root = ElementTree.fromstring(file.getvalue())
     for parent in root.iter():
@@ -55,9 +55,10 @@ def _references(root: ElementTree.Element) -> set[str]:
 
 
 def _rewritten(key: str, value: str, name: str) -> tuple[str, str]:
-    """Return an attribute without its XML namespace.
+    """Return an attribute as it appears on the page.
 
-    Identifiers are prefixed with the figure's name, and coordinates are cut to hundredths of a point.
+    Its XML namespace is removed, IDs are prefixed with the figure's name, and coordinates are truncated to hundredths
+    of a point.
     """
     key = _NAMESPACE.sub("", key)
     if key == "id":

@@ -26,7 +26,7 @@ class Table:
 
 
 def loss_table(report: dict[str, Any]) -> Table:
-    """Return the loss before and after, as mean over scales and for each scale."""
+    """Return the loss before and after the job, as a mean over scales and for each scale."""
     loss = report["loss"]
     rows = [["mean over scales", loss["before"]["total"], loss["after"]["total"], loss["relative"]]]
     for scale, before in loss["before"]["scales"].items():
@@ -107,7 +107,7 @@ def decision_table(report: dict[str, Any]) -> Table:
     )
 
 
-#: Rows for first visits; the other rows are about views visited before.
+#: Titles of rows about first visits. The other rows apply to views visited before.
 _VISITS = {"first_visit": "first visit of a view, in addition", "first_visit_coarse": "the same in phase 1"}
 
 
@@ -174,7 +174,7 @@ def finding_table(report: dict[str, Any]) -> Table | None:
 
 
 def approximation_table(report: dict[str, Any]) -> Table | None:
-    """Return all comparisons with the exact gradient; None if there are none."""
+    """Return all comparisons of the job's gradient with the exact one; None if there are none."""
     moments = (report.get("approximations") or {}).get("moments") or []
     names = report["cameras"]["names"]
     rows = []

@@ -1,4 +1,4 @@
-"""Formatting of numbers for people."""
+"""Human-readable formatting of numbers."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 
 #: Text for a missing value.
 NOTHING = "–"
-#: Space between a number and its unit, where a line must not break.
+#: No-break space between a number and its unit.
 _GAP = "\u00a0"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Format a number with `digits` significant digits; below 1e9, all integer digits are kept."""
+    """Format a number with `digits` significant digits; below 1e9, integer digits are never rounded away."""
     if value is None:
         return NOTHING
     if not math.isfinite(value):

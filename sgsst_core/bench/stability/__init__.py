@@ -1,7 +1,7 @@
-"""Numerically hard cases, as one table that the tests and the benchmark share.
+"""Numerically hard cases, shared by the tests and the benchmark.
 
-Each case describes what is extreme, measures an error against a float64 reference, and states a bound for it. For input
-that must be refused, the case checks the refusal.
+Each case describes its extreme input, measures an error against a float64 reference, and states a bound for this error.
+If the input must be rejected, the case checks that it is.
 """
 
 from __future__ import annotations

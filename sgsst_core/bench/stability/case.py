@@ -33,10 +33,10 @@ Group = Literal[
 
 #: Error bound of float32 images and coverage against float64, relative to the brightest color.
 IMAGE_BOUND = 1e-4
-#: Distance to a cutoff within which float32 may skip what float64 keeps: a discontinuity, not an error.
+#: Distance to a cutoff within which float32 and float64 may decide differently. Such a discontinuity is not an error.
 CLOSE_TO_CUT = 2e-5
-#: Largest such jump, relative to the color: a contribution just above ALPHA_MIN, or a Gaussian that crosses a
-#: transmittance of up to 1e-2.
+#: Largest jump at a cutoff, relative to the color: the contribution of a Gaussian just above ALPHA_MIN, or of one that
+#: reduces a transmittance of up to 1e-2 to its cutoff.
 LARGEST_STEP = 1e-2
 #: Relative error bound of float32 loss and gradient against float64, with the same ReLU and max-pool decisions.
 LOSS_BOUND = 1e-5
@@ -49,7 +49,7 @@ class CaseResult:
     Attributes:
         error: Measured error against the float64 reference; NaN or infinite if a result is not finite.
         bound: Maximum allowed error.
-        note: Other observations, for people.
+        note: Other observations, human-readable.
     """
 
     error: float
@@ -69,8 +69,9 @@ class Case:
     Attributes:
         name: Description of what is extreme.
         group: Part of the method under stress.
-        measure: Definition of the error.
-        run: Function that runs the measurement, in full size if its argument is true, or else within a few seconds.
+        measure: Description of the measured error.
+        run: Function that runs the measurement: at full size if its argument is true, else in a version that takes a
+            few seconds.
     """
 
     name: str
@@ -81,7 +82,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Measurement:
-    """Result of a case, wall-clock seconds, and growth of the process's peak memory in bytes."""
+    """Result of a case, its wall-clock seconds, and the growth of the process's peak memory in bytes."""
 
     result: CaseResult
     seconds: float
@@ -89,7 +90,7 @@ class Measurement:
 
 
 def measure(case: Case, *, full: bool = False) -> Measurement:
-    """Run a case, in full size or in a version that takes a few seconds at most."""
+    """Run a case: at full size if `full` is true, else in a version that takes at most a few seconds."""
     peak, started = _peak_memory(), time.perf_counter()
     result = case.run(full)
     return Measurement(result, time.perf_counter() - started, _peak_memory() - peak)
@@ -124,7 +125,7 @@ def ordinary(count: int = 80, *, seed: int = 0, degree: int = 0) -> Scene:
 
 
 def among_ordinary(extreme: Scene, *, count: int = 80) -> Scene:
-    """Return the extreme Gaussians followed by ordinary ones, whose pixels must stay correct."""
+    """Return the extreme Gaussians followed by ordinary Gaussians, whose pixels must stay correct."""
     rest = ordinary(count, degree=extreme.sh_degree)
     return Scene(*(torch.cat([getattr(extreme, name), getattr(rest, name)]) for name in Scene.__dataclass_fields__))
 
@@ -136,7 +137,7 @@ def repeated(
     scale: float = 0.1,
     logit: float = 2.0,
 ) -> Scene:
-    """Return `count` copies of one round Gaussian, to be made extreme; `scale` is in world units."""
+    """Return `count` copies of one round Gaussian, as a base for extreme cases; `scale` is in world units."""
     return Scene(
         means=torch.tensor(mean).repeat(count, 1),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
@@ -170,9 +171,9 @@ def compare_rasterizers(
         scene: Scene to render.
         view: Camera to render with.
         near: Distance of the near plane in world units.
-        colors: Colors [N, 3]; None for random ones in 0 to 2.
-        expected_scene: Scene that the reference renders; None for `scene`. It holds the rows `keep` of the scene; the
-            others must contribute nothing.
+        colors: Colors [N, 3]; None for random colors in 0 to 2.
+        expected_scene: Scene that the reference renders: the rows `keep` of `scene`, whose other rows must contribute
+            nothing. None for `scene`.
         keep: Mask [N] bool of the rows in `expected_scene`; None for all.
     """
     generator = torch.Generator().manual_seed(5)
@@ -192,7 +193,7 @@ def compare_rasterizers(
         fast = make_rasterizer(name, scene, near=near)
         shown = torch.cat([fast.render(colors, view) / brightest, fast.coverage(view)[..., None]], dim=-1).cpu()
         off = (shown.double() - torch.cat([image / brightest, coverage[..., None]], dim=-1)).abs().amax(-1)
-        # A jump that a cutoff explains is not an error; any larger one is.
+        # A jump that a cutoff explains is not an error; a larger one is.
         explained = band & (off > IMAGE_BOUND) & (off <= LARGEST_STEP)
         flipped += int(explained.sum())
         error = _worst(error, off[~explained])
@@ -210,7 +211,7 @@ def _worst(error: float, values: Tensor) -> float:
 
 @cache
 def vgg16() -> BackboneWeights:
-    """Load the smaller network, for cases that need real features.
+    """Load VGG16, the smaller network, for cases that need trained features.
 
     Raises:
         WeightsError: If it is not installed.
@@ -219,14 +220,14 @@ def vgg16() -> BackboneWeights:
 
 
 class DecisionsOf(FeatureNetwork):
-    """Float64 network that back-propagates through the ReLU masks and pool positions of another network.
+    """Float64 network that back-propagates through the ReLU masks and max-pool positions of another network.
 
-    In exact arithmetic, maxima can be tied, for example in any constant image. The gradient may then go to either
-    pixel: both are subgradients, and no precision makes two networks agree.
+    Maxima can be tied even in exact arithmetic, for example in a constant image. The gradient may then go to either
+    pixel: both are valid subgradients, so higher precision does not make two networks agree.
 
-    The decisions come from the passes that the other network made in a `listening` block, in their order. Repeating its
-    passes on the same pixels would not do: images of lower scales are averaged in float64 here and in float32 there,
-    which can move a maximum that is nearly tied.
+    These decisions are recorded from the other network's forward passes in a `listening` block, and used in the same
+    order. They are not recomputed from the same pixels: coarser scales are averaged in float64 here but in float32
+    there, which can change the position of a nearly tied maximum.
     """
 
     def __init__(self, weights: BackboneWeights, other: FeatureNetwork) -> None:
@@ -237,7 +238,7 @@ class DecisionsOf(FeatureNetwork):
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Record the passes that the other network makes in this block, for this network to follow afterwards."""
+        """Record the other network's forward passes in this block; later passes of this network use their decisions."""
         forward = self.other.forward
 
         def heard(rgb: Tensor, *, keep: bool = True) -> Activations:
@@ -252,12 +253,12 @@ class DecisionsOf(FeatureNetwork):
     def rounding_of(self, layer: str) -> float:
         """Return the rounding error of the other network.
 
-        A channel that is constant except for that rounding then has no gradient in either network.
+        Both networks then agree on which channels are constant up to rounding, and give them no gradient.
         """
         return self.other.rounding_of(layer)
 
     def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
-        """Run `FeatureNetwork.forward`, and store the decisions of the other network's next pass for `backward`."""
+        """Run `FeatureNetwork.forward`; store the decisions of the next recorded pass for `backward`."""
         own = super().forward(rgb, keep=keep)
         theirs = Activations({}, self._heard.popleft())
         for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
@@ -276,7 +277,7 @@ def compare_losses(
     untiled: bool = True,
     bound: float = LOSS_BOUND,
 ) -> CaseResult:
-    """Return the relative error of the float32 loss and pixel gradient against float64 with the same decisions.
+    """Return the relative error of float32 loss and pixel gradient against float64, with equal ReLU and pool decisions.
 
     Args:
         image: Image [H, W, 3].
@@ -284,7 +285,8 @@ def compare_losses(
         content: Content image [H, W, 3].
         content_weight: Weight of the content term.
         coverage: Position weights [H, W]; None for equal weights.
-        untiled: Whether to compare the loss with the autograd reference too, which needs at least 16 x 16 pixels.
+        untiled: Whether to compare the loss with the untiled autograd reference instead of the float64 `SosLoss`;
+            requires at least 16 x 16 pixels.
         bound: Maximum allowed error.
     """
     style = resize_area(style, style_size((style.shape[0], style.shape[1]), (image.shape[0], image.shape[1])))
@@ -298,7 +300,7 @@ def compare_losses(
     loss = expected.loss
     if untiled:
         loss, _ = sos_reference(vgg16(), image, style, content, content_weight=content_weight, coverage=coverage)
-    # The floor of 1, a loss far below anything visible, only prevents a division by zero for a perfect match.
+    # The floor of 1 is far below any visible loss. It only prevents a division by zero for a perfect match.
     error = abs(found.loss - loss) / max(abs(loss), 1.0)
     if not bool(torch.isfinite(found.image_gradient).all()):
         error = math.inf
@@ -334,7 +336,7 @@ def texture(height: int, width: int, seed: int = 0) -> Tensor:
 
 
 def without(scene: Scene, rows: Tensor) -> tuple[Scene, Tensor]:
-    """Return the scene without some rows ([N] bool), and the mask [N] bool of the remaining ones."""
+    """Remove rows ([N] bool) from a scene; return the new scene, and the mask [N] bool of the remaining rows."""
     kept = ~rows
     columns = {name: getattr(scene, name)[kept] for name in Scene.__dataclass_fields__}
     return replace(scene, **columns), kept

@@ -1,4 +1,4 @@
-"""Hard cases of compressed scene files and of orbits: one Gaussian, extreme sizes, objects without extent."""
+"""Hard cases of compressed scene files and camera orbits: one Gaussian, extreme sizes, objects without extent."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ _SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def _packed(make: Callable[[], Scene], form: PackedForm, full: bool) -> CaseResult:
-    """Check that a file is finite and complete, and that rounded values do not change when written again."""
+    """Check that a compressed file is finite and complete, and that writing it again keeps its quantized values."""
     scene = make()
     with tempfile.TemporaryDirectory() as folder:
         first, second = Path(folder) / f"first.{form}", Path(folder) / f"second.{form}"
@@ -101,7 +101,7 @@ def _packed(make: Callable[[], Scene], form: PackedForm, full: bool) -> CaseResu
 def _sorted(values: torch.Tensor, scene: Scene) -> torch.Tensor:
     """Return rows ordered by position.
 
-    Compressed PLY files may reorder Gaussians; the order among those at one position does not matter.
+    Compressed PLY files may reorder Gaussians. The order of Gaussians at the same position does not matter.
     """
     order = np.lexsort(scene.means.double().numpy().round(3).T)
     return values.double()[torch.from_numpy(order)]
@@ -120,7 +120,7 @@ def _finite(scene: Scene) -> bool:
 
 
 def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
-    """Check a hand-made file: positions and sizes are read exactly, the rest to the rounding of a byte."""
+    """Check a .splat file: positions and sizes are read exactly, all other values up to the rounding of a byte."""
     scene = make()
     sizes = scene.scales.exp().numpy().astype("<f4")
     colors = (0.5 + 0.28209479177387814 * scene.sh_dc.double()).clamp(0, 1)
@@ -149,7 +149,7 @@ def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
 
 
 def _cloud(x: float, y: float, z: float, count: int = 200) -> Scene:
-    """Return small round Gaussians in a box with these sides."""
+    """Return small round Gaussians in a box with the given sides."""
     scene = repeated(count, mean=(0.0, 0.0, 0.0), scale=0.02)
     box = torch.rand(count, 3, generator=torch.Generator().manual_seed(9)) - 0.5
     return replace(scene, means=box * torch.tensor([x, y, z]))

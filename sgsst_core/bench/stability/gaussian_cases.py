@@ -1,4 +1,4 @@
-"""Hard cases of Gaussians, mixed with ordinary ones whose pixels must stay correct."""
+"""Hard cases of extreme Gaussians, mixed with ordinary Gaussians whose pixels must stay correct."""
 
 from __future__ import annotations
 
@@ -74,28 +74,28 @@ def _columns(scene: Scene, **columns: Tensor) -> Scene:
 
 
 def _quaternions() -> Scene:
-    """Return quaternions of length 0 (no rotation, left out), of float32's extreme lengths, and denormal ones."""
+    """Return Gaussians with quaternions of length 0 (never drawn), denormal, tiny and huge lengths."""
     lengths = torch.tensor([0.0, 1e-45, 1e-30, 1e-4, 1.0, 1e4, 1e19, 1.9e38])
     return _columns(repeated(8), quats=torch.tensor([0.5, 0.5, -0.5, 0.7]) * lengths[:, None])
 
 
 def _scales() -> Scene:
-    """Return scales of 0 (below float64's range), 1e-20, 1e10, 1e30, and one that overflows float64 (left out)."""
+    """Return Gaussians with scales of 0 (underflow in float64), 1e-20, 1e10, 1e30, or float64 overflow (not drawn)."""
     logarithms = torch.tensor([-3e38, -1000.0, math.log(1e-20), math.log(1e10), math.log(1e30), 300.0, 1e5, 3e38])
     return _columns(repeated(8), scales=logarithms[:, None].expand(8, 3).clone(), opacities=torch.full((8,), -2.0))
 
 
 def _flat_or_thin() -> Scene:
-    """Return discs and needles whose other axes have no extent at all."""
+    """Return discs and needles with zero extent along their short axes."""
     none, some = -200.0, -1.0
     axes = [[none, some, some], [some, none, some], [some, some, none], [none, none, some], [some, none, none]]
     return _columns(ordinary(5, seed=3), scales=torch.tensor(axes))
 
 
 def _opacities_at_the_cut() -> Scene:
-    """Return opacities of 1/255 and its float32 neighbors.
+    """Return Gaussians whose opacity is 1/255, a float32 neighbor of it, or slightly larger.
 
-    With these, alpha reaches the cutoff at no more than one pixel center.
+    Their alpha reaches the cutoff of 1/255 at one pixel center at most.
     """
     cut = np.float32(math.log(ALPHA_MIN / (1 - ALPHA_MIN)))
     values = [np.nextafter(cut, np.float32(-9)), cut, np.nextafter(cut, np.float32(9)), cut + np.float32(1e-3)]
@@ -105,31 +105,31 @@ def _opacities_at_the_cut() -> Scene:
 
 
 def _logits() -> Scene:
-    """Return opacities of 0 and 1 up to the largest logits."""
+    """Return Gaussians with opacities of almost or exactly 0 and 1, up to the largest float32 logits."""
     return _columns(ordinary(8, seed=4), opacities=torch.tensor([-3e38, -1e4, -100.0, -17.0, 17.0, 100.0, 1e4, 3e38]))
 
 
 def _depths() -> Scene:
-    """Return Gaussians at depth 0, around 0 and at the camera, all closer than the near plane."""
+    """Return Gaussians at, near and behind the camera's plane, none of them beyond the near plane."""
     scene = repeated(7, scale=0.5)
     depths = torch.tensor([0.0, -0.0, 1e-38, -1e-38, 1e-6, -1e-6, -4.0])
     return _columns(scene, means=torch.stack([torch.zeros(7), torch.zeros(7), depths], dim=1))
 
 
 def _off_screen() -> Scene:
-    """Return Gaussians centered far outside the view, up to a million pixels, whose footprints reach into it."""
+    """Return Gaussians centered up to a million pixels outside the view, whose footprints reach into it."""
     means = torch.tensor([[-20.0, 0, 4], [20, 1, 4], [0, -15, 4], [0, 1e3, 4], [-1.3e5, 0, 4]])
     sizes = torch.tensor([6.0, 6.0, 5.0, 400.0, 5e4]).log()
     return _columns(repeated(5, logit=-1.0), means=means, scales=sizes[:, None].expand(5, 3).clone())
 
 
 def _stacked(count: int, logit: float) -> Scene:
-    """Return many Gaussians at one point, so that the transmittance is a product of as many factors."""
+    """Return `count` Gaussians at one point, so that the transmittance is a product of `count` factors."""
     return repeated(count, scale=0.02, logit=logit)
 
 
 def _sub_pixel() -> Scene:
-    """Return thousands of points between the pixel centers."""
+    """Return thousands of Gaussians much smaller than a pixel."""
     scene = ordinary(3000, seed=7)
     return _columns(scene, scales=torch.full((3000, 3), math.log(1e-6)))
 
@@ -137,7 +137,7 @@ def _sub_pixel() -> Scene:
 def _grazing() -> Scene:
     """Return Gaussians just beyond the near plane and far to the side.
 
-    There the slopes and derivatives of the perspective are largest.
+    The derivatives of perspective projection are largest there.
     """
     scene = ordinary(60, seed=8)
     depths = torch.full((60,), NEAR * 1.001)
@@ -195,7 +195,10 @@ def _invalid_in_memory(name: str, value: str, full: bool) -> CaseResult:
 
 
 def _needles(full: bool) -> CaseResult:
-    """Check needles in all orientations. In float32, their p r - q^2 has no correct digit and is often negative."""
+    """Check needles in all orientations.
+
+    Their determinant, computed as p r - q^2 in float32, has no correct digit and is often negative.
+    """
     worst, lost = CaseResult(0.0, 0.0), 0
     steps = 180 if full else 36
     for step in range(steps):
@@ -210,7 +213,7 @@ def _needles(full: bool) -> CaseResult:
 
 
 def _float32_determinant_is_lost(needle: Scene) -> bool:
-    """Return whether the usual formula's relative error exceeds 0.1 for `needle` at depth 4 in `camera()`."""
+    """Return whether the determinant p r - q^2 of `needle`, computed in float32, has a relative error above 0.1."""
     found = project(needle, camera()).values
     if not len(found):
         return False
@@ -248,9 +251,9 @@ def _equal_depths(full: bool) -> CaseResult:
 
 
 def _moved_world(full: bool) -> CaseResult:
-    """Check that a scene renders the same at 1e6 as at the origin.
+    """Check that a scene renders the same if it is translated by 1e6 along each axis.
 
-    Its positions are multiples of 1/16, which float32 can represent at 1e6.
+    Positions are multiples of 1/16, which float32 represents exactly at this distance.
     """
     scene, view = ordinary(300, seed=9), camera()
     scene = replace(scene, means=(scene.means * 16).round() / 16)
@@ -268,7 +271,7 @@ def _moved_world(full: bool) -> CaseResult:
 def _large_harmonics(full: bool) -> CaseResult:
     """Check colors in which frozen SH coefficients of 1e4 and a DC coefficient of -1e4 cancel.
 
-    The error is relative to 1e4, because float32 cannot keep more.
+    The error is relative to 1e4, because of float32's limited precision.
     """
     scene = ordinary(200, seed=10, degree=3)
     scene = replace(scene, sh_rest=held(scene.sh_rest) * 1e4)
@@ -287,7 +290,7 @@ def _large_harmonics(full: bool) -> CaseResult:
 def _no_direction(full: bool) -> CaseResult:
     """Check a Gaussian at the camera's center.
 
-    Its view direction is 0, its SH colors must be finite, and it is never drawn.
+    Its view direction is the zero vector. Its SH colors must be finite, and it must not be drawn.
     """
     scene = replace(repeated(3), sh_rest=torch.ones(3, 15, 3))
     means = torch.tensor([[0.0, 0, 0], [1e-45, 0, 0], [0, 1e38, 1e38]])

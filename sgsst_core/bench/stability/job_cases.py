@@ -1,4 +1,4 @@
-"""Hard cases of whole jobs: styles, scenes and settings with nothing to compare, or with extreme values."""
+"""Hard cases of whole jobs: degenerate and extreme styles, scenes and settings."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _strained(situation: Callable[[], Situation], full: bool) -> CaseResult:
 
 
 def _refused(situation: Callable[[], Situation], full: bool) -> CaseResult:
-    """Check that a job is refused with an error of its own, at the latest in its first step."""
+    """Check that a job raises an `SgsstError` no later than in its first step."""
     try:
         make(situation()).run_step()
     except SgsstError as error:
@@ -95,9 +95,9 @@ def _job(
 
 
 def _unlike(scene: Callable[[], Scene], style: Callable[[], Tensor], **settings: object) -> Situation:
-    """Return a job like `_job` whose loss need not fall.
+    """Return a job like `_job` whose loss is not required to decrease.
 
-    What it compares is equal from the start, or can never become equal.
+    Scene and style match from the start, or can never match.
     """
     return replace(_job(scene, style, **settings), falls=False)
 
@@ -108,7 +108,10 @@ def _scaled(factor: float) -> Situation:
 
 
 def _black_views(scale: str) -> Situation:
-    """Return a job on black views with the real network, at fixed factors for "paper" to save computing them."""
+    """Return a job on black views with the trained network.
+
+    The factors of the feature scale "paper" are fixed to avoid computing them.
+    """
     weights = vgg16()
     if scale == "paper":
         weights = with_scales(weights, dict.fromkeys(PUBLISHED, 20.0))
@@ -117,16 +120,16 @@ def _black_views(scale: str) -> Situation:
 
 
 def _pixels(situation: Situation, factor: float | None = None) -> Situation:
-    """Return the same job with pixels compared too, at the given factor or the usual one."""
+    """Return the same job with pixel colors as a further feature layer, at a given factor or the usual one."""
     weights = even_network()
     scales = weights.scales if factor is None else weights.scales | {PIXELS: factor}
     return replace(situation, weights=replace(weights, scales=scales))
 
 
 def _white_on_white() -> Situation:
-    """Return a job whose difference from the style is a hundredth of the values themselves.
+    """Return a job in which scene and style differ by only about a hundredth of their values.
 
-    Every rounding error therefore counts a hundred times as much.
+    Relative to this difference, rounding errors are a hundred times as large.
     """
     style = partial(_flat, 1, 1, 1, 64, 64)
     settings = {"background": (1.0, 1.0, 1.0), "content_weight": 0, "learning_rate": 0.01}
@@ -219,9 +222,9 @@ _REFUSED: dict[str, Callable[[], Situation]] = {
 
 
 def _chroma(full: bool) -> CaseResult:
-    """Check that colors of very different magnitudes keep their chroma.
+    """Check that stylizing luminance alone preserves the chroma of colors of very different magnitudes.
 
-    The allowed error is one rounding of the larger of the values before and after.
+    The error bound is one float32 rounding of the larger color, before or after the job.
     """
     scene = crowd(60)
     sizes = torch.logspace(-6, 3, 60)[:, None]

@@ -48,7 +48,7 @@ def cases() -> list[Case]:
 
 
 class _OnShallowLayers(Stylizer):
-    """Stylizer on the first two style layers: steps are quick, and only the optimizer is under stress."""
+    """Stylizer on the first two style layers, whose fast steps test the optimizer rather than the network."""
 
     def _network(self, weights: BackboneWeights) -> FeatureNetwork:
         return FeatureNetwork(weights, STYLE_LAYERS[:2])
@@ -59,7 +59,7 @@ def _camera() -> Camera:
 
 
 def _walls(*walls: tuple[float, int]) -> Scene:
-    """Return walls of Gaussians, one behind the other, each of which fills the view.
+    """Return several walls of Gaussians at increasing depth, each of which fills the view.
 
     Args:
         walls: Logit of the opacity and number of Gaussians per side, for each wall.
@@ -107,13 +107,13 @@ def _at_the_end(stylizer: Stylizer, note: str) -> CaseResult:
 
 
 def _outside(stylizer: Stylizer, rows: Tensor) -> float:
-    """Return how far the colors of some rows ([n] bool) lie outside 0 to 1, at most."""
+    """Return the maximum distance of the colors of `rows` ([n] bool) from the range 0 to 1."""
     colors = COLOR_OFFSET + SH_C0 * stylizer.sh_dc.detach()[rows]
     return float(torch.maximum(colors - 1, -colors).amax()) if len(colors) else 0.0
 
 
 def _weights(full: bool) -> CaseResult:
-    """Check Gaussians behind opaque walls, with blend weights down to almost the smallest possible one."""
+    """Check Gaussians behind opaque walls, with blend weights down to nearly the smallest possible value."""
     faint = math.log(1.1 * ALPHA_MIN / (1 - 1.1 * ALPHA_MIN))
     scene = _walls((2.0, 5), (3.0, 1), (faint, 5), (2.0, 5), (1.0, 5), (faint, 8))
     stylizer = _stylizer(scene, 2000 if full else 200, learning_rate=0.05)
@@ -131,9 +131,9 @@ def _weights(full: bool) -> CaseResult:
 
 
 def _adam(full: bool) -> CaseResult:
-    """Check Adam on gradients of 16 orders of magnitude.
+    """Check Adam on gradients from 1e-12 to 1e3.
 
-    Adam divides by the gradient's own size, so all values move alike, in either precision.
+    Adam normalizes each gradient by its own magnitude, so all values change equally, in float32 and in float64.
     """
     sizes = torch.logspace(-12, 3, 16, dtype=torch.float64)
     ends = []

@@ -52,12 +52,12 @@ def _constant(red: float, green: float, blue: float, height: int = _HEIGHT, widt
 
 
 def _checkerboard() -> Tensor:
-    """Return pixels that alternate between black and white, the highest frequency there is."""
+    """Return a one-pixel checkerboard, the highest possible spatial frequency."""
     return ((torch.arange(_HEIGHT)[:, None] + torch.arange(_WIDTH)) % 2).float()[..., None].expand(-1, -1, 3).clone()
 
 
 def _contrast() -> Tensor:
-    """Return an image with values of -100 and 100; colors are not clamped before the network."""
+    """Return an image with values of -100 and 100, which the network does not clamp."""
     return 200 * (texture(_HEIGHT, _WIDTH, 4) > 0.5).float() - 100
 
 
@@ -88,7 +88,7 @@ def _nothing_to_do(full: bool) -> CaseResult:
 
 
 def _small_style(side: int, full: bool) -> CaseResult:
-    """Check a style image smaller than a cell of deep layers, which are then left out of the loss."""
+    """Check a style image smaller than a cell of the deep layers, which are then skipped in the loss."""
     result = compare_losses(
         texture(_HEIGHT, _WIDTH, 1), texture(side, side, 2), texture(_HEIGHT, _WIDTH, 3), untiled=False
     )
@@ -126,9 +126,9 @@ def _features(seed: int, channels: int = 12) -> Tensor:
 
 
 def _dead(where: str, full: bool) -> CaseResult:
-    """Check channels that are constant, zero or not.
+    """Check constant channels, at zero and at another value.
 
-    The published factor (sigma - sigma_v) / sigma is infinite for them.
+    The factor (sigma - sigma_v) / sigma of the published code is not finite for them.
     """
     view, style = _features(1), _features(2)
     for name, features in (("the view", view), ("the style", style)):
@@ -146,7 +146,7 @@ def _dead(where: str, full: bool) -> CaseResult:
 
 
 def _ratio(power: int, full: bool) -> CaseResult:
-    """Check sigma for features whose mean is 10^power sigma.
+    """Check sigma for features whose mean is 10^power times sigma.
 
     The note gives the error of the published code's one-pass formula.
     """

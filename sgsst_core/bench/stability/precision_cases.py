@@ -27,12 +27,12 @@ from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.settings import make_settings
 
-#: Error bound of the losses of partition tiles, and of the style loss of the same features in any number of tiles.
+#: Relative error bound of a loss that is computed in partition tiles, for any number of tiles.
 _TILES_BOUND = 1e-6
-#: Error bound of results with longer sums. Squares of up to 4096 positions are summed in float32, by matrix products
-#: that some processors accumulate in longer chains than others. After a ReLU, most positions of a channel have the same
-#: value 0, so the same addend is rounded the same way over and over, which does not average out: with AVX2 4e-7 of a
-#: gradient and 1.5e-7 of a loss; with AVX-512 on a Xeon 1.2e-6 and 1.3e-6, for a view in one piece.
+#: Relative error bound of results with longer sums. Squares of up to 4096 positions are summed in float32 by matrix
+#: products, which some processors accumulate in longer chains than others. After a ReLU, most positions of a channel
+#: are 0, so the same addend is rounded the same way repeatedly, and errors do not average out. For an undivided view,
+#: the errors of gradient and loss are 4e-7 and 1.5e-7 with AVX2, and 1.2e-6 and 1.3e-6 with AVX-512 on a Xeon.
 _SUMS_BOUND = 2e-6
 
 
@@ -52,9 +52,9 @@ def cases() -> list[Case]:
 
 
 def _long_sum(full: bool) -> CaseResult:
-    """Check the statistics of 67 partition tiles of 512 x 512, which make a view of 5187 x 3361.
+    """Check the statistics of 67 partition tiles of 512 x 512 pixels, as many pixels as in a view of 5187 x 3361.
 
-    The note gives the error of adding one term after another in float32.
+    The note gives the error of sequential summation in float32.
     """
     generator = torch.Generator().manual_seed(0)
     channels = torch.linspace(1, 300, 64)
@@ -75,7 +75,7 @@ def _long_sum(full: bool) -> CaseResult:
 
 
 def _float16(full: bool) -> CaseResult:
-    """Check that float16 is refused: features reach 1e4 and Gram entries 1e8, while float16 ends at 65504."""
+    """Check that float16 is refused: features reach 1e4 and Gram entries 1e8, but float16 has a maximum of 65504."""
     activations = FeatureNetwork(vgg16(), STYLE_LAYERS).forward(texture(32, 40).round(), keep=False)
     largest = max(float(features.max()) for features in activations.features.values())
     gram = max(float(layer_statistics(features).gram().max()) for features in activations.features.values())
@@ -90,7 +90,7 @@ def _float16(full: bool) -> CaseResult:
 def _bfloat16(brightest: float, full: bool) -> CaseResult:
     """Check gradients in bfloat16, which has the range of float32 but 8 bits of precision.
 
-    Nothing overflows, and the gradient's direction is roughly right.
+    Values must not overflow, and the gradient's direction must be roughly right.
     """
     image, style, content = (brightest * texture(48, 64, seed) for seed in (1, 2, 3))
     gradients = []
@@ -132,7 +132,7 @@ def _split(height: int, width: int, tiles: int) -> list[tuple[slice, slice]]:
 
 
 def _agreement(features: torch.Tensor, parts: dict[str, list[LayerStatistics]], target: LayerTarget) -> CaseResult:
-    """Return the largest difference of loss and feature gradient between ways to sum the same features."""
+    """Return the largest difference of loss and feature gradient between ways to sum up statistics of one layer."""
     results = {name: style_loss(merge_all(statistics), target) for name, statistics in parts.items()}
     losses = [float(terms.sum()) for terms, _ in results.values()]
     gradients = [gradient.apply(features) for _, gradient in results.values()]
@@ -146,7 +146,7 @@ def _agreement(features: torch.Tensor, parts: dict[str, list[LayerStatistics]], 
 def _features() -> tuple[torch.Tensor, LayerTarget]:
     """Return real features [160, 224, 64] float32, and the target of a clearly different image.
 
-    For similar images, the loss is a small difference, which magnifies every rounding error.
+    The loss of similar images is a small difference of large values, which magnifies rounding errors.
     """
     network = FeatureNetwork(vgg16(), ("relu1_1",))
     style = network.forward(texture(100, 100, 5) ** 3, keep=False).features["relu1_1"]
@@ -190,7 +190,8 @@ def _tiles(full: bool) -> CaseResult:
         assert result.image_gradient is not None
         losses.append(result.loss)
         gradients.append(result.image_gradient)
-    # The undivided view, where sums are longest, is held to _SUMS_BOUND; tiles are held to _TILES_BOUND, scaled to it.
+    # The bound of the undivided view, which has the longest sums, is _SUMS_BOUND. The bound of tiles is _TILES_BOUND,
+    # so their error is scaled.
     whole, *tiled = (abs(loss / exact - 1) for loss in losses)
     error = max(whole, max(tiled) * _SUMS_BOUND / _TILES_BOUND)
     off = max(float((gradient - gradients[0]).norm() / gradients[0].norm()) for gradient in gradients)

@@ -1,7 +1,8 @@
-"""Whole jobs so small that hundreds of them can be run, to test combinations of scene, style and settings.
+"""Whole jobs small enough to run hundreds of them, to test combinations of scene, style and settings.
 
-The cases and the random search (`benchmarks.stability_search`) apply the same bounds: finite colors, steps no longer
-than Adam's, bit-identical repetition, a loss that does not rise, and loss and gradient of the last image as in float64.
+The cases and the random search (`benchmarks.stability_search`) check the same properties. Colors are finite, no step
+exceeds Adam's maximum, a repeated run is bit-identical, the loss does not rise, and loss and gradient of the final
+image match float64.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Relative error bound of loss and pixel gradient of the last image against float64.
 REFERENCE_BOUND = 1e-4
-#: Adam's longest step in learning rates: after a gradient that was 0 in all steps before.
+#: Adam's longest step in units of the learning rate. It occurs if the gradient was 0 in all earlier steps.
 LONGEST_STEP = 0.1 / math.sqrt(0.001) + 0.1
 #: Fraction by which the final loss may exceed the initial one.
 RISE = 1e-3
-#: Losses up to this size are rounding errors of what was equal at the start.
+#: Losses up to this value count as rounding errors if scene and style match from the start.
 NO_LOSS = 1e-3
-#: Upper limit for the allowed error of a gradient, however uncertain the content is.
+#: Upper limit of a gradient's allowed error, regardless of rounding errors in the content term.
 _MOST_UNCERTAIN = 0.5
 #: Rounding error of the cosine of two float32 vectors of length 1.
 _ROUNDING_OF_COSINES = 2**-22
@@ -46,10 +47,10 @@ STEPS, LEARNING_RATE = 4, 0.02
 _CHANNELS = 8
 #: Rounding error of float32 features, relative to their size.
 _FEATURE_ROUNDING = 2**-20
-#: Multiple of a number that, when added and subtracted again, leaves 20 of its 53 bits in float64.
+#: Factor for rounding a float64 number x from 53 bits to 20 bits, by adding and subtracting _CUT * x.
 _CUT = 2.0**33
-#: The change that this rounding makes to a gradient is at least an eighth of that of float32, which also rounds sums,
-#: and rounds those of equal numbers the same way each time.
+#: Safety factor for the gradient's change due to rounded features. The change in float32 is up to 8 times as large,
+#: because float32 also rounds sums, and rounds sums of equal numbers the same way each time.
 _SAFETY = 8.0
 
 
@@ -61,10 +62,10 @@ class Situation:
         scene: Scene to stylize.
         style: Style image [H, W, 3].
         settings: Settings that override those of `make`.
-        cameras: Cameras; `views()` if empty.
-        falls: Whether the loss must not end above the start; only checked if steps use the background that losses are
-            measured with. False if a step of any length overshoots, because what is compared is (nearly) equal from the
-            start.
+        cameras: Cameras of the job; empty for `views()`.
+        falls: Whether the final loss must not exceed the initial one. Only checked if steps use the same background as
+            loss evaluations. False if scene and style (nearly) match from the start, so that a step of any length
+            overshoots.
         weights: Weights of the network; None for `small_network`.
     """
 
@@ -85,7 +86,7 @@ def views(width: int = 24, height: int = 20) -> tuple[Camera, ...]:
 
 
 def crowd(count: int = 60, *, seed: int = 0, degree: int = 0) -> Scene:
-    """Return Gaussians that cover most of each view, as trained ones do."""
+    """Return Gaussians that cover most of each view, as in trained scenes."""
     scene = ordinary(count, seed=seed, degree=degree)
     return replace(scene, scales=scene.scales + 2.2, sh_dc=0.6 * scene.sh_dc)
 
@@ -117,7 +118,7 @@ def even_network() -> BackboneWeights:
 
 
 def make(situation: Situation) -> Stylizer:
-    """Make a stylizer of a situation, before its first step."""
+    """Create the stylizer of a situation, before its first step."""
     values: dict[str, Any] = {
         "steps_coarse": 1,
         "steps_sos": STEPS,
@@ -133,7 +134,9 @@ def make(situation: Situation) -> Stylizer:
 
 
 def strain(situation: Situation) -> CaseResult:
-    """Run a situation twice. Returns the final error against float64, or infinity if another bound is violated.
+    """Run a situation twice and check the properties that the module lists.
+
+    Returns the final error against float64, or infinity if another property is violated.
 
     Raises:
         SgsstError: If the situation is refused.
@@ -166,7 +169,7 @@ def strain(situation: Situation) -> CaseResult:
 
 
 def _moved(job: Stylizer, begun: Tensor) -> float:
-    """Return the largest change of a coefficient, not counting the change that brings initial colors into bounds."""
+    """Return the largest change of a coefficient, ignoring the clamping of initial colors to their bounds."""
     found = job.sh_dc.detach()
     chroma_of = begun if job.settings.preserve_colors == "luminance" else None
     within = constrained(begun, chroma_of, bounded=job.settings.bounded)
@@ -174,12 +177,14 @@ def _moved(job: Stylizer, begun: Tensor) -> float:
 
 
 def reference_error(job: Stylizer) -> tuple[float, float, int]:
-    """Compare loss and pixel gradient of a view's present image with float64.
+    """Compare loss and pixel gradient of a view's current image with float64.
 
-    The allowed error grows with the effect of feature rounding, which no implementation avoids, and if content has
-    changed by little more than that rounding. If content has changed by less, its term may consist of rounding alone,
-    and everything else is compared without it. For nearest-neighbor losses only the loss is compared, less the rounding
-    of cosines near 1: another vector that is equally near is no error.
+    Rounding of features is unavoidable in float32. The allowed error therefore grows with the effect of rounding on the
+    gradient, and on a content term whose features have changed by little more than rounding. If they have changed by
+    less, the content term may consist of rounding errors alone, and loss and gradient are compared without it.
+
+    For nearest-neighbor losses, only the loss is compared, and the rounding of cosines near 1 is subtracted from its
+    error. Matching another neighbor at the same distance is not an error.
 
     Returns:
         Relative error, allowed error, and number of flipped ReLU and pool decisions.
@@ -213,8 +218,8 @@ def _rounding_of_features(
 ) -> float:
     """Return the relative change of the gradient if all features are rounded slightly more than in float32.
 
-    It is large if the style loss is a difference of nearly equal statistics, or if a standard deviation is hardly
-    larger than the rounding of the features.
+    The change is large if the style loss is a difference of nearly equal statistics, or if a standard deviation is
+    hardly larger than the rounding of the features.
     """
     rounded = _Rounded(job.weights, job.network)
     _, found = _evaluate_both(job, rounded, *given, content_weight)
@@ -225,9 +230,9 @@ def _rounding_of_features(
 
 
 class _Rounded(DecisionsOf):
-    """Float64 network with the features of every layer rounded, equal ones equally, as in float32.
+    """Float64 network that rounds the features of every layer as float32 does: equal values to equal values.
 
-    Images are rounded too, because those of lower scales are means.
+    Images are rounded too, because the pixels of coarser scales are averages.
     """
 
     def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
@@ -248,7 +253,8 @@ def _feature_rounding(job: Stylizer, content: Tensor) -> float:
 def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> float:
     """Return the relative uncertainty of the content term and its gradient with float32 features.
 
-    E_c = lambda mean(d^2) gives the size of the differences d. If d is off by delta, E_c is off by 2 delta / d.
+    The magnitude of the feature differences d follows from E_c = lambda mean(d^2). If d has an error of delta, E_c has
+    a relative error of 2 delta / d.
     """
     weight = job.settings.content_weight
     rounding = _feature_rounding(job, content) if weight else 0.0
@@ -259,7 +265,7 @@ def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> fl
 def _content_is_rounding(job: Stylizer, found: SosResult, exact: SosResult, content: Tensor) -> bool:
     """Return whether rounding errors of the features explain the content term.
 
-    With differences d that are off by delta, the term is the mean of (d + delta)^2.
+    If the feature differences d have an error of delta, the term is lambda mean((d + delta)^2).
     """
     most = 2 * job.settings.content_weight * _feature_rounding(job, content) ** 2
     return all(terms["content"] <= 2 * exact.terms[scale]["content"] + most for scale, terms in found.terms.items())
@@ -273,7 +279,7 @@ def _evaluate_both(
     coverage: Tensor | None,
     content_weight: float,
 ) -> tuple[SosResult, SosResult]:
-    """Return the loss of an image by the job's network, and in float64 with the same decisions."""
+    """Return the loss of an image by the job's network, and in float64 with the same ReLU and pool decisions."""
     with double.listening():
         found = _evaluate(job, job.network, picture, content, coverage, content_weight)
     return found, _evaluate(job, double, picture, content, coverage, content_weight)

@@ -28,7 +28,8 @@ from sgsst_core.scene.gaussians import Scene
 
 _IMAGE = "image, coverage, gradient against float64"
 _LOSS = "loss and pixel gradient, relative to float64"
-#: Bound on memory growth. Python and caches grow by themselves; the refused allocation would be tens of gigabytes.
+#: Upper bound in bytes on memory growth when an allocation of tens of gigabytes is refused. It allows for the growth of
+#: Python and caches.
 _SMALL_MEMORY = 300 << 20
 
 
@@ -56,7 +57,10 @@ def _size(width: int, height: int, full: bool) -> CaseResult:
 
 
 def _stylized_size(width: int, height: int, full: bool) -> CaseResult:
-    """Check the loss of a view of this size; layers without a cell do not count. Quick runs shorten long views."""
+    """Check the loss of a view of this size, without layers whose output is empty.
+
+    Quick runs limit the width to 512 pixels.
+    """
     width = width if full else min(width, 512)
     image, style, content = texture(height, width, 1), texture(40, 32, 2), texture(height, width, 3)
     return compare_losses(image, style, content, untiled=min(width, height) >= 16)
@@ -105,7 +109,7 @@ _VIEWS: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 
 
 def _blind(full: bool) -> CaseResult:
-    """Check that views that see nothing are left out, and that a clear error is raised if all are."""
+    """Check that views that see nothing are skipped, and that an error is raised if all views are skipped."""
     scene = repeated(5)
     behind = replace(camera(), name="blind", world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1]).double()))
     rasterizer = make_rasterizer("cpu", scene)
@@ -124,9 +128,9 @@ def _too_many_intersections(full: bool) -> CaseResult:
 
 
 def _too_much_memory(full: bool) -> CaseResult:
-    """Check that intersections that can be addressed but exceed the free memory are refused.
+    """Check that intersections are refused if 32-bit indices can address them but free memory cannot hold them.
 
-    On machines with more than 40 GB of free memory, nothing is checked.
+    This is not checked on machines with more than 40 GB of free memory.
     """
     view = camera(16384, 16384, focal=8000.0)
     fitting = 2**31 // 1024**2 - 8
