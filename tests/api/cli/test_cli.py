@@ -492,7 +492,7 @@ def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, comm
 
 
 def _shown_until(terminal: int, pattern: str | None) -> str:
-    """Return what a program writes to its terminal until a pattern matches; with None, until the program ends."""
+    """Return a program's terminal output until a pattern matches it; if `pattern` is None, until the program ends."""
     shown = ""
     while pattern is None or not re.search(pattern, shown):
         try:

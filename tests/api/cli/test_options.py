@@ -1,4 +1,4 @@
-"""Tests that commands, API parameters and the reference share one declaration per option, with its words and bounds."""
+"""Tests that command line, API and reference documentation use the same help text and bounds of each option."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_commands_and_parameters_have_every_option() -> None:
 
 
 def outside(option: Declared) -> list[float]:
-    """Return numbers just outside an option's bounds."""
+    """Return the numbers just outside an option's bounds."""
     found: list[float] = []
     for item in option.limits:
         if isinstance(item, Ge | Le):

@@ -45,14 +45,14 @@ def store(service: Service) -> Iterator[Store]:
 
 @pytest.fixture(autouse=True)
 def no_waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Allow as many attempts as outside of tests, without waits between them."""
+    """Remove the waits between retries; the number of retries stays the same."""
     monkeypatch.setattr("api.client.events.FIRST_WAIT", 0.0)
     with stamina.set_testing(True, attempts=TRIES):
         yield
 
 
 class Awaited:
-    """Adapter that lets tests call an `AsyncClient` like a `Client`, in an event loop of its own."""
+    """Adapter that lets tests call an `AsyncClient` like a `Client`, in a separate event loop."""
 
     def __init__(self, url: str) -> None:
         self._runner = asyncio.Runner()
@@ -189,7 +189,7 @@ def test_a_job_from_its_upload_to_its_removal(
 
 
 def finish(store: Store, service: Service, job_id: str, content: bytes, folder: Path) -> bytes:
-    """Play the dispatcher for a queued job, whose result is the given content."""
+    """Finish a queued job in place of a dispatcher, with the given content as its result."""
     while (lease := store.leases.take("test")) is not None and lease.job_id != job_id:
         store.leases.stop(lease)
     assert lease is not None
@@ -263,11 +263,11 @@ def test_one_upload_serves_many_jobs(connect: Any, service: Service, files: dict
 
 
 class Relay:
-    """Proxy that forwards connections to a server, and cuts each one off after a number of bytes of its answer.
+    """Proxy that forwards connections to a server, and cuts each one off after a number of bytes of its response.
 
     Args:
         port: Port of the server on this machine.
-        limits: Bytes of each connection, in order; later connections are not cut off.
+        limits: Number of bytes after which each connection is cut off, in order; later connections are not cut off.
     """
 
     def __init__(self, port: int, limits: list[int]) -> None:

@@ -1,4 +1,4 @@
-"""Results in an S3-compatible bucket, with moto's server over HTTP."""
+"""Tests of results in an S3-compatible bucket, with moto's server over HTTP."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def endpoint() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def environment(endpoint: str) -> Iterator[dict[str, str]]:
-    """Provide the environment of S3 clients, and a bucket named `results`."""
+    """Create a bucket named `results`, and set and yield the environment variables of S3 clients."""
     values = environment_of(endpoint)
     with pytest.MonkeyPatch.context() as patch:
         for name, value in values.items():
@@ -116,7 +116,7 @@ def test_a_bucket_that_is_not_there_is_not_ready(artifacts: Artifacts) -> None:
 
 @contextmanager
 def dispatcher(data: Path, environment: dict[str, str]) -> Iterator[None]:
-    """Run a dispatcher with its own data folder."""
+    """Run a dispatcher with a separate data folder."""
     command = [sys.executable, "-m", "service.scheduling.dispatcher"]
     with data.with_suffix(".log").open("ab") as log:
         process = subprocess.Popen(command, env={**environment, "SGSST_DATA": str(data)}, stdout=log, stderr=log)

@@ -1,4 +1,4 @@
-"""Webhooks: signed, retried, sent to checked addresses only, and no receiver can delay the messages of others."""
+"""Tests of webhooks: signatures, retries, validation of addresses, and isolation of receivers from slow ones."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ Start = Callable[..., Receiver]
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Provide a function that starts receivers, which end with the test."""
+    """Yield a function that starts receivers, which are stopped after the test."""
     started: list[Receiver] = []
 
     def start(*arguments: Any, **named: Any) -> Receiver:
@@ -134,7 +134,7 @@ def _deliver(store: Store, folder: Path, **values: Any) -> None:
 
 
 def _end_job(store: Store, url: str, owner: str = "local") -> str:
-    """End a job whose webhook is `url`, bypassing the check at submission."""
+    """Create and end a job with the webhook `url`, bypassing the validation at submission."""
     store.inputs.add_blob("a" * 64, "aa/b", 1)
     inputs = [{"role": "scene", "name": "s", "sha256": "a" * 64, "size": 1}]
     job, _ = store.jobs.create(NewJob(owner, "wall", 0, {}, inputs, url), limit=1000)
@@ -143,7 +143,7 @@ def _end_job(store: Store, url: str, owner: str = "local") -> str:
 
 
 def _tries(store: Store) -> list[int]:
-    """Return the attempts of each message that is neither delivered nor given up."""
+    """Return the number of attempts of each pending message."""
     with store.database.reading() as session:
         return list(session.scalars(select(DeliveryRow.tries)))
 
@@ -437,7 +437,7 @@ def test_certificates_are_verified_for_the_name(
 
 
 def _certificate(folder: Path, name: str) -> Path:
-    """Write a self-signed certificate for a name, with its key."""
+    """Write a self-signed certificate for a host name, with its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.UTC)

@@ -1,4 +1,4 @@
-"""Folder of a rank on a machine that shares only the file store with others."""
+"""Tests of a rank's working folder on a machine that shares only the file store with others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quotas of keys: usage is counted exactly, requests beyond a limit are refused, and usage is released."""
+"""Tests of API key quotas: usage is counted exactly, requests beyond a limit are refused, and usage is released."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_retry_is_refused_once_the_gpu_seconds_are_used_up(store: Store, clock: 
 
 
 def at_once(work: Callable[[], object], times: int) -> int:
-    """Call `work` in `times` threads at the same moment; return the number of calls that were not refused."""
+    """Call `work` concurrently in `times` threads; return the number of calls that were not refused."""
     ready, passed, broken = threading.Barrier(times), [], []
 
     def one() -> None:
