@@ -1,4 +1,4 @@
-"""Tests that PyTorch's large tensors are in huge pages, if Linux provides them."""
+"""Tests that PyTorch's large tensors use huge pages, if Linux provides them."""
 
 from __future__ import annotations
 

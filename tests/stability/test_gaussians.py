@@ -1,4 +1,4 @@
-"""Hard cases of Gaussians: values, shapes, opacities and positions that overflow, cancel or divide by zero."""
+"""Tests of hard cases of Gaussians: values that can cause overflow, cancellation or division by zero."""
 
 from __future__ import annotations
 

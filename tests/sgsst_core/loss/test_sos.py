@@ -1,4 +1,4 @@
-"""Tests of the SOS gradient for any partition against the untiled autograd reference."""
+"""Tests of the SOS gradient with various partitions into tiles, against the untiled autograd reference."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ FLOAT32_TOLERANCE = 1e-5
 
 
 def setting(size, *, covered=False):
-    """Return (image, style, content, coverage) for views of a size, float64."""
+    """Return float64 image, style, content and coverage (None unless `covered`) for a view of this size."""
     image, content = picture(*size, seed=1), picture(*size, seed=2)
     style = resize_area(picture(600, 500, seed=3) ** 2, style_size((600, 500), size))
     coverage = None
@@ -117,7 +117,7 @@ def test_float32_does_not_depend_on_the_partition(tiny_weights, size, tile_sizes
 
 
 class DecisionsOf(FeatureNetwork):
-    """Float64 network that back-propagates through the ReLU masks and pool positions of a float32 network."""
+    """Float64 network whose backward pass uses the ReLU masks and max pooling positions of a float32 network."""
 
     def __init__(self, weights, other: FeatureNetwork):
         super().__init__(weights, dtype=torch.float64)

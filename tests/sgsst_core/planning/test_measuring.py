@@ -1,4 +1,4 @@
-"""Tests of the measurements in a plan: how they are thinned out and what the plan says about them."""
+"""Tests of planned quality measurements: how many of them a plan leaves out, and how it explains that."""
 
 from __future__ import annotations
 

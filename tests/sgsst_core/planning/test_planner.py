@@ -1,4 +1,4 @@
-"""Tests that what a plan leaves out changes no result, and that the plan gives the reason."""
+"""Tests that components that a plan leaves out do not change results, and that the plan states the reasons."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.small_scenes import ball, cameras, wall
 
 
 def behind(scene: Scene, count: int = 10) -> Scene:
-    """Return the scene with its last Gaussians moved behind the cameras, where no view sees them."""
+    """Return the scene with its last `count` Gaussians moved behind the cameras, where no view sees them."""
     moved = scene.means.clone()
     moved[-count:, 2] *= -1
     return replace(scene, means=moved)

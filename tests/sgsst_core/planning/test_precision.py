@@ -1,4 +1,4 @@
-"""Tests of the gain and the cost of lower precisions."""
+"""Tests of measuring speedup and gradient error of lower precisions."""
 
 from __future__ import annotations
 

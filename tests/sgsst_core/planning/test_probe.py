@@ -1,4 +1,4 @@
-"""Tests of the probe: what it measures, on what, and what it passes on."""
+"""Tests of the planner's probe: its measurements, the views it uses, and the data that a job reuses."""
 
 from __future__ import annotations
 

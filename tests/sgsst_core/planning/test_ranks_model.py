@@ -1,4 +1,4 @@
-"""Tests of the planner's model of several ranks."""
+"""Tests of the planner's performance model of several ranks."""
 
 from __future__ import annotations
 

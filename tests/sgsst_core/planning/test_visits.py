@@ -1,4 +1,4 @@
-"""Tests of the cost of visiting views: once for cached data, at every visit for the rest."""
+"""Tests of the predicted cost of visiting views: cached data cost time once, other data at every visit."""
 
 from __future__ import annotations
 

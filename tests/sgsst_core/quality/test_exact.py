@@ -1,4 +1,4 @@
-"""Tests of the comparison of approximations with exact gradients."""
+"""Tests of comparing approximate gradients with exact ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `sgsst check` on scenes, views and styles that are each extreme in one respect."""
+"""Tests of `sgsst check` on scenes, views and styles, each with one extreme property."""
 
 from __future__ import annotations
 

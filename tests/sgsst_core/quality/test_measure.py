@@ -1,4 +1,4 @@
-"""Tests of how much of a job is measured: the plan's amount, less for slow views, and the same after resuming."""
+"""Tests of the number of quality measurements in a job: as planned, fewer for slow views, the same after resuming."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def make(
 
 
 def measured(stylizer: Stylizer) -> list[int]:
-    """Run a job to its end. Returns the steps after which it was measured."""
+    """Run a job to its end, and return the steps after which quality was measured."""
     measure = Measurements(stylizer)
     run(stylizer, Callbacks(measure=measure))
     measure.at_the_end()

@@ -1,4 +1,4 @@
-"""Tests of `coarse` against the float64 reference with box average, including edge cases."""
+"""Tests of the rasterizer `coarse` against the float64 reference followed by a box average, including edge cases."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def coarse_pixels(view: Camera, scale: int, seed: int = 6) -> Tensor:
 
 
 def upscaled(gradient: Tensor, view: Camera, scale: int) -> Tensor:
-    """Return D^T of a coarse gradient, [H, W, 3], in its dtype."""
+    """Return the gradient [H, W, 3] of the full-size view, by the adjoint of the box average."""
     whole = torch.zeros(view.height, view.width, 3, dtype=gradient.dtype)
     add_upscaled_(whole, gradient, scale)
     return whole

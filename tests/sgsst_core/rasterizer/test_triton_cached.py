@@ -1,4 +1,4 @@
-"""Tests of cached weights on GPUs against `reference` and `triton`, on a GPU or in Triton's interpreter."""
+"""Tests of cached blend weights on a GPU or in Triton's interpreter, against `reference` and `triton`."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_a_piece_holds_a_weight_and_every_slot_is_filled_once() -> None:
 
 @contextmanager
 def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Yield the names of the calls that would wait for a device."""
+    """Yield a list that collects the names of calls that would synchronize with a GPU."""
     found: list[str] = []
 
     def noted(name: str) -> Callable[..., Any]:

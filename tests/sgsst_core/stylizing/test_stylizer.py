@@ -1,4 +1,4 @@
-"""Tests of the optimizer loop, on scenes so small that a step is quick."""
+"""Tests of the optimization loop, on tiny scenes."""
 
 from __future__ import annotations
 
@@ -370,7 +370,7 @@ def test_stylize_leaves_the_scene_as_it_is(tiny_weights: BackboneWeights, scene:
 
 
 class ClockEvent:
-    """Event in a device's stream; the device finishes all work immediately."""
+    """Simulated event in the stream of a device that finishes all work immediately."""
 
     def record(self) -> None:
         self.at = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Tests of the training background of an object: it is determined by seed, step and view, and changes nothing else."""
+"""Tests of training backgrounds of object scans: seed, step and view determine them, and they affect nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the state that a rank sets before it starts: threads, GPU, precision of matrix products."""
+"""Tests of process-wide settings that a rank makes at startup: threads, GPU, precision of matrix products."""
 
 from __future__ import annotations
 
