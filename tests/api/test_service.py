@@ -451,7 +451,7 @@ def test_the_client_and_its_commands(service: Service, files: dict[str, Path], e
 
 
 def test_a_deleted_job_takes_its_files_along(service: Service, short_job: str) -> None:
-    """Runs last of the tests that use this job."""
+    """This test runs after all other tests that use the same job."""
     with service.client() as client:
         where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
         assert client.get(where).status_code == 200
@@ -461,6 +461,6 @@ def test_a_deleted_job_takes_its_files_along(service: Service, short_job: str) -
 
 
 def test_nothing_went_wrong_unnoticed(service: Service) -> None:
-    """Runs last on the shared service: its log has no traceback."""
+    """This test runs last, and checks that the log of the shared service contains no traceback."""
     assert "Traceback" not in service.said()
     assert os.listdir(service.data / "incoming") == []

@@ -27,7 +27,7 @@ OVERLAYS = ("small", "gpu")
 each_overlay = pytest.mark.parametrize("overlay", OVERLAYS)
 #: Path where Kubernetes clients look for a token.
 TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"
-#: Secrets that the documents ask for.
+#: Secrets that operators have to create, according to the documentation.
 SECRETS = {"sgsst-database", "sgsst-store", "sgsst-ray", "sgsst-tls"}
 
 
@@ -178,7 +178,7 @@ def test_only_the_api_can_be_reached(overlay: str) -> None:
 
 @each_overlay
 def test_pods_reach_what_they_need_alone(overlay: str) -> None:
-    """Name server, database, store and Ray's other pods; with an autoscaler, the API server of Kubernetes too."""
+    """These are DNS, database, file store and Ray's other pods; with an autoscaler, also the Kubernetes API server."""
     policies = {name: spec for name, spec in policies_of(overlay).items() if "egress" in spec}
     (cluster,) = of_kind(overlay, "RayCluster")
     scales = bool(cluster["spec"].get("enableInTreeAutoscaling"))

@@ -18,7 +18,7 @@ from tests.api.service import Service
 pytestmark = pytest.mark.slow
 MONITORING = Path(__file__).resolve().parents[2] / "deploy" / "monitoring"
 OPERATIONS = MONITORING.parents[1] / "docs" / "operations.md"
-#: Names of metrics in a query, unlike names of functions.
+#: Pattern of metric names in a query, which does not match function names.
 _METRIC = re.compile(r"\bsgsst_\w+")
 
 

@@ -23,7 +23,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from tests.pretend_cuda.counts import Counts, calling_line
 
 DEVICE = torch.device("cuda", 0)
-#: Counters of this process.
+#: Global counters of this process.
 counts = Counts()
 
 
@@ -57,7 +57,7 @@ _WAITS = {
     "_local_scalar_dense", "nonzero", "masked_select", "equal", "unique_consecutive", "_unique2", "unique_dim",
     "bincount", "repeat_interleave", "is_nonzero", "linalg_lstsq", "histc",
 }  # fmt: skip
-#: Operations that accept CPU tensors together with those of the device.
+#: Operations that accept a mix of CPU tensors and simulated tensors.
 _MIXED = {"copy_", "_to_copy", "index", "index_put_", "index_put", "_index_put_impl_", "_pin_memory"}
 
 

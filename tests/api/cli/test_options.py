@@ -108,7 +108,7 @@ def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.
 
 
 def test_bounds_have_settings_numbers_and_no_other(capsys: pytest.CaptureFixture[str]) -> None:
-    """A bound itself is valid or not, as the help says."""
+    """Whether the bound itself is valid is as the help text says."""
     assert {name for name, option in OPTIONS.items() if option.bounds} == {name for name, _ in BEYOND}
     assert OPTIONS["similar_views"].bounds == "0<=x<1"
     assert OPTIONS["near"].bounds == "x>0"

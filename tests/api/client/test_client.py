@@ -375,7 +375,7 @@ def test_events_go_on_where_they_broke_off(
 def test_uploads_go_on_where_they_broke_off(
     connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The answer to a part is lost. The client sends the part again, and the service refuses it as already received."""
+    """The response to a part is lost. The client sends the part again; the service refuses it as already received."""
     monkeypatch.setattr(uploads, "PART_BYTES", 20_000)
     # Connections stay open: the first one of each relay passes the answer to the creation, not that to the first part.
     with Relay(int(service.environment["SGSST_PORT"]), [900]) as relay, connect(relay.url) as client:

@@ -331,7 +331,7 @@ def test_scenes_that_lie(client: httpx.Client, store: Store, files: Files, packe
 def test_packed_scenes_are_told_by_their_content(
     client: httpx.Client, store: Store, files: Files, packed: Files, what: str
 ) -> None:
-    """The format is detected whatever the file name, for files in the request and for tus uploads."""
+    """The format is detected regardless of the file name, for files in the request and for tus uploads."""
     answer = client.post("/v1/jobs", files=form(files, scene=("my scan.ply", packed[what])))
     assert answer.status_code == 202, answer.text
     headers = {**TUS, "Upload-Length": str(len(packed[what]))}
@@ -517,7 +517,7 @@ def test_models_whose_other_files_lie(client: httpx.Client, files: Files, name: 
 
 
 def test_camera_files_cannot_ask_for_files_of_the_machine(client: httpx.Client, files: Files, tmp_path: Path) -> None:
-    """For a transforms.json without sizes, the reader opens the image that it names, wherever that is."""
+    """If a transforms.json lacks image sizes, the reader opens the image at any path that the file contains."""
     there = tmp_path / "secret.png"
     there.write_bytes(files["style"])
     told = set()
@@ -1191,7 +1191,7 @@ def test_slow_clients_are_cut_off_and_block_nobody(service: Service, client: htt
 
 
 def test_clients_that_drip_are_cut_off(service: Service) -> None:
-    """A byte now and then is not a stall, but far below the minimum rate."""
+    """A client that sends single bytes at intervals does not stall, but is far below the minimum rate."""
     head = lines(
         f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
     )
@@ -1275,7 +1275,7 @@ def test_heads_that_make_no_sense(service: Service, client: httpx.Client, data: 
 
 
 def test_a_chunk_that_makes_no_sense(service: Service) -> None:
-    """A malformed chunk of a body that is being read is answered once, and what follows is not taken for a request."""
+    """A malformed chunk gets one response, and subsequent bytes are not interpreted as a request."""
     start = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}"
     with connect(service) as connection:
         connection.sendall(lines(start + "\nTransfer-Encoding: chunked\nExpect: 100-continue"))
@@ -1345,7 +1345,7 @@ def test_requests_that_wait_for_no_answer(service: Service) -> None:
 
 
 def test_a_body_that_nobody_reads_has_to_end(service: Service) -> None:
-    """The request is answered before its body arrives. A byte now and then does not hold the connection open."""
+    """The response is sent before the body arrives. Single bytes at intervals do not keep the connection open."""
     for rest in (b"", b"x"):
         with connect(service) as connection:
             connection.sendall(lines("POST /livez HTTP/1.1\nContent-Length: 1000000"))
@@ -1534,7 +1534,7 @@ def test_paths_write_no_lines_of_the_log(service: Service, client: httpx.Client)
 
 
 def test_nothing_of_all_that_is_left(service: Service, client: httpx.Client, store: Store) -> None:
-    """Runs last: the service is as ready as before, and every file has its row."""
+    """This test runs last: the service is still ready, and a database row refers to each stored file."""
     assert client.get("/readyz").status_code == 200
     metrics = client.get("/metrics").text
     assert not re.findall(r'sgsst_requests_total\{[^}]*status="(?!503)5\d\d"\} [1-9]', metrics)

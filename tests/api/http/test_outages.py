@@ -27,7 +27,7 @@ from tests.small_scenes import wall, write_files
 
 #: Concurrent requests: more than an API process has threads for.
 MANY = 60
-#: Seconds that a health check may take on a busy machine; if it waited for requests, it would take minutes.
+#: Timeout of a health check on a busy machine in seconds. If it waited for other requests, it would take minutes.
 HEALTH_SECONDS = 10.0
 #: Operations that need no database.
 WITHOUT_DATABASE = {("get", "/livez"), ("get", "/readyz"), ("options", "/v1/uploads")}
@@ -226,7 +226,7 @@ def test_a_locked_database_is_busy_and_can_be_read(tmp_path: Path, files: dict[s
 
 
 def test_waiting_for_a_lock_is_bounded_for_all_writers_together(tmp_path: Path) -> None:
-    """One writer at a time waits for a locked database; the others do not each wait for a time-out of their own."""
+    """Only one writer at a time waits for a locked database; timeouts of other writers do not add up."""
     store: Store = open_store(ServiceSettings(data=tmp_path), answer_seconds=0.5)
     with contextlib.closing(sqlite3.connect(tmp_path / "sgsst.db")) as other:
         other.isolation_level = None

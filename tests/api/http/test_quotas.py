@@ -275,7 +275,7 @@ def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: d
 
 @pytest.mark.skipif(not is_installed(), reason="PostgreSQL's server is not installed")
 def test_of_a_hundred_requests_at_once_none_passes_a_limit(tmp_path: Path, files: dict[str, bytes]) -> None:
-    """On PostgreSQL, where concurrent transactions do not see each other's rows."""
+    """The test uses PostgreSQL, where concurrent transactions do not see each other's rows."""
     limits = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_JOBS_PER_KEY": "7"}
     with (
         server(durable=True) as url,

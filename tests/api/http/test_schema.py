@@ -88,7 +88,7 @@ def key(store: Store) -> str:
 @schemathesis.openapi.from_dict(DOCUMENT).parametrize()
 @settings(max_examples=20, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
 def test_every_operation(case: schemathesis.Case, service: Service, key: str) -> None:
-    """Examples, limits of every parameter, unsupported methods and random input."""
+    """Requests include the examples, limits of every parameter, unsupported methods and random input."""
     case.call_and_validate(
         base_url=service.url, checks=checks(), timeout=60, headers={"Authorization": f"Bearer {key}"}
     )
@@ -96,7 +96,7 @@ def test_every_operation(case: schemathesis.Case, service: Service, key: str) ->
 
 # --- chains --------------------------------------------------------------------------------------------------------
 
-#: The same chains in every run.
+#: Settings with which each run generates the same chains of requests.
 BOUNDS = settings(
     max_examples=40,
     stateful_step_count=8,
@@ -106,13 +106,13 @@ BOUNDS = settings(
     phases=[Phase.generate],
     suppress_health_check=list(HealthCheck),
 )
-#: Operations that are reachable by links only: ids cannot be guessed.
+#: Operations that chains only reach by links, because ids cannot be guessed.
 JOBS = ("get_job", "cancel_job", "delete_job", "watch_job")
 ENDS = ("cancel_job", "retry_job")
 ARTIFACTS = ("list_artifacts", "get_artifact")
 INPUTS = ("get_progress", "list_inputs", "get_input")
 UPLOADS = ("get_upload", "head_upload", "append_upload", "delete_upload")
-#: Parameters that are not only well-formed but valid, so that requests create what links lead to.
+#: Parameters that are not only well-formed but valid, so that requests create resources that links refer to.
 RIGHT: dict[str, dict[str, Any]] = {
     "dry_run": {"type": "boolean", "enum": [False]},
     "Upload-Length": {"type": "integer", "minimum": 100, "maximum": 200},
@@ -175,7 +175,7 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     ("path", "behind"),
     [
         ("/v1/jobs(?!.*(artifacts|inputs|progress))", JOBS),
-        # Again on their own: among all operations, chains rarely cancel and then retry, or list and then take.
+        # Separate chains, because those above rarely cancel and then retry a job, or list and then get its files.
         ("/v1/jobs($|/{job_id}/(cancel|retry))", ENDS),
         ("/v1/jobs($|/{job_id}/artifacts)", ARTIFACTS),
         ("/v1/jobs($|/{job_id}/(inputs|progress))", INPUTS),
@@ -183,7 +183,7 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     ],
 )
 def test_chains_of_requests(service: Service, key: str, uploaded: Uploaded, path: str, behind: tuple[str, ...]) -> None:
-    """Stateful test: ids from answers are used in the requests that the document links to them."""
+    """Stateful test: ids from responses are used in the requests that the document links to them."""
     followed: Counter[str] = Counter()
     loaded = schemathesis.openapi.from_dict(uploaded.document()).include(path_regex=f"^{path}")
     loaded.config.update(base_url=service.url)

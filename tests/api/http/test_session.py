@@ -253,7 +253,7 @@ def test_reading_changes_nothing_wherever_it_comes_from(browser: httpx.Client, s
 
 
 def test_other_sites_sign_nobody_in(service: Service, key: str) -> None:
-    """Otherwise another site could make a user work under a key of its own."""
+    """Otherwise, another site could sign users in with the attacker's key."""
     with service.client() as browser:
         for headers in ELSEWHERE[:-1]:
             sent = {name: value.replace("SELF", service.url) for name, value in headers.items()}

@@ -157,7 +157,7 @@ def run(pair: Pair, count: int, seed: int) -> None:
 
 
 def test_a_file_is_not_written_to_by_two_processes(pair: Pair) -> None:
-    """The second of two writers is refused. Otherwise the digest of its bytes would name the bytes of the first."""
+    """The second of two writers is refused. Otherwise, a file could be named by the digest of other content."""
     with pair.services[0].client() as client:
         where = begin(client, 1000)
         first = Patch(pair.services[0], where, 0, b"x" * 1000, expect=True)

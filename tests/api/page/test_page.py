@@ -216,7 +216,7 @@ def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_pat
 
 
 def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """The stream resumes where it stopped, and the loss history is complete."""
+    """After a restart of the server, the event stream resumes where it stopped, and the loss history is complete."""
     job_id = submit(service, files, **LONG)
     watched = visit(f"/#/jobs/{job_id}")
     page = watched.page
@@ -457,7 +457,7 @@ def _new_key(service: Service, name: str) -> str:
 
 
 def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
-    """A weighted mix of two styles and a frozen half: the job has what the page sends."""
+    """The job has the settings that the page has sent: a weighted mix of two styles, and one frozen half."""
     night = tmp_path / "night.png"
     Image.new("RGB", (64, 64), (20, 30, 90)).save(night)
     watched = visit()

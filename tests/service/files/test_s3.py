@@ -97,7 +97,7 @@ def test_files_that_no_row_refers_to_are_swept(artifacts: Artifacts, tmp_path: P
 def test_another_process_sees_what_was_put_since_it_looked(
     artifacts: Artifacts, environment: dict[str, str], prefix: str, tmp_path: Path
 ) -> None:
-    """fsspec caches listings of folders, but new files of other processes must be found."""
+    """fsspec caches folder listings, but files that other processes have just added must be found."""
     source = write(tmp_path, 10)
     first = artifacts.put("job_1", 1, "plan.json", source)
     artifacts.sweep("job_1", 9, {first.location})

@@ -194,7 +194,7 @@ UNUSABLE = ["http://127.0.0.1:99999/", "http://[::1", "http://℀.com/", "http:/
 
 
 def test_bad_rows_stop_no_other_message(tmp_path: Path, store: Store, receiver: Receiver) -> None:
-    """A version without checks may have stored such rows; the last message is the newest."""
+    """An older version without validation may have stored such rows. The newest message must still be sent."""
     for url in UNUSABLE[:4]:
         _end_job(store, url)
     _end_job(store, receiver.url)
@@ -281,7 +281,7 @@ def test_a_receiver_that_drips_is_cut_off(
 def test_the_deadline_includes_lookup_and_tls(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A name that is never found, and a server that accepts connections and stays silent."""
+    """The receivers are a host name whose lookup hangs, and a server that accepts connections, but never responds."""
     release, found = threading.Event(), socket.getaddrinfo
 
     def slow(host: Any, *arguments: Any, **named: Any) -> Any:
@@ -405,7 +405,7 @@ def test_what_counts_as_public(address: str) -> None:
 def test_the_checked_address_is_the_one_that_is_called(
     tmp_path: Path, store: Store, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the second lookup on, the name leads elsewhere; there is no second lookup."""
+    """A second DNS lookup would return another address, so there must not be one."""
     looked_up, found = [], socket.getaddrinfo
 
     def resolve(host: Any, *arguments: Any, **named: Any) -> Any:

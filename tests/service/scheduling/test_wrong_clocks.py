@@ -219,7 +219,7 @@ def test_what_a_clock_ahead_has_written_waits_for_nothing(settings: ServiceSetti
 
 
 def test_what_is_due_is_deleted_after_some_hours_of_work_and_not_at_once(settings: ServiceSettings) -> None:
-    """A machine that was off for 40 days cannot be told from a clock that is ahead."""
+    """A machine that was off for 40 days cannot be distinguished from one whose clock is ahead."""
     clock = Clock()
     store = open_store(settings, clock)
     store.inputs.add_blob(SHA, "aa/blob", 3)

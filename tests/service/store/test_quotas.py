@@ -161,7 +161,7 @@ def at_once(work: Callable[[], object], times: int) -> int:
 
 
 def test_no_limit_is_passed_by_requests_at_once(store: Store) -> None:
-    """On PostgreSQL, transactions do not see each other's rows: without a lock, all of these would pass."""
+    """On PostgreSQL, transactions do not see each other's rows, so without a lock, all requests would be accepted."""
     bytes_of_two = Quotas(stored_bytes=10)
     assert at_once(lambda: store.jobs.create(new_job("a"), limit=5), 30) == 5
     assert at_once(lambda: submit(store, Quotas(jobs_a_day=5), "b"), 30) == 5

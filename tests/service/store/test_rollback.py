@@ -19,7 +19,7 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import ROOT
 
-#: Service that accepts a job, creates a file, and dies.
+#: Program that accepts a job, creates a file, and dies.
 _WORK = """
 import os, sys
 from pathlib import Path

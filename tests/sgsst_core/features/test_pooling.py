@@ -55,7 +55,7 @@ def test_negative_zeros_and_infinities_are_compared_as_numbers(dtype: torch.dtyp
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_not_a_number_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
-    """NaN of either sign, as processors make them, must not be hidden by the pool."""
+    """NaN of either sign must propagate through max pooling."""
     source = relu_output(2, 2, dtype)
     source[0, 5, 1, 0] = torch.copysign(torch.tensor(torch.nan, dtype=dtype), torch.tensor(sign, dtype=dtype))
     assert bool(torch.signbit(source[0, 5, 1, 0])) == (sign < 0)

@@ -66,7 +66,7 @@ def test_every_flipped_bit_is_found(folder: Path) -> None:
 
 
 def test_weights_that_only_claim_to_be_the_package_s_are_refused(folder: Path) -> None:
-    """Damaged before their digest was recorded, so that the file agrees with itself."""
+    """The file was damaged before its own digest was computed, so only the digest in the code detects it."""
     path = folder / "lpips_vgg16.safetensors"
     tensors = safetensors.torch.load_file(path)
     tensors["linear3.weight"][7] += 1

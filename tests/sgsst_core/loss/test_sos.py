@@ -57,7 +57,7 @@ def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, gray
 
 
 def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny_weights):
-    """The pixel loss is that of means and deviations of 0-256 values, times the squared factor."""
+    """The pixel loss compares means and standard deviations of values from 0 to 256, times the squared factor."""
     weights = comparing_pixels(tiny_weights, 3.0)
     network = FeatureNetwork(weights, (PIXELS, "relu1_1"))
     loss = SosLoss(network, content_weight=0)
@@ -154,7 +154,7 @@ def test_float32_differs_from_float64_by_flips_and_little_else(vgg16_weights):
 
 @pytest.mark.parametrize("held", [0, 1.5])
 def test_memory_budget_changes_no_result(tiny_weights, held):
-    """Recomputed forward passes give the same gradient, for no kept tile and for some."""
+    """Gradients with recomputed forward passes are the same, whether no tile or some tiles are cached."""
     network = FeatureNetwork(tiny_weights)
     case = setting((200, 330))
     whole = evaluate(network, case, None, memory=1 << 34)

@@ -111,7 +111,7 @@ def test_nothing_is_measured_without_a_share() -> None:
 
 
 def test_a_job_is_its_steps_its_first_visits_and_measuring() -> None:
-    """All four views are visited in either phase.
+    """All four views are visited in each phase.
 
     The first visits compute cached weights and use the survey's intersections.
     """

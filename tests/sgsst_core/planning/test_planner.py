@@ -121,7 +121,7 @@ def test_similar_views_are_left_out_only_when_asked(tiny_weights: BackboneWeight
 
 
 def test_distinct_views_by_their_shift() -> None:
-    """Views 0.3 apart of a wall at distance 3, with a focal length of one width, are shifted by 0.1 of the width."""
+    """Cameras 0.3 apart, at distance 3 from a wall, with a focal length of one image width: a shift by 0.1 widths."""
     scene, views = wall(), cameras(3)
     turned = [replace(camera, world_to_camera=camera.world_to_camera.clone()) for camera in views]
     for camera, x in zip(turned, (-0.3, 0.0, 0.3), strict=True):

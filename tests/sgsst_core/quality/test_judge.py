@@ -129,7 +129,7 @@ def test_large_views_are_judged_at_one_size(alex: Lpips) -> None:
 
 @pytest.mark.parametrize("picture", [torch.full((1, 1, 3), 0.5), torch.zeros(40, 40, 3), torch.ones(5, 900, 3)])
 def test_extreme_styles_give_finite_figures(alex: Lpips, picture: Tensor) -> None:
-    """Styles are a single pixel, black without variance, and a line."""
+    """The styles are a single pixel, a black image without variance, and a line."""
     scene = ball()
     found = judged(judge_of(alex, scene, cameras(1), picture), torch.full_like(scene.sh_dc, -50.0))
     assert all(np.isfinite(value) for value in vars(found).values())

@@ -100,7 +100,7 @@ def test_agrees_with_the_published_code(alex: Lpips, name, changed, expected):
 
 
 def test_prefers_a_small_warp_to_a_blur_where_squared_error_prefers_the_blur(alex: Lpips):
-    """Figure 1 of the paper: people find the warped patch closer to the original, L2 and PSNR the blurred one."""
+    """In figure 1 of the paper, people prefer the warped patch, whereas L2 and PSNR prefer the blurred one."""
     image = photo("coffee")[100:300, 150:450]
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, 200), torch.linspace(-1, 1, 300), indexing="ij")
     wave = torch.stack([columns + 0.009 * torch.sin(9 * rows), rows + 0.0135 * torch.sin(7 * columns)], dim=-1)

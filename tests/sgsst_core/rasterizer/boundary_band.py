@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-#: Largest jump: a contribution just above ALPHA_MIN, or a Gaussian that crosses a transmittance of up to 1e-2, times a
-#: color up to 2.
+#: Largest difference at a cutoff: a contribution just above ALPHA_MIN, or one of a Gaussian at a transmittance of up to
+#: 1e-2, times a color of up to 2.
 LARGEST_STEP = 2e-2
 
 

@@ -45,7 +45,7 @@ from tests.sgsst_core.splat_scenes import (
     turned_pose,
 )
 
-#: Relative distance from a cutoff within which float32 may decide otherwise.
+#: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 FAST = ["cpu", "cached"]
 BLACK = (0.0, 0.0, 0.0)
@@ -407,7 +407,7 @@ def test_too_many_intersections_are_an_error_with_figures() -> None:
 
 
 def test_kernels_run_where_no_folder_can_be_written(tmp_path: Path) -> None:
-    """Machine code is then kept in memory only; Numba itself would raise an exception at import."""
+    """If no folder is writable, machine code is kept in memory only; Numba itself would raise an error at import."""
     package = Path(__file__).resolve().parents[3]
     code = (
         "import numba.core.caching as c\n"

@@ -37,7 +37,7 @@ ROOT = Path(__file__).resolve().parents[3]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
 BACKGROUND = (1.0, 0.25, 0.5)
-#: Relative distance from a cutoff within which float32 may decide otherwise.
+#: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 
 

@@ -34,7 +34,7 @@ pytest.importorskip("triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.usefixtures("one_thread"), *([pytest.mark.gpu] if DEVICE == "cuda" else [])]
 BACKGROUND = (1.0, 0.25, 0.5)
-#: Relative distance from a cutoff within which float32 may decide otherwise.
+#: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 #: Relative errors of images and gradients. Weights in half precision are off by at most 2^-11 each.
 ERRORS: dict[Precision, float] = {"float32": 5e-6, "half": 2**-11}

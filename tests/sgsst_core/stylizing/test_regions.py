@@ -140,7 +140,7 @@ def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
 
 
 def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights) -> None:
-    """It does not approach the other's; a flat dark and a flat bright image tell them apart."""
+    """A region does not approach another region's style; the styles are a uniform dark and a uniform bright image."""
     scene = wall()
     dark, bright = torch.full((40, 40, 3), 0.1), torch.full((40, 40, 3), 0.9)
     regions = halves(scene, right=Region("right", style=StyleMixture.of(bright)))

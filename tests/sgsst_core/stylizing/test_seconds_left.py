@@ -59,7 +59,7 @@ def session(
 @pytest.mark.parametrize("start", [0, 7, 30, 40])
 @pytest.mark.parametrize("views_per_step", [1, 3])
 def test_where_steps_take_what_was_expected_nothing_is_off(start: int, views_per_step: int) -> None:
-    """The prediction is exact in both phases, also after resuming in the middle of either."""
+    """The prediction is exact in both phases, also after resuming in the middle of a phase."""
     told = session([COARSE, SOS], [COARSE, SOS], start, views_per_step)
     assert len(told) == 90 - start
     for entry in told:

@@ -39,7 +39,7 @@ def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int],
 
 @pytest.mark.slow
 def test_two_ranks_make_the_steps_of_one_and_wait_once_in_each() -> None:
-    """Exchanges are not counted as waits for the device, since the communication library waits for other ranks."""
+    """Communication is not counted as host synchronization, because the library waits for other ranks anyway."""
     expected, losses, _, _ = run_steps(ALONE)
     first, second = on_ranks(2, run_steps, device="cuda")
     assert first[2][2:] == second[2][2:] == [1] * (STEPS - 2)

@@ -94,7 +94,7 @@ def test_what_the_view_shows_gives_the_bits_of_the_whole_gradient(scene: Scene, 
 
 
 def test_a_band_that_shows_nothing_is_one() -> None:
-    """Check the assumption of the second case above."""
+    """Check the assumption of the second test case above."""
     scene, camera = upper(wall()), cameras(1, WIDTH, HEIGHT)[0]
     first, second = divide_rows(HEIGHT, 2)
     rasterizer = make_rasterizer("cpu", scene)

@@ -66,7 +66,7 @@ def own_sockets(collectives: Collectives) -> list[str]:
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2"])
 def test_ranks_listen_on_the_address_of_their_job_alone(host: str) -> None:
-    """Here 127.0.0.2 stands for the address of a cluster's interface."""
+    """In this test, 127.0.0.2 represents the address of a cluster's network interface."""
     first, second = on_ranks(2, own_sockets, host=host)
     assert host in first, "the ranks' store"
     assert {"127.0.0.1", host} >= {*first, *second}
