@@ -1,8 +1,9 @@
-"""Baseline: one SOS gradient by the published block method (SPST as released with SGSST), reimplemented.
+"""Reimplemented baseline: one SOS gradient by the published block method (SPST as released with SGSST).
 
-Blocks of 512 px go through the network with a margin of 256 px, twice: once for statistics, once for back-propagation.
-The loss acts on every feature of the window, and the margin is cropped away afterwards. Content features are recomputed
-in every iteration. It runs on this project's network code, so that only the method differs.
+Blocks of 512 px with a margin of 256 px go through the network twice: once for statistics, once for back-propagation.
+The loss acts on all features of a block and its margin; the gradient of the margin is discarded afterwards. Content
+features are recomputed in every iteration. The baseline uses this project's network code, so that only the method
+differs.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def blocks(height: int, width: int) -> list[PartitionTile]:
 
 
 def block_gradient(network: FeatureNetwork, image: Tensor, style: Mapping[int, ScaleTarget], content: Tensor) -> Tensor:
-    """Compute dE/dimage [H, W, 3] of the SOS loss with lambda_c = 1, for image and content image [H, W, 3]."""
+    """Compute the gradient [H, W, 3] of the SOS loss with lambda_c = 1, for image and content image [H, W, 3]."""
     scales = range(scale_count(image.shape[0], image.shape[1]))
     total = torch.zeros(image.shape)
     for scale in scales:

@@ -15,8 +15,8 @@ def read_views(source: str, scene: Scene, count: int, resolution: int) -> list[C
 
     Args:
         source: Camera file, or orbit:N for a ring of N cameras.
-        scene: Scene, which determines the orbit.
-        count: Number of cameras, evenly spread over the source.
+        scene: Scene that an orbit is placed around; a camera file doesn't need it.
+        count: Number of cameras to select, at even intervals from the source.
         resolution: Longer side in pixels.
     """
     if source.startswith("orbit:"):

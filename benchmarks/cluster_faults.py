@@ -1,15 +1,16 @@
-"""Random machine failures in a cluster that shares only PostgreSQL and S3, while it works through small jobs.
+"""Random machine failures in a cluster that runs small jobs and shares only PostgreSQL and S3.
 
 python -m benchmarks.cluster_faults [--faults 60] [--seconds S] [--seed 0] [--kinds kill-node cut-node ...]
 
-There are ten hosts made of namespaces (`benchmarks.cluster_hosts`), each with its own network, processes and disk: two
-for the API, two for dispatchers, one for Ray's head, three Ray nodes that compute, PostgreSQL, and S3 (moto's server).
-Services that end are restarted, and a killed host returns with an empty disk, as in a real cluster.
+The cluster has ten simulated hosts, which are Linux namespaces (`benchmarks.cluster_hosts`) with their own network,
+processes and disk: two for the API, two for dispatchers, one for Ray's head, three Ray nodes that compute, one for
+PostgreSQL, and one for S3 (moto's server). As in a real cluster, services that exit are restarted, and a killed host
+returns with an empty disk.
 
-The benchmark counts accepted jobs that do not succeed (lost), jobs published twice, and results that differ from those
-of `sgsst stylize` on one rank (bit by bit for jobs on one rank, by color for jobs on two). It also counts files left
-behind and reads that no API process answered while the database was up, and measures for each kind of fault the seconds
-until a job makes steps again.
+The benchmark counts accepted jobs that do not succeed (lost), jobs whose result is published twice, and results that
+differ from those of `sgsst stylize` on one rank. Results of jobs on one rank must be bit-identical; for jobs on two
+ranks, colors are compared. The benchmark also counts leftover files, and read requests that no API process answered
+although the database was up. For each kind of fault it measures the seconds until a job continues to make steps.
 """
 
 from __future__ import annotations
@@ -52,12 +53,12 @@ QUEUE, TWO_RANKS_EVERY = 3, 3
 RAY_PORT, PG_PORT, S3_PORT, API_PORT = 6479, 5498, 5599, 8000
 NODES, DISPATCHERS, APIS = ("n1", "n2", "n3"), ("d1", "d2"), ("a1", "a2")
 FINISHED = ("succeeded", "failed", "canceled", "expired")
-#: Minimum and maximum seconds of a network cut; seconds of an S3 outage, of a slow connection, and of a full disk.
+#: Durations of faults in seconds: network cut (minimum, maximum), S3 outage, slow connection, full disk.
 CUT, AWAY, SLOW, FULL = (5.0, 60.0), 30.0, 30.0, 20.0
 DELAY, LOSS = 0.2, 0.05
-#: Seconds for all accepted jobs to end after the last fault is repaired, and for leftover files to be deleted.
+#: Time limits in seconds after the last repair: for all accepted jobs to end, and for leftover files to be deleted.
 PATIENCE, SWEEP = 900.0, 120.0
-#: Size in bytes of a node's disk, which a fault fills; scene, network and checkpoint are small here.
+#: Size in bytes of a node's disk. It is small, so that a fault can fill it; scene, network and checkpoint still fit.
 NODE_DISK = 96 << 20
 
 
@@ -93,7 +94,7 @@ class Cluster:
         return self.network.hosts[name]
 
     def start(self) -> None:
-        """Start everything: database and store first, then the rest, in arbitrary order."""
+        """Start the database and the object store, then all other services in arbitrary order."""
         for name, number in self._addresses.items():
             self.network.host(name, number, NODE_DISK if name in NODES else 1 << 30)
         self.start_services("pg")
@@ -201,7 +202,7 @@ def _wait(what: str, condition: Callable[[], bool], seconds: float = 180.0) -> N
 
 @dataclass
 class Run:
-    """Cluster under attack, and the figures collected."""
+    """Cluster under fault injection, and the figures collected."""
 
     cluster: Cluster
     files: dict[str, Path]
@@ -215,7 +216,7 @@ class Run:
     # --- through the API -------------------------------------------------------------------------------------------
 
     def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request to any API process that answers, retrying while none does."""
+        """Send a request to any API process that responds; retry while none does."""
         deadline = time.monotonic() + PATIENCE
         while True:
             for url in self.cluster.urls:
@@ -262,7 +263,7 @@ class Run:
     def steps(self) -> tuple[int, int]:
         """Return the number of ended jobs, and the total steps of running jobs.
 
-        The pair grows whenever a job makes a step or ends.
+        One of the two numbers grows whenever a job makes a step or ends.
         """
         jobs = self.jobs()
         running = [job for job in jobs if job["status"] == "running" and (job["progress"] or {}).get("loss")]
@@ -270,7 +271,7 @@ class Run:
         return ended, sum(job["attempt"] * 1_000_000 + job["progress"]["step"] for job in running)
 
     def watch_reads(self) -> None:
-        """Request a page of jobs every half second, and record how long no API process answers."""
+        """Request a page of the job list every half second, and record for how long no API process responds."""
         while not self.over.wait(0.5):
             started = time.monotonic()
             if not any(self._reads(url) for url in self.cluster.urls) and not self.database_away:
@@ -285,7 +286,7 @@ class Run:
     # --- faults ----------------------------------------------------------------------------------------------------
 
     def strike(self, kind: str) -> None:
-        """Inject a fault, repair it, and record the seconds until a job makes steps."""
+        """Inject a fault, repair it, and record the seconds until a job makes a step."""
         self.fill()
         self.wait_for_steps(120)
         time.sleep(self.chance.uniform(0, 4))
@@ -304,7 +305,7 @@ class Run:
         print(f"{len(self.faults):3} {time.strftime('%H:%M:%S')} {record}", flush=True)
 
     def wait_for_steps(self, seconds: float) -> float | None:
-        """Wait until a job makes steps or ends. Returns the seconds, or None if none does in time."""
+        """Wait until a job makes a step or ends, and return the seconds waited; return None after a timeout."""
         started = time.monotonic()
         before = self.steps()
         while time.monotonic() - started < seconds:
@@ -382,7 +383,7 @@ class Run:
     # --- what became of it -----------------------------------------------------------------------------------------
 
     def wait_for_all(self) -> dict[str, dict[str, Any]]:
-        """Wait until all accepted jobs have ended or time is up. Returns the last status of those that exist."""
+        """Wait until all accepted jobs have ended or time is up, and return the last status of each existing job."""
         deadline = time.monotonic() + PATIENCE
         found: dict[str, dict[str, Any]] = {}
         while time.monotonic() < deadline:
@@ -397,7 +398,7 @@ class Run:
         return found
 
     def published(self, job_id: str) -> int:
-        """Return how often a job's result was reported."""
+        """Return the number of events that announce a job's result."""
         text = self.call("GET", f"/v1/jobs/{job_id}/events").text
         return max(text.count('"name": "stylized.ply"'), text.count('"status": "succeeded"'))
 
@@ -421,7 +422,7 @@ KINDS = (
 
 
 def main() -> None:
-    """Inject faults, print and store the figures."""
+    """Inject faults, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=60)
     parser.add_argument("--seconds", type=float, default=None, help="no further fault after these")
@@ -452,7 +453,7 @@ def measure(
     """Run the cluster under faults and return all figures.
 
     Args:
-        folder: Working folder, with a short path.
+        folder: Working folder. Its path must be short.
         kinds: Kinds of faults.
         faults: Number of faults.
         seconds: Time after which no further fault starts; None for no limit.
@@ -481,7 +482,7 @@ def measure(
 
 
 def attack(run: Run, kinds: Sequence[str], faults: int, limit: float | None) -> float:
-    """Inject the kinds of faults in rounds, each round in a random order. Returns the seconds it took."""
+    """Inject faults in rounds, each with all kinds in random order, and return the elapsed seconds."""
     started = time.monotonic()
     order: list[str] = []
     while len(run.faults) < faults and (limit is None or time.monotonic() - started < limit):
@@ -493,7 +494,7 @@ def attack(run: Run, kinds: Sequence[str], faults: int, limit: float | None) -> 
 
 
 def _expected(folder: Path, files: dict[str, Path]) -> dict[int, Path]:
-    """Return the results of `sgsst stylize` on one rank, by seed, with the network of the cluster."""
+    """Return the results of `sgsst stylize` on one rank by seed, computed with the cluster's network weights."""
     installed = os.environ.get("SGSST_CACHE")
     os.environ["SGSST_CACHE"] = str(folder / "weights")
     try:
@@ -509,7 +510,7 @@ def _expected(folder: Path, files: dict[str, Path]) -> dict[int, Path]:
 
 
 def _count(run: Run, found: dict[str, dict[str, Any]], expected: dict[int, Path], folder: Path) -> dict[str, Any]:
-    """Return the figures about jobs."""
+    """Return the number of lost, twice published and differing jobs, and related figures."""
     ended = [job_id for job_id in run.accepted if found.get(job_id, {}).get("status") == "succeeded"]
     different, farthest = 0, 0.0
     before = read_scene(run.files["scene"]).scene.sh_dc
@@ -554,7 +555,7 @@ def _spread(values: list[float | None]) -> dict[str, float | int | None]:
 
 
 def _left(run: Run, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return what is left on the hosts and in the store after dispatchers have had time to clean up."""
+    """Return leftover files on hosts and in the object store, after dispatchers have had time to clean up."""
     deadline = time.monotonic() + SWEEP
     while True:
         hosts = {name: _files_of_jobs(run.cluster[name]) for name in (*NODES, *DISPATCHERS)}
@@ -596,5 +597,5 @@ print("\\n".join(ObjectStore("s3://files/sgsst").below("")))
 """
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # hosts end with this process, however it ends
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # exit normally, so that the hosts are removed too
     main()

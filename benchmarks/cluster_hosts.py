@@ -1,8 +1,8 @@
-"""Simulated hosts on one machine: Linux namespaces, each with its own network, processes, name and disk, on one switch.
+"""Simulated hosts on one machine: Linux namespaces with their own network, processes, name and disk, on one switch.
 
-Every host is connected by a cable of its own (`Cable`), a pair of TAP devices between which this process forwards
-packets. A cable can therefore be cut in one or both directions, lose packets and delay them, without any kernel module.
-Needs Linux, root, iproute2, util-linux and /dev/net/tun.
+Each host is connected to the switch by its own `Cable`: a pair of TAP devices between which this process forwards
+packets. It can therefore drop or delay packets in one or both directions without any kernel module. The simulation
+needs Linux, root, iproute2, util-linux and /dev/net/tun.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from pathlib import Path
 _TUNSETIFF, _TAP_WITHOUT_HEADER = 0x400454CA, 0x0002 | 0x1000
 _LARGEST_PACKET = 65536
 _TOOLS = ("ip", "unshare", "nsenter", "mount")
-#: Third numbers of addresses 10.77.N. The scripts in deploy/ use those from 81 on.
+#: Numbers N for networks 10.77.N. The scripts in deploy/ use numbers from 81 on.
 _NETWORKS = range(61, 80)
 
 
 def missing() -> str | None:
-    """Return what this machine lacks to run hosts, or None."""
+    """Return why this machine cannot run simulated hosts, or None if it can."""
     if os.name != "posix" or not hasattr(os, "geteuid") or os.geteuid() != 0:
         return "hosts of namespaces need Linux and root"
     for tool in _TOOLS:
@@ -82,12 +82,12 @@ class Carrier(threading.Thread):
         self._ended = threading.Event()
 
     def add(self, source: int, way: Way, target: int) -> None:
-        """Forward packets from one device's descriptor to another's."""
+        """Start to forward packets from the device with descriptor `source` to the one with descriptor `target`."""
         with self._lock:
             self._selector.register(source, selectors.EVENT_READ, (way, target))
 
     def remove(self, *descriptors: int) -> None:
-        """Stop forwarding for these descriptors."""
+        """Stop forwarding packets of the given descriptors."""
         with self._lock:
             for each in descriptors:
                 self._drop(each)
@@ -135,21 +135,21 @@ class Carrier(threading.Thread):
 
     @staticmethod
     def _write(target: int, packet: bytes) -> None:
-        with contextlib.suppress(OSError):  # a full queue drops packets, as in a switch; a device may be gone
+        with contextlib.suppress(OSError):  # a full queue drops packets, as a switch does; a device may be gone
             os.write(target, packet)
 
 
 class Network:
-    """Switch with hosts, on the first free one of `_NETWORKS`; this machine has the address `gateway`.
+    """Switch with hosts, in the first unused network of `_NETWORKS`. This machine has the address `gateway`.
 
-    It is a context manager that leaves nothing behind. Leftovers of a killed one are skipped, and two networks on one
-    machine do not interfere.
+    The context manager removes everything on exit. Several instances on one machine do not interfere. If a killed
+    process has left its network behind, the next free network is used.
 
     Args:
         folder: New folder for logs and the hosts' disks.
 
     Attributes:
-        prefix: First three numbers of all addresses, once entered.
+        prefix: First three numbers of all addresses; set when the context is entered.
         name: Name of the switch, and prefix of the devices' names.
     """
 
@@ -177,7 +177,7 @@ class Network:
         _ip("link", "delete", self.name, check=False)
 
     def _take(self) -> None:
-        """Create a switch with an unused name, which reserves its network."""
+        """Create a switch with an unused name, so that no other process uses the same network."""
         for number in _NETWORKS:
             self.prefix, self.name = f"10.77.{number}", f"sgsst{number}"
             made = subprocess.run(["ip", "link", "add", self.name, "type", "bridge"], capture_output=True, text=True)
@@ -196,11 +196,11 @@ class Network:
 
 
 class Host:
-    """Simulated host. Its services (`run`) are restarted whenever they end, until the host is killed.
+    """Simulated host. Services that `run` has started are restarted when they exit, until the host is killed.
 
     Attributes:
-        disk: Its disk, in memory and empty after each start.
-        log: Log of its services, across restarts.
+        disk: Folder of the host's disk. It is in memory, and empty after each start.
+        log: Log file of the host's services, across restarts.
     """
 
     def __init__(self, network: Network, name: str, address: str, disk_bytes: int) -> None:
@@ -216,7 +216,7 @@ class Host:
 
     @property
     def runs(self) -> bool:
-        """Whether it is running."""
+        """Whether the host is running."""
         return self._first is not None
 
     def start(self) -> None:
@@ -257,7 +257,7 @@ class Host:
         return subprocess.run([*self._enter(), *command], capture_output=True, check=False)
 
     def run(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
-        """Run a service on the host, restarted a second after it ends, as by a supervisor."""
+        """Run a service on the host; restart it a second after it exits, as a supervisor would."""
         again = 'while true; do "$@"; sleep 1; done'
         with self.log.open("ab") as log:
             self._services.append(
@@ -272,7 +272,7 @@ class Host:
             )
 
     def _enter(self) -> list[str]:
-        """Return the prefix that makes a command run on the host."""
+        """Return the command prefix that runs a command on the host."""
         assert self._first is not None
         children = Path(f"/proc/{self._first.pid}/task/{self._first.pid}/children")
         deadline = time.monotonic() + 10

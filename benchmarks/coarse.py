@@ -1,11 +1,11 @@
-"""Rasterization time of a phase 1 step, at full size and with the cached coarse operator, as ratios within one run.
+"""Rasterization time of a phase 1 step: speedup of the cached coarse operator over rasterization at full size.
 
     python -m benchmarks.coarse point_cloud.ply [--cameras cameras.json] [--side 1280] [--scales 1 2] [--repeats 9]
 
-Each method computes the image at a scale and one color gradient from there: `cpu` and `cached` through the box average
-and its adjoint, `coarse` directly. They take turns on the same view, and the fastest turn counts, because other
-programs disturbed it least. Geometry is prepared in advance. Beyond tile intersections, `coarse` prepares its operator;
-this is timed with the first image that uses it.
+Each method computes the image at a coarse scale, and the color gradient from an image gradient at that scale. `cpu` and
+`cached` render at full size and apply the box average and its adjoint; `coarse` computes both directly. The methods
+take turns on the same view, and the fastest turn counts, because other programs disturbed it least. Tile intersections
+are prepared in advance. `coarse` also prepares its operator; that time is measured together with the first image.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 
 
 def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camera: Camera, scale: int) -> None:
-    """Compute the image at a scale and the gradient from there, through the full-size view."""
+    """Compute image and color gradient at a scale through the full-size view."""
     downscale(rasterizer.render(colors, camera), scale)
     whole = torch.zeros((camera.height, camera.width, 3))
     add_upscaled_(whole, gradient, scale)
@@ -42,7 +42,7 @@ def at_full_size(rasterizer: Rasterizer, colors: Tensor, gradient: Tensor, camer
 
 
 def measure(scene: Scene, camera: Camera, scale: int, repeats: int) -> dict[str, Any]:
-    """Return the fastest seconds of each method, the cost of the operator, and the ratios, on one view."""
+    """Return for one view the fastest seconds of each method, the operator's preparation time, and the speedups."""
     colors = scene_colors(scene, camera)
     gradient = torch.randn(camera.height >> scale, camera.width >> scale, 3, generator=torch.Generator().manual_seed(1))
     cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)

@@ -3,9 +3,9 @@
     python -m benchmarks.device_counts [--size 980x545] [--name device_counts]
 
 The network has VGG19's layers with random weights, and there are three scales. One scene fills its views; the other is
-an object scan, whose statistics are weighted. Kernels are those that PyTorch's operations launch one by one; a library
-may launch a few more for one of them. Steps use a small view, because Triton's interpreter takes minutes to render a
-large one. Only the loss could depend on the size, so it is counted for the given size too.
+an object scan, which needs weighted statistics. Each PyTorch operation counts as the kernels that it launches itself;
+on a real GPU, a library may launch a few more. Steps use a small view, because Triton's interpreter takes minutes to
+render a large one. Only the loss could depend on the size, so it is counted at the given size too.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SMALL = (64, 64)
 
 
 def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str, Any]:
-    """Count the first step of a view, a later one, and the loss of a small and a large view."""
+    """Count the work of a view's first step, of a later step, and of the loss on a small and a large view."""
     settings = make_settings(
         steps_coarse=0,
         steps_sos=2,
@@ -47,7 +47,7 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
     with pretend_cuda() as counts:
         weights = comparing_pixels(tiny_weights("vgg19"))  # as with feature scale `even`
         plan, planning_context = make_plan(scene, cameras(1, *SMALL), settings, weights=weights)
-        plan = replace(plan, precision=precision)  # whatever is fastest on this processor
+        plan = replace(plan, precision=precision)  # independent of what is fastest on this processor
         kept = planning_context if plan.precision == planning_context.network.precision else None
         stylizer = Stylizer(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, planning_context=kept)
         steps = []
@@ -70,7 +70,7 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
 
 
 def launches_of(loss: SosLoss, counts: Counts, size: tuple[int, int], scan: bool) -> int:
-    """Count the launches of the loss, with gradient, of a view (height, width) in three scales."""
+    """Count the kernel launches of loss and gradient of a view at three scales; `size` is (height, width)."""
     assert loss.scale_count(*size) == 3
     image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0)).to("cuda")
     view = loss.view_target(image.flip(0), image[..., 0] if scan else None)
@@ -81,12 +81,12 @@ def launches_of(loss: SosLoss, counts: Counts, size: tuple[int, int], scan: bool
 
 
 def totals(counts: Counts) -> dict[str, int]:
-    """Return the totals over all lines."""
+    """Return the totals over all lines of code."""
     return {kind: getattr(counts, kind).total() for kind in ("launches", "waits", "copies")}
 
 
 def main() -> int:
-    """Count and print."""
+    """Count the work, then print and store it."""
     torch.set_num_threads(2)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", default="980x545", help="of a large view, WIDTHxHEIGHT")

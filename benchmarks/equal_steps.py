@@ -1,12 +1,13 @@
-"""Comparison of settings after the same number of steps, on novel views, by a network that no run optimizes.
+"""Comparison of settings after the same number of steps, on novel views, by a network that is not part of the loss.
 
 python -m benchmarks.equal_steps SCENE CAMERAS|orbit:N STYLE NAME 'ROW={"content_weight": 3000}' 'ROW=...'
 
-Every row has settings in JSON that override the standard preset. `factor` scales all features of VGG16 by a number (1
-leaves the network as it is), or each layer by its own ({"relu1_1": 16, "relu2_1": 8}; later layers follow). Rows are
-added to benchmarks/results/equal_steps.json, under NAME. With several seeds, figures are means, and "spread" is the
-largest difference between two seeds. "sliced" is a color distance that neither a loss nor a start optimizes: the sliced
-Wasserstein distance of the pixels' colors from the style's, in 8-bit levels.
+Each row is a JSON object of settings that override the standard preset. The additional setting `factor` scales VGG16's
+features: a number scales all layers (1 = unchanged), an object individual layers ({"relu1_1": 16, "relu2_1": 8}). A
+layer without a factor takes that of the previous layer. Results are added to benchmarks/results/equal_steps.json, under
+NAME. With several seeds, figures are means, and "spread" is the largest difference between two seeds. "sliced" is the
+sliced Wasserstein distance between the colors of pixels and style, in 8-bit levels; no loss term and no color
+initialization optimizes it.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ from sgsst_core.report.contact_sheet import write_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Number of views on the sheet.
+#: Number of views on the contact sheet.
 SHOWN = 3
 COLUMNS = ("style", "color_distance", "sliced", "content", "features", "background_sensitivity", "saturated", "seconds")
-#: Number of color directions, and of quantiles along each, in the sliced distance.
+#: Number of color directions of the sliced distance, and number of quantiles along each.
 DIRECTIONS, QUANTILES = 64, 1024
 
 
 def main() -> None:
-    """Run, print and store."""
+    """Run all rows, then print and store the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("cameras", help="camera file, or orbit:N")
@@ -81,7 +82,7 @@ def main() -> None:
 
 
 def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
-    """Make a judge of all views between those of a job."""
+    """Return a judge of the novel views between a job's views."""
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
     novel_views = make_novel_views(stylizer)
     views = [novel_views.cameras[index] for index in novel_views.views]
@@ -96,7 +97,7 @@ def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[st
 
 
 def sliced_distance(pictures: list[torch.Tensor], palette: torch.Tensor) -> float:
-    """Return the sliced Wasserstein distance, of order 2, of a view's covered pixels from a palette, in 8-bit levels.
+    """Return the order-2 sliced Wasserstein distance of a view's covered pixels from a palette, in 8-bit levels.
 
     Args:
         pictures: Renders of the view [h, w, 3], on black and on white.
@@ -121,7 +122,7 @@ def quantiles(picture: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
 def _run(
     scene: Scene, cameras: list[Camera], style: torch.Tensor, values: dict[str, Any]
 ) -> tuple[torch.Tensor, float]:
-    """Run a job. Returns its colors [N, 3] and the processor seconds of the steps."""
+    """Run a job, and return its colors [N, 3] and the CPU seconds of its steps."""
     weights = _weights(values.pop("factor", None))
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **values), weights=weights)
     before = time.process_time()
@@ -141,7 +142,7 @@ def _weights(factor: float | dict[str, float] | None) -> BackboneWeights:
 
 
 def _mean(found: list[dict[str, float]]) -> dict[str, Any]:
-    """Return the mean over seeds."""
+    """Return means over seeds, and spreads between them."""
     mean: dict[str, Any] = {name: sum(row[name] for row in found) / len(found) for name in found[0]}
     mean["seeds"] = len(found)
     if len(found) > 1:
@@ -155,7 +156,7 @@ def _print(name: str, row: dict[str, Any]) -> None:
 
 
 def _store(arguments: argparse.Namespace, rows: dict[str, Any]) -> None:
-    """Add rows to the stored ones of the pair."""
+    """Add rows to the stored results of the same scene and style."""
     path = RESULTS / "equal_steps.json"
     pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
     told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
@@ -167,7 +168,7 @@ def _store(arguments: argparse.Namespace, rows: dict[str, Any]) -> None:
 
 
 def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
-    """Write the colors, and a sheet with a row of views per setting."""
+    """Write each row's colors, and a contact sheet with one row of views per setting."""
     folder.mkdir(parents=True, exist_ok=True)
     rows = [(way, [judge.pictures(sh_dc, view)[0] for view in judge.cameras[:SHOWN]]) for way, sh_dc in colors.items()]
     write_rows(folder / f"{name}.jpg", style, rows)

@@ -1,10 +1,10 @@
-"""Random kills of ranks, Ray and the driver in small jobs: what each fault costs, and whether results stay correct.
+"""Random kills of ranks, Ray processes and the driver of small jobs: cost of each fault, and correctness of results.
 
 python -m benchmarks.faults [--faults 33] [--drivers 3] [--seed 0]
 
-Jobs run on two ranks on this machine, with one fault per attempt and several attempts per job. Results go to
-benchmarks/results/faults.json: for each fault its kind, the steps lost, and the seconds until the first step after it;
-for each job its loss against that of an undisturbed one.
+Jobs run on two ranks on this machine, with one fault per attempt and several attempts per job. The results in
+benchmarks/results/faults.json are the kind of each fault, the number of steps lost, the seconds until the next step,
+and the final loss of each job compared with that of an undisturbed job.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from worker.ranks.listener import Listener
 from worker.request import StylizeRequest
 
 STEPS = 250
-#: Faults per job; an attempt makes some dozen steps before its fault.
+#: Number of faults per job. An attempt makes a few dozen steps before its fault.
 FAULTS_A_JOB = 9
 CHECKPOINT_SECONDS, RANK_TIMEOUT = 0.5, 5.0
-#: Out of ten faults: number of ranks that are stopped instead of killed, and of kills of Ray's own processes.
+#: Of ten faults: number that suspend a rank (SIGSTOP) instead of killing it, and number that kill a Ray process.
 STOPPED, DAEMONS = 2, 1
 
 
@@ -52,14 +52,14 @@ class DaemonFault:
 
 
 def random_faults(chance: random.Random) -> Iterator[Fault | DaemonFault]:
-    """Yield random faults that cycle through all places in the code where one can happen."""
+    """Yield random faults that cycle through all functions in which a fault can be injected."""
     for number, place in enumerate(itertools.cycle(get_args(Place))):
         if number % 10 < DAEMONS:
             yield DaemonFault(chance.choice(["raylet", "gcs_server"]), chance.randint(3, 12))
             continue
         what: Literal["SIGKILL", "SIGSTOP"] = "SIGSTOP" if chance.random() < STOPPED / 10 else "SIGKILL"
         rank = 0 if place == "checkpoint" else chance.randint(0, 1)
-        # Checkpoints are written twice a second, and values are gathered only during preparation.
+        # These functions are called less often: a checkpoint twice a second, `all_gather` only during preparation.
         call = chance.randint(*{"checkpoint": (2, 5), "all_gather": (2, 8)}.get(place, (20, 60)))
         # Half of the faults happen immediately, the others during an operation that takes some milliseconds.
         yield Fault(rank, place, call, what, chance.choice([0.0, chance.uniform(0, 0.005)]))
@@ -71,7 +71,7 @@ class Chaos:
     Args:
         request: Job.
         cluster: Ray cluster that runs it.
-        faults: Queue of faults; one that has not happened when the job ends is returned to it.
+        faults: Queue of faults; a fault that has not occurred when the job ends is put back.
     """
 
     def __init__(self, request: StylizeRequest, cluster: Cluster, faults: list[Fault | DaemonFault]) -> None:
@@ -80,7 +80,7 @@ class Chaos:
         self._faults = faults
         self._current: Fault | DaemonFault | None = None
         self._reports = 0
-        self._at: float | None = None  # time of the current fault, in seconds since the epoch
+        self._at: float | None = None  # time of the current fault in seconds since the epoch
         self.found: list[dict[str, Any]] = []
         self._arm()
 
@@ -92,7 +92,7 @@ class Chaos:
         if self._current is not None:
             self._faults.append(self._current)
         for entry, attempt in zip(self.found, ended.attempts, strict=True):
-            entry.pop("at", None)  # only left if the next fault came before anything ran again
+            entry.pop("at", None)  # still present if the next fault occurred before the job made a step
             entry |= {
                 "reason": attempt.reason,
                 "steps_lost": attempt.last_step - attempt.saved_step,
@@ -121,7 +121,7 @@ class Chaos:
         if isinstance(self._current, Fault):
             at = fired(self._request)
             self._at = None if at is None else at + self._current.delay
-        if self._current is None or self._at is None:  # no fault: a rank that was slow to answer on a busy machine
+        if self._current is None or self._at is None:  # not an injected fault: a rank responded late on a busy machine
             self.found.append({"fault": {"what": "none"}, "at": time.time()})
             return
         self.found.append({"fault": asdict(self._current), "at": self._at})
@@ -130,7 +130,7 @@ class Chaos:
 
 
 def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
-    """Kill the command itself after a random time, then run it again, resumed if there is a checkpoint."""
+    """Kill the `sgsst` command after a random time, then run it again; resume if there is a checkpoint."""
     request = small_request(folder, STEPS)
     source = request.source
     arguments = ["stylize", str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
@@ -150,7 +150,7 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
     process.wait()
     _, alive = psutil.wait_procs(family, timeout=30)
     seconds = time.monotonic() - started
-    time.sleep(2)  # the folder is deleted last
+    time.sleep(2)  # Ray deletes its folder last
     saved = request.out.with_name("s.checkpoint.safetensors").exists()
     again = subprocess.run([*command, *(["--resume"] if saved else [])], capture_output=True, text=True)
     return {
@@ -166,7 +166,7 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run, print and store."""
+    """Run all jobs, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--faults", type=int, default=33)
     parser.add_argument("--drivers", type=int, default=3)

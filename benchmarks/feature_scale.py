@@ -1,11 +1,12 @@
-"""Feature scale of the paper's network, inferred from published logs, for docs/quality.md.
+"""Feature scale of the paper's network, inferred from published optimization logs, for docs/quality.md.
 
 python -m benchmarks.feature_scale factors PICTURE...
 python -m benchmarks.feature_scale log CONTENT STYLE [--scales none,paper,even] [--iterations 50]
 
-`factors` prints, for each image, how many times smaller VGG16's features are than the original VGG19's, by layer. `log`
-repeats the optimization whose loss Gatys et al. published (Gram weights 1e3 / c^2, content 1, L-BFGS from the content,
-512 pixels), with VGG16 at several scales. Results are added to benchmarks/results/feature_scale.json.
+`factors` prints for each image and layer by which factor VGG16's features are smaller than the original VGG19's. `log`
+repeats the optimization whose loss values Gatys et al. published (Gram weights 1e3 / c^2, content weight 1, L-BFGS
+starting from the content image, 512 pixels), with VGG16 at several feature scales. Results are added to
+benchmarks/results/feature_scale.json.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ GRAM_WEIGHT = 1e3
 
 
 def main() -> None:
-    """Run the command, print and store its figures."""
+    """Run the command, then print and store its figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     factors = commands.add_parser("factors")
@@ -61,7 +62,7 @@ def _print_factors(weights: BackboneWeights, picture: Path) -> dict[str, float]:
 
 
 def _pixels(path: Path) -> Tensor:
-    """Load an image as [h, w, 3] in 0 to 1, with a longer side of `SIDE` pixels."""
+    """Load an image [h, w, 3] with values from 0 to 1, resized so that its longer side has `SIDE` pixels."""
     with Image.open(path) as picture:
         width, height = (round(side * SIDE / max(picture.size)) for side in picture.size)
         small = picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
@@ -75,7 +76,7 @@ def _gram(features: Tensor) -> Tensor:
 
 
 def _optimize(network: FeatureNetwork, content: Tensor, style: Tensor, iterations: int) -> dict[str, float]:
-    """Run L-BFGS from the content image, on pixels in units of 0 to 255. Returns the first and the last loss."""
+    """Run L-BFGS from the content image, on pixel values from 0 to 255, and return the first and the last loss."""
     grams = {layer: _gram(features) for layer, features in _forward(network, style).features.items()}
     kept = _forward(network, content).features[CONTENT_LAYER]
     pixels = (255 * content).clone().requires_grad_()
@@ -98,7 +99,7 @@ def _forward(network: FeatureNetwork, pixels: Tensor, *, keep: bool = False) -> 
 def _loss_and_gradient(
     network: FeatureNetwork, pixels: Tensor, grams: dict[str, Tensor], kept: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return Gatys' loss of pixels [h, w, 3] in 0 to 1, and its gradient in units of 0 to 255."""
+    """Return Gatys' loss of pixels [h, w, 3] from 0 to 1, and its gradient with respect to pixels from 0 to 255."""
     total = torch.zeros((), dtype=torch.float64)
 
     def add(layer: str, features: Tensor, gradient: Tensor) -> None:
@@ -119,7 +120,7 @@ def _loss_and_gradient(
 
 
 def _store(name: str, figures: dict[str, Any]) -> None:
-    """Add figures to the stored ones."""
+    """Add figures to the result file."""
     path = RESULTS / "feature_scale.json"
     earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     parts = {key: earlier[key] for key in ("factors", "log") if key in earlier}

@@ -1,12 +1,12 @@
-"""Simulation of a fleet with the service's own queue, fairness, leases and packing, under a simulated clock.
+"""Simulation of a GPU fleet under a simulated clock, with the service's own queue, fairness, leases and packing.
 
 python -m benchmarks.fleet [--gpus 1000] [--hours 6] [--load 0.9]
 python -m benchmarks.fleet --database [--queued 10000]
 
-It shows how well a fleet uses its GPUs, how long jobs wait by size and by key, and what failing hosts cost. With
-`--database` it measures the load on one PostgreSQL server instead, with real dispatchers' statements and a long queue.
-Only the jobs (`benchmarks.fleet_parts.demand`) and the passing of time are simulated; see
-`benchmarks.fleet_parts.simulation`.
+The simulation reports GPU utilization, how long jobs wait by size and by API key, and the cost of host failures. With
+`--database`, it instead measures the load on one PostgreSQL server, by executing real dispatchers' statements on a long
+queue. Only the jobs (`benchmarks.fleet_parts.demand`) and the passage of time
+(`benchmarks.fleet_parts.simulation`) are simulated.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _GPUS_EACH = 8
 
 
 def simulate(demand: Demand, hours: float, host_days: float, seed: int, patience: float = math.inf) -> dict[str, Any]:
-    """Return the figures of a fleet with eight GPUs per host; the first quarter of the hours is warm-up."""
+    """Simulate a fleet with eight GPUs per host, and return its figures; the first quarter of `hours` is warm-up."""
     seconds = hours * 3600
     started = time.perf_counter()
     with tempfile.TemporaryDirectory(dir=_MEMORY if _MEMORY.is_dir() else None, prefix="sgsst-fleet-") as folder:
@@ -53,14 +53,14 @@ def simulate(demand: Demand, hours: float, host_days: float, seed: int, patience
 
 
 def _stored() -> dict[str, Any]:
-    """Return the results of earlier runs, without their machine, which every run describes itself."""
+    """Return the results of earlier runs, without the machine description, which each run writes again."""
     path = RESULTS / "fleet.json"
     known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return {name: known[name] for name in ("simulated", "database") if name in known}
 
 
 def main() -> None:
-    """Simulate or measure, print and store."""
+    """Simulate or measure, then print and store the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--gpus", type=int, default=1000)
     parser.add_argument("--hours", type=float, default=6.0)

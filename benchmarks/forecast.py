@@ -1,11 +1,11 @@
-"""Forecast of a step on one H200 from counted operations, bytes and launches, for comparison with measurements.
+"""Forecast of the time of a step on one H200, from counted operations, bytes and kernel launches.
 
 python -m benchmarks.forecast [--launches 494]
 
-Nothing here is measured on a GPU: peaks come from the data sheet, and `SHARES` below assumes how much of them is
-reached. Feature network, image pyramid, colors and content loss are counted by running the project's own code on
-tensors without values; Triton's kernels are counted from their source, and the rasterizer from pairs of Gaussian and
-raster tile.
+Nothing here is measured on a GPU: peak rates come from the data sheet, and `SHARES` below contains assumed fractions of
+them. The work of feature network, image pyramid, colors and content loss is counted by running the project's own code
+on meta tensors, which have no values. The work of Triton kernels is counted from their source, that of the rasterizer
+from the number of pairs of a Gaussian and a raster tile.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings
 
-#: Peaks of the H200 SXM from the data sheet, dense: operations per second by precision, bytes per second, bytes of
-#: memory and of L2.
+#: Peak rates of the H200 SXM from the data sheet, without sparsity: operations per second by precision; memory
+#: bandwidth in bytes per second; sizes of memory and L2 cache in bytes.
 PEAKS = {"bfloat16": 989e12, "tf32": 495e12, "float32": 67e12}
 BANDWIDTH, MEMORY, L2 = 4.8e12, 141e9, 50e6
-#: Instructions of single threads per second: the data sheet counts a fused multiply-add as two float32 operations.
+#: Thread instructions per second: the data sheet counts a fused multiply-add as two float32 operations.
 LANES = PEAKS["float32"] / 2
 PRECISIONS = ("float32", "tf32", "bfloat16")
-#: Launches of a step on a fully cached view: an object scan in bfloat16, as counted by `device_counts`.
+#: Kernel launches of a step on a fully cached view of an object scan in bfloat16, as counted by `device_counts`.
 LAUNCHES = 494
-#: Launches to compute a view's tile intersections: two sorts in passes, a sum in passes, kernels and copies.
+#: Launches to compute a view's tile intersections: two multi-pass sorts, a multi-pass sum, kernels and copies.
 LIST_LAUNCHES = 40
 #: Instructions per pixel for a pair of Gaussian and raster tile, from the source of `blend_weights` and its callers:
-#: about 30 for the weight, including two functions at a quarter of the rate or less, and the rest for three colors.
+#: about 30 for the weight, including two functions at a quarter of the rate or less, and 15 for three color channels.
 PIXEL_INSTRUCTIONS = 45
-#: Fraction of the scene's Gaussians that are visible. The pairs per Gaussian in `JOBS` are those of the biker's 152,605
-#: Gaussians at widths of 980 and 5187; most are a few pixels wide, as in large scenes. (The plush toy's are larger:
-#: 12.8 and 236 pairs.)
+#: Fraction of the scene's Gaussians that are visible in a view. `Job.pairs_each` in `JOBS` was counted on the biker
+#: scene (152,605 Gaussians) at widths of 980 and 5187 pixels. Most of its Gaussians are a few pixels wide, as in large
+#: scenes. The Gaussians of the plush toy are larger and have 12.8 and 236 pairs each.
 VISIBLE_SHARE = 0.5
 #: Bytes of tile intersections per visible Gaussian, and per pair.
 LIST_BYTES = (80, 8)
@@ -59,15 +59,15 @@ LIST_BYTES = (80, 8)
 
 @dataclass(frozen=True)
 class Shares:
-    """Fractions of the peaks that are reached.
+    """Assumed fractions of the peak rates.
 
     Attributes:
         convolution: Fraction of `PEAKS` for convolutions, by precision.
         matrix: Fraction of `PEAKS` for Triton's feature products, in TF32 or float32 ("ieee").
         bandwidth: Fraction of the memory bandwidth.
         lanes: Fraction of `LANES` for the rasterizer.
-        blended: Fraction of the pairs of Gaussian and tile that come before the tile is opaque.
-        launch: Seconds of the host per launch.
+        blended: Fraction of the pairs of Gaussian and tile that are blended before the tile is opaque.
+        launch: CPU seconds per kernel launch.
     """
 
     convolution: Mapping[str, float]
@@ -78,7 +78,7 @@ class Shares:
     launch: float
 
     def rates(self, precision: str) -> dict[str, float]:
-        """Return operations and bytes per second, for `Work.seconds`."""
+        """Return the operations and bytes per second that `Work.seconds` expects."""
         product = matrix_precision(torch.bfloat16 if precision == "bfloat16" else torch.float32)
         return {
             "convolution": PEAKS[precision] * self.convolution[precision],
@@ -127,8 +127,8 @@ class Job:
         return self.pairs_each * self.visible
 
 
-#: A scene of Tanks and Temples, and the garden of Mip-NeRF 360 at full size, which took 25.5 hours on an A100 in the
-#: paper.
+#: Typical scene of Tanks and Temples, and the garden scene of Mip-NeRF 360 at full size, for which the paper reports
+#: 25.5 hours on an A100.
 JOBS = {
     "980x545": Job((545, 980), 2_500_000, 2.5, 250),
     "5187x3361": Job((3361, 5187), 5_800_000, 15.0, 185),
@@ -137,7 +137,7 @@ JOBS = {
 
 @dataclass(frozen=True)
 class Part:
-    """Part of a step: its launches, how often a step has it, and how many launches are not included in `LAUNCHES`."""
+    """Part of a step: work of each launch, mean repetitions per step, and number of launches not in `LAUNCHES`."""
 
     works: Sequence[Work]
     visits: float = 1.0
@@ -145,7 +145,7 @@ class Part:
 
 
 def shapes_of(name: str) -> BackboneWeights:
-    """Return a network's weights as shapes without values."""
+    """Return a network's weights as meta tensors, which have shapes but no values."""
     layers, channels = {}, 3
     for block, count in enumerate(BLOCKS[name], start=1):
         for index in range(1, count + 1):
@@ -163,12 +163,12 @@ def make_loss(precision: str) -> SosLoss:
 
 
 def memory_limit() -> float:
-    """Return the bytes that a job plans with (`budget.default_memory_limit`)."""
+    """Return the memory limit in bytes that a job has by default (`budget.default_memory_limit`)."""
     return GPU_SHARE * MEMORY
 
 
 class Passes:
-    """Parts of the loss of a view on some scales."""
+    """Work of the parts of a view's loss at the given scales."""
 
     def __init__(self, loss: SosLoss, size: Size, scales: Sequence[int]) -> None:
         self.loss, self.size = loss, size
@@ -178,7 +178,7 @@ class Passes:
         self.kept = loss.tiling.kept([tile.outer.pixels for tile, _ in self.tiles])
 
     def network(self) -> tuple[list[Work], list[Work]]:
-        """Return the work of the forward pass, and of the backward pass including recomputed activations."""
+        """Return the work of forward pass and backward pass; the latter includes recomputing activations."""
         forward, backward = [], []
         for (tile, _), kept in zip(self.tiles, self.kept, strict=True):
             outer = tile.outer
@@ -191,7 +191,7 @@ class Passes:
         return forward, backward
 
     def style(self) -> tuple[list[Work], list[Work]]:
-        """Return the work of the statistics and their comparison, and of the style gradient."""
+        """Return the work of computing and comparing statistics, and that of the style gradient."""
         size = self.loss.network.dtype.itemsize
         pieces = [
             (self.loss.network.channels(layer), _cells(layer, tile, scaled))
@@ -222,7 +222,7 @@ class Passes:
         return counted.works
 
     def added_up(self) -> list[Work]:
-        """Return the work of adding the scales' gradients to that of the image."""
+        """Return the work of adding the gradients of all scales to the image gradient."""
         with Counted() as counted:
             for scale, scaled in self.sizes.items():
                 add_upscaled_(meta(*self.size, 3), meta(*scaled, 3), scale)
@@ -234,17 +234,17 @@ def _cells(layer: str, tile: PartitionTile, size: Size) -> int:
 
 
 def statistics(channels: int, positions: int, size: int) -> Work:
-    """Return the work of `fused_kernels.shifted_moments` and the kernels that follow it.
+    """Return the work of `fused_kernels.shifted_moments` and its subsequent kernels.
 
     Args:
         channels: Number of channels of the layer.
         positions: Number of feature cells.
-        size: Bytes of a feature.
+        size: Bytes per feature value.
     """
     tiles = -(-channels // TILE)
     pairs = tiles * (tiles + 1) // 2
-    # Each pair of tiles reads both, or one on the diagonal. Spans are the outer loop, so a layer larger than the cache
-    # is read from memory every time.
+    # Each pair of channel tiles reads both tiles, or one on the diagonal. Spans are the outer loop, so a layer larger
+    # than the L2 cache is read from memory each time.
     reads = tiles if channels * positions * size > L2 else 1
     spans = -(-positions // (SPAN_VALUES // channels))
     moved = reads * channels * positions * size + 2 * spans * channels**2 * 4
@@ -254,7 +254,7 @@ def statistics(channels: int, positions: int, size: int) -> Work:
 def style_gradient(channels: int, positions: int, size: int) -> Work:
     """Return the work of `fused_kernels.add_style_gradient`.
 
-    Every tile of channels reads all features; its own gradient is read and written.
+    Each channel tile reads all features, and reads and writes its own part of the gradient.
     """
     tiles = -(-channels // TILE)
     reads = tiles if channels * positions * size > L2 else 1
@@ -264,14 +264,14 @@ def style_gradient(channels: int, positions: int, size: int) -> Work:
 def render(job: Job) -> list[Work]:
     """Return the work of a render with cached tile intersections.
 
-    Each pair reads its rank, eight float64 values and a color; each pixel writes its color and transmittance.
+    Each pair reads its depth-order index, eight float64 values and a color. Each pixel writes color and transmittance.
     """
     pixels = job.size[0] * job.size[1]
     return [Work(_blending(job), job.pairs * (4 + 64 + 8 + 12) + 16 * pixels, "lanes")]
 
 
 def raster_gradient(job: Job) -> list[Work]:
-    """Return the work of clearing, writing and adding up the slots, and of the gradient [N, 3]."""
+    """Return the work of clearing, writing and summing the gradient slots of pairs, and of the gradient [N, 3]."""
     pixels = job.size[0] * job.size[1]
     return [
         Work(_blending(job), job.pairs * (8 + 64 + 24) + 12 * pixels, "lanes"),
@@ -286,8 +286,8 @@ def _blending(job: Job) -> float:
 def lists(job: Job) -> list[Work]:
     """Return the work to compute tile intersections.
 
-    This is the projection, and two sorts with 8-byte indices: one of 8-byte depths, one of 4-byte tiles. A sort handles
-    one byte of the key per pass, and each pass reads and writes keys and indices.
+    The work consists of the projection and two radix sorts with 8-byte indices: one by 8-byte depths, one by 4-byte
+    tile numbers. Each pass sorts by one byte of the key, and reads and writes all keys and indices.
     """
     depths, tiles = 8 * 2 * 16 * job.gaussians, 4 * 2 * 12 * job.pairs
     gathered = 40 * job.gaussians + 128 * job.visible + 36 * job.pairs
@@ -295,12 +295,12 @@ def lists(job: Job) -> list[Work]:
 
 
 def rest(job: Job) -> list[Work]:
-    """Return the work for the frozen part of the colors (SH of degree 3): one launch, each coefficient read once."""
+    """Return the work of evaluating the frozen SH coefficients (degree 3): one launch, each coefficient read once."""
     return [Work(0, (15 * 12 + 12 + 12) * job.gaussians)]
 
 
 def colors(job: Job) -> list[Work]:
-    """Return the work for a view's colors, their gradient, and Adam, which reads four tensors and writes three."""
+    """Return the work of a view's colors, of their gradient, and of Adam, which reads four tensors and writes three."""
     values = meta(job.gaussians, 3)
     with Counted() as counted:
         view_colors(values, values)
@@ -314,7 +314,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
     Args:
         job: Scene and views.
         precision: Precision of the feature network.
-        coarse: Whether the step is one of phase 1, on the coarsest scale alone.
+        coarse: Whether the step belongs to phase 1, which uses the coarsest scale alone.
         everything_kept: Whether content features, intersections and frozen colors of all views are cached.
     """
     loss = make_loss(precision)
@@ -344,7 +344,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
 
 
 def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
-    """Return the fractions of views whose content features, intersections and frozen colors fit the caches."""
+    """Return the fractions of views whose content features, tile intersections and frozen colors fit the caches."""
     views = memory_for("views", int(memory_limit()))
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
     count = loss.scale_count(*job.size)
@@ -361,7 +361,7 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
 
 
 def step_seconds(parts: Mapping[str, Part], shares: Shares, precision: str, launches: int) -> dict[str, float]:
-    """Return the device's seconds by part, the host's, and the total, which is the larger of both sums."""
+    """Return GPU seconds by part, CPU seconds, and the total: the maximum of both sums."""
     rates = shares.rates(precision)
     seconds = {name: part.visits * sum(w.seconds(rates) for w in part.works) for name, part in parts.items()}
     host = shares.launch * (launches + sum(part.visits * part.more_launches for part in parts.values()))
@@ -369,7 +369,7 @@ def step_seconds(parts: Mapping[str, Part], shares: Shares, precision: str, laun
 
 
 def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
-    """Return the seconds of a step by phase, with and without everything cached, and the hours of the paper's job."""
+    """Return seconds per step in each phase, with and without complete caches, and the hours of the paper's job."""
     kinds: dict[str, dict[str, bool]] = {
         "sos": {},
         "coarse": {"coarse": True},
@@ -397,7 +397,7 @@ def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
 
 
 def table(found: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the milliseconds of a step as Markdown, by precision: the likely value, with the range in parentheses."""
+    """Return a Markdown table of milliseconds per step by precision: likely value, and range in parentheses."""
     lines = ["| part of a step, ms | " + " | ".join(found) + " |", "|---|" + "---:|" * len(found)]
     first = next(iter(found.values()))["sos"]["likely"]
 
@@ -419,7 +419,7 @@ def table(found: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Forecast, print and store."""
+    """Compute the forecast, then print and store it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--launches", type=int, default=LAUNCHES, help="of a step")
     arguments = parser.parse_args()

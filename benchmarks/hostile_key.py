@@ -1,10 +1,10 @@
-"""How long one key's small submissions take while another key does its worst.
+"""Latency of one API key's small submissions while another key attacks the service.
 
 python -m benchmarks.hostile_key [--parallel 16] [--seconds 60] [--result NAME]
 
-One key sends costly requests, 16 at a time: files that take long to check, dry runs, large bodies that are refused, and
-uploads that are created and deleted. Meanwhile another key submits small jobs one after the other, each with files that
-the service has not seen. The aim is a 99th percentile below 2 s. Client and service share the machine.
+One key sends costly requests, 16 at a time: files that are slow to validate, dry runs, large bodies that are refused,
+and uploads that are created and deleted. Meanwhile, another key submits small jobs one after the other, each with files
+that are new to the service. The target is a 99th percentile below 2 s. Client and service run on the same machine.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _SETTINGS = {
 }
 _TUS = {"Tus-Resumable": "1.0.0"}
 _QUICK = {"preset": "preview", "backbone": "vgg16", "resolution": 128}
-#: Bytes of a body that is refused at its end.
+#: Bytes of a request body that is refused only after its last byte.
 _LARGE = 60_000_000
-#: Seconds for which the hostile key waits for an answer, and the other one.
+#: Timeout in seconds for responses to the hostile key, and for responses to the other key.
 _PATIENCE, _SHORT_PATIENCE = 600.0, 60.0
 
 Files = dict[str, bytes]
@@ -51,7 +51,7 @@ Costly = Callable[[httpx.AsyncClient, Files, int], Awaitable[httpx.Response]]
 
 
 def costly_files(folder: Path) -> Files:
-    """A scene behind all of its 2,000 cameras: each of them is tried before the answer."""
+    """Write a scene with 2,000 cameras that all look away from it, so that validation has to try each camera."""
     scene = wall(500, 400)
     scene.means[:, 2] = -3
     write_scene(folder / "behind.ply", scene)
@@ -75,7 +75,7 @@ def _views(count: int) -> list[dict[str, Any]]:
 
 
 def form(files: Files, number: int) -> dict[str, Any]:
-    """A form whose files are new to the service: a number of spaces and line ends makes the cameras' content differ."""
+    """Return a multipart form whose files are new to the service: `number` determines whitespace in the camera file."""
     new = files["cameras"] + f"{number:064b}".replace("0", " ").replace("1", "\n").encode()
     names = {"scene": "scene.ply", "cameras": "cameras.json", "style": "style.png"}
     parts = [(role, (names[role], content)) for role, content in {**files, "cameras": new}.items()]
@@ -113,7 +113,7 @@ ATTACKS: dict[str, Costly] = {
 
 
 def attack(url: str, key: str, name: str, files: Files, parallel: int, statuses: Any) -> None:
-    """Send requests of one kind until the process is ended; count their answers."""
+    """Send requests of one kind until the process is killed, and count response statuses."""
 
     async def one(client: httpx.AsyncClient, numbers: itertools.count[int]) -> None:
         while True:
@@ -134,7 +134,7 @@ def attack(url: str, key: str, name: str, files: Files, parallel: int, statuses:
 
 
 def submissions(url: str, key: str, files: Files, seconds: float) -> dict[str, Any]:
-    """Small jobs one after the other, and how long each took to be accepted."""
+    """Submit small jobs one after the other, and return the time until each one was accepted."""
     took: list[float] = []
     statuses: Counter[str] = Counter()
     small = {role: files[role] for role in ("scene", "cameras", "style")}
@@ -153,7 +153,7 @@ def submissions(url: str, key: str, files: Files, seconds: float) -> dict[str, A
 
 
 def measure(folder: Path, parallel: int, seconds: float) -> dict[str, Any]:
-    """Percentiles of the small submissions: alone, and beside each attack."""
+    """Return percentiles of the small submissions' times, without an attack and during each kind of attack."""
     (folder / "inputs").mkdir()
     ply, views, style = write_files(folder / "inputs", wall())
     files = {"scene": ply.read_bytes(), "cameras": views.read_bytes(), "style": style.read_bytes()}
@@ -163,7 +163,7 @@ def measure(folder: Path, parallel: int, seconds: float) -> dict[str, Any]:
         store = open_store(ServiceSettings(data=service.data))
         hostile, other = (store.keys.create(name)[1] for name in ("hostile", "other"))
         store.close()
-        submissions(service.url, other, files, 1)  # what is loaded once
+        submissions(service.url, other, files, 1)  # warm-up: modules and data that are loaded once
         figures["alone"] = submissions(service.url, other, files, seconds / 4)
         print("alone", figures["alone"], flush=True)
         context = multiprocessing.get_context("spawn")
@@ -173,7 +173,7 @@ def measure(folder: Path, parallel: int, seconds: float) -> dict[str, Any]:
                 arguments = (service.url, hostile, name, files, parallel, statuses)
                 process = context.Process(target=attack, args=arguments, daemon=True)
                 process.start()
-                time.sleep(10)  # until its requests wait for one another
+                time.sleep(10)  # until the attack's requests queue up
                 figures[name] = submissions(service.url, other, files, seconds)
                 process.kill()
                 process.join()
@@ -183,13 +183,13 @@ def measure(folder: Path, parallel: int, seconds: float) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, print and store."""
+    """Measure, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parallel", type=int, default=16)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--result", default="hostile_key", help="name of the result's file")
     arguments = parser.parse_args()
-    load = [round(value, 2) for value in psutil.getloadavg()]  # of what else the machine does
+    load = [round(value, 2) for value in psutil.getloadavg()]  # load from other programs
     with tempfile.TemporaryDirectory(prefix="sgsst-hostile-") as folder:
         figures = measure(Path(folder), arguments.parallel, arguments.seconds)
     measured = {"processors": os.cpu_count(), "load_average_at_start": load, "parallel": arguments.parallel, **figures}

@@ -1,10 +1,10 @@
-"""Memory of the API under hostile requests: what it grows by, at its peak, during each of several attacks.
+"""Peak memory growth of the API during each of several attacks with hostile requests.
 
     python -m benchmarks.hostile_memory [--attacks trailers sign_in ...] [--name hostile_memory]
 
-Each attack runs against an API process of its own on loopback that asks for no key. The peak is the kernel's (`VmHWM`),
-counted from the state after a few ordinary requests. An attack is given up once the API has grown by 1 GB. The aim is a
-growth of at most 64 MB for every attack.
+Each attack runs against a separate API process on loopback, which requires no key. Growth is the difference between the
+peak that the kernel reports (`VmHWM`) and the memory after a few ordinary requests. An attack is stopped once the API
+has grown by 1 GB. The target is a growth of at most 64 MB for each attack.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from benchmarks.machine import write_result
 from tests.api.service import Service, wait_for
 
 MB = 1_000_000
-#: Growth that is allowed, and growth at which an attack is given up.
+#: Largest allowed growth, and growth at which an attack is stopped.
 ALLOWED, TOO_MUCH = 64 * MB, 1000 * MB
 _PIECE = b"X-Trailer: y\r\n" * (MB // 14)
 
 
 class Target:
-    """An API process under attack.
+    """API process under attack.
 
     Attributes:
-        answers: Number of answers by status; `none` for connections that closed without one.
+        answers: Number of responses by status; "none" for connections that were closed without a response.
     """
 
     def __init__(self, service: Service) -> None:
@@ -47,11 +47,11 @@ class Target:
         self._status = Path(f"/proc/{api.pid}/status")
         self._lock = threading.Lock()
         self.answers: Counter[str] = Counter()
-        Path(f"/proc/{api.pid}/clear_refs").write_text("5")  # the kernel counts the peak from here
+        Path(f"/proc/{api.pid}/clear_refs").write_text("5")  # reset the peak that the kernel reports
         self._before = self._memory("VmRSS")
 
     def growth(self) -> int:
-        """Return the bytes that the process has grown by at its peak."""
+        """Return the peak growth of the process in bytes."""
         return self._memory("VmHWM") - self._before
 
     def connect(self) -> socket.socket:
@@ -59,7 +59,7 @@ class Target:
         return socket.create_connection(self._address, timeout=60)
 
     def ask(self, request: bytes, connection: socket.socket | None = None) -> None:
-        """Send a request and count its answer."""
+        """Send a request, and count its response."""
         with contextlib.ExitStack() as stack:
             connection = connection or stack.enter_context(self.connect())
             with contextlib.suppress(OSError):
@@ -67,7 +67,7 @@ class Target:
             self.count(connection)
 
     def count(self, connection: socket.socket) -> None:
-        """Read the beginning of an answer and count its status."""
+        """Read the start of a response, and count its status."""
         answer = b""
         with contextlib.suppress(OSError):
             answer = connection.recv(65536)
@@ -86,7 +86,7 @@ def _request(first: str, kind: str, body: bytes) -> bytes:
 
 
 def trailers(target: Target) -> None:
-    """Send 1 GB of trailers to `/livez`; over another connection whenever one is closed."""
+    """Send 1 GB of trailers to `/livez`; reconnect whenever the connection is closed."""
     start = b"POST /livez HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n"
     sent = 0
     while sent < 1000 * MB and target.growth() < TOO_MUCH:
@@ -108,17 +108,17 @@ def sign_in(target: Target) -> None:
 
 
 def json_text(target: Target) -> None:
-    """Submit 1,000 jobs, on 200 connections at a time, as JSON of 1 MB in one string."""
+    """Submit 1,000 jobs, on 200 connections at a time, as JSON that contains one string of 1 MB."""
     _bodies(target, _request("POST /v1/jobs", "application/json", b'{"scene": "' + b"x" * (MB - 20) + b'"}'))
 
 
 def json_lists(target: Target) -> None:
-    """Submit 100 jobs, each on a connection of its own, as JSON of 1 MB in as many lists as possible."""
+    """Submit 100 jobs, each on a separate connection, as 1 MB of JSON that contains as many lists as possible."""
     _bodies(target, _request("POST /v1/jobs", "application/json", b'{"photos": [' + b"[]," * 333_000 + b"[]]}"), 100)
 
 
 def unfinished(target: Target) -> None:
-    """Keep 200 bodies of 1 MB open, all but their last byte sent."""
+    """Send 200 bodies of 1 MB except for their last bytes, and keep the connections open."""
     request = _request("POST /v1/jobs", "application/json", b'{"scene": "' + b"x" * (MB - 20) + b'"}')
     with contextlib.ExitStack() as stack, ThreadPoolExecutor(200) as pool:
         held = [stack.enter_context(target.connect()) for _ in range(200)]
@@ -128,16 +128,16 @@ def unfinished(target: Target) -> None:
                 connection.sendall(request[:-1])
 
         list(pool.map(hold, held))
-        time.sleep(2)  # what is in the kernel's buffers arrives
+        time.sleep(2)  # until the data in the kernel's buffers has arrived
 
 
 def pipelined(target: Target) -> None:
-    """Send 1,000,000 requests without reading an answer; over another connection whenever one is closed."""
+    """Send 1,000,000 requests without reading a response; reconnect whenever the connection is closed."""
     piece = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n" * 1000
     sent = 0
     while sent < 1000 and target.growth() < TOO_MUCH:
         with target.connect() as connection, contextlib.suppress(OSError):
-            connection.settimeout(10)  # the service may read no more
+            connection.settimeout(10)  # the service may stop reading
             while sent < 1000 and target.growth() < TOO_MUCH:
                 sent += 1
                 connection.sendall(piece)
@@ -153,12 +153,12 @@ def _held(target: Target, sent: bytes) -> None:
 
 
 def idle(target: Target) -> None:
-    """Keep 10,000 connections open that send nothing."""
+    """Keep 10,000 connections open without sending anything."""
     _held(target, b"")
 
 
 def kept_alive(target: Target) -> None:
-    """Keep 10,000 connections open after a request on each."""
+    """Send one request on each of 10,000 connections, and keep them open."""
     _held(target, b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n")
 
 
@@ -169,13 +169,13 @@ ATTACKS: dict[str, Callable[[Target], None]] = {
 
 
 def measure(name: str) -> dict[str, Any]:
-    """Run one attack against an API process of its own."""
+    """Run one attack against a new API process."""
     with (
         tempfile.TemporaryDirectory(prefix="sgsst-hostile-") as folder,
         Service(Path(folder) / "data", alone=True) as service,
         service.client() as client,
     ):
-        for _ in range(20):  # what is loaded once is no growth
+        for _ in range(20):  # warm-up: what is loaded once does not count as growth
             client.get("/v1/jobs")
             client.post("/v1/jobs", json={"scene": "x", "style": "x"})
         target = Target(service)
@@ -189,7 +189,7 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the attacks, print and store."""
+    """Run the attacks, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--attacks", nargs="+", choices=ATTACKS, default=list(ATTACKS))
     parser.add_argument("--name", default="hostile_memory", help="name of the result file")

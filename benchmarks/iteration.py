@@ -1,4 +1,4 @@
-"""Time of an iteration by part, on a real scene at 1280x720, and the fraction spent outside the feature network.
+"""Time of an iteration by part on a real scene at 1280x720, and fraction of it spent outside the feature network.
 
 python -m benchmarks.iteration SCENE.ply CAMERAS STYLE [--views 3] [--rounds 2]
 """
@@ -20,7 +20,7 @@ NETWORK = ("vgg_forward", "vgg_backward", "network")
 
 
 def main() -> None:
-    """Measure, print and store."""
+    """Measure, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("cameras", type=Path)

@@ -1,11 +1,12 @@
-"""Scenes of millions of Gaussians on the CPU: time and memory of reading, survey, rendering and unseen Gaussians.
+"""Time and memory on the CPU of reading, surveying, rendering and completing scenes of millions of Gaussians.
 
     python -m benchmarks.large_scene [--millions 1 4 12] [--views 4] [--parts reading survey ...] [--write FOLDER]
 
-The plush scene is multiplied: each copy of a Gaussian is moved by up to its size, and scales are reduced to keep the
-total volume. If the data is missing, a generated scene is used. Everything is seeded. Every size runs in a process of
-its own, so that its memory peak is its own. Optimized code is timed against a plain version in the same process; only
-the ratio counts, because seconds depend on what else the machine does. `--write` keeps the scenes for use with `sgsst`.
+Large scenes are made from the plush scene, or from a generated one if it is missing: each Gaussian is copied several
+times, copies are moved by up to the Gaussian's size, and scales are reduced so that the total volume stays the same.
+Everything is seeded. Each size runs in a separate process, so that it has its own memory peak. Optimized code is
+compared with a plain version in the same process; only the ratio counts, because seconds depend on the machine's other
+load. `--write` keeps the scene files for use with `sgsst`.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ _RESOLUTION = 990
 
 
 def multiplied(scene: Scene, count: int) -> Scene:
-    """Return `count` Gaussians: copies of a scene's, each moved by up to its size, with the same total volume."""
+    """Return `count` copies of a scene's Gaussians, moved by up to their size, with the same total volume."""
     generator = torch.Generator().manual_seed(0)
     copies = -(-count // len(scene))
     many = scene.subset(torch.arange(len(scene)).repeat(copies)[:count])
@@ -62,7 +63,7 @@ def multiplied(scene: Scene, count: int) -> Scene:
 
 
 def small_scene() -> tuple[Scene, list[Camera], str]:
-    """Return the scene to multiply, its cameras and its name."""
+    """Return the scene to copy Gaussians from, its cameras and its name."""
     if _PLUSH.is_dir():
         return read_scene(_PLUSH / "point_cloud.ply").scene, read_cameras(_PLUSH / "cameras.json"), "plush"
     scene = generated_scene(50_000)
@@ -72,12 +73,12 @@ def small_scene() -> tuple[Scene, list[Camera], str]:
 
 
 def middle(action: Callable[[Camera], object], cameras: list[Camera]) -> float:
-    """Return the median over views of the seconds of one call."""
+    """Return the median over views of the seconds of one call per view."""
     return statistics.median(timed(lambda camera=camera: action(camera)) for camera in cameras)  # type: ignore[misc]
 
 
 def measure_harmonics(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """Time the spherical harmonics of a view, and their speedup over the reference on part of the scene."""
+    """Time the evaluation of spherical harmonics for a view; measure the speedup over the reference on a subset."""
     part = scene.subset(torch.arange(min(_HARMONICS_SAMPLE, len(scene))))
     rest_colors(part.sh_rest, part.means, cameras[0])  # compiles
     slow = middle(
@@ -89,9 +90,9 @@ def measure_harmonics(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """Time a view's tile intersections on one thread and on all, its renders and its survey.
+    """Time a view's tile intersections (on one thread and on all threads), its rendering and its survey.
 
-    The survey's single pass is compared with separate passes for coverage and gradient.
+    The survey makes a single pass, which is compared with separate passes for coverage and gradient.
     """
     CpuRasterizer(scene.subset(torch.arange(100))).survey(cameras[0])  # compiles
     threads = torch.get_num_threads()
@@ -101,7 +102,7 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     isects = middle(lambda camera: build_tile_intersections(scene, camera), cameras)
     rasterizer = CpuRasterizer(scene, max_intersection_bytes=0)  # caches the last view only
     places = torch.arange(len(scene), dtype=torch.int32)
-    places[::8] = -1  # about as many as views do not see
+    places[::8] = -1  # about the fraction that views do not see
     places[places >= 0] = torch.arange(int((places >= 0).sum()), dtype=torch.int32)
     one = build_tile_intersections(scene.subset(torch.arange(1)), cameras[0])
     intersections_of_subset(one, places[1:2].numpy())  # compiles
@@ -128,7 +129,7 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """Time the neighbor search for unseen Gaussians, against one on a single core in file order."""
+    """Time the neighbor search for unseen Gaussians, and compare it with a single-threaded one in file order."""
     rasterizer = CpuRasterizer(scene, max_intersection_bytes=0)
     weights = torch.zeros(len(scene), dtype=torch.float64)
     for camera in cameras:
@@ -145,7 +146,7 @@ def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
-    """Time a job by part, from a scene in memory to the end of the first step; network weights are installed."""
+    """Time a job by part, from a loaded scene to the end of the first step, with network weights installed."""
     settings = make_settings(max_resolution=_RESOLUTION)
     timer, weights, style = Timer(), load_network_weights("auto"), soft_picture(512)
     plan, planning_context = make_plan(scene, cameras, settings, weights=weights, timer=timer)
@@ -157,7 +158,7 @@ def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 
 
 def measure_reading(scene: Scene, folder: Path | None) -> dict[str, float]:
-    """Time the reading of a scene's file, which is kept in `folder` if given."""
+    """Time the reading of a scene file, which is kept in `folder` unless that is None."""
     with tempfile.TemporaryDirectory() as temporary:
         path = (folder or Path(temporary)) / f"{len(scene) / 1e6:g}m.ply"
         write_scene(path, scene)
@@ -165,7 +166,7 @@ def measure_reading(scene: Scene, folder: Path | None) -> dict[str, float]:
 
 
 def measure(count: int, views: int, parts: list[str], folder: Path | None) -> dict[str, float]:
-    """Return all figures of one size; `parts` selects from PARTS."""
+    """Return all figures of one scene size; `parts` selects measurements from `PARTS`."""
     small, cameras, _ = small_scene()
     scene, cameras = multiplied(small, count), spread(cameras, views)
     figures: dict[str, float] = {"gaussians": count}
@@ -184,7 +185,7 @@ def measure(count: int, views: int, parts: list[str], folder: Path | None) -> di
 
 
 def main() -> None:
-    """Measure every size in a process of its own, print and store."""
+    """Measure each size in a separate process, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--millions", type=float, nargs="+", default=[1, 4, 12])
     parser.add_argument("--views", type=int, default=4)
@@ -193,7 +194,7 @@ def main() -> None:
     arguments = parser.parse_args()
     sizes = []
     for millions in arguments.millions:
-        # A new process instead of a fork, so that its memory peak and its threads are its own.
+        # Spawned, not forked, so that the process has its own memory peak and threads.
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             sizes.append(pool.apply(measure, (int(millions * 1e6), arguments.views, arguments.parts, arguments.write)))
         print(json.dumps(sizes[-1], indent=2), flush=True)

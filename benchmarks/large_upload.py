@@ -1,12 +1,12 @@
-"""One large scene through the whole service: uploaded in three ways, checked, planned, stylized, downloaded.
+"""One large scene in the whole service: uploaded in three ways, validated, planned, stylized, downloaded.
 
     python -m benchmarks.large_upload [--millions 4] [--scene FILE] [--stages tus dry_run ...]
 
-The processes of `sgsst serve` are real; clients are curl, `sgsst submit` and plain tus requests. A connection is cut in
-the middle of the tus upload and of a download, and both resume. Each stage reports its seconds, the seconds of them in
-which files were checked or planned (`inspecting_seconds`), the API's memory before and at its peak, and the peaks of
-the processes that read the scene, with the mapped pages of the file and without (`own`). Clients run on the same
-machine and use some of its capacity.
+The server is `sgsst serve`; clients are curl, `sgsst submit` and plain tus requests. The connection is cut in the
+middle of the tus upload and of a download, and both resume. Each stage reports its duration, the time in which files
+were validated or planned (`inspecting_seconds`), the API's initial and peak memory, and the peak memory of the
+processes that read the scene, with and without (`own`) mapped pages of the file. Clients run on the same machine and
+use some of its capacity.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _PIECE = 1 << 20
 
 
 class Memory:
-    """Monitor of the memory of the service's processes, and of the time in which files are inspected."""
+    """Monitor of the memory of the service's processes, and of the time that they spend on inspecting files."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -70,7 +70,7 @@ class Memory:
         self._peaks, self._inspecting = {}, 0.0
 
     def figures(self) -> dict[str, float]:
-        """Return peaks in MB since `begin`, and the seconds in which something was inspected."""
+        """Return memory peaks in MB since `begin`, and the seconds in which files were inspected."""
         peaks = {f"{name}_mb": round(size / 1e6, 1) for name, size in self._peaks.items()}
         return {"inspecting_seconds": round(self._inspecting, 1), **peaks}
 
@@ -94,7 +94,7 @@ class Memory:
 
 
 def memory_of(process: psutil.Process) -> dict[str, int]:
-    """Return a process's resident bytes with mapped files (`_peak`) and without (`_own_peak`); empty if it is gone."""
+    """Return a process's resident bytes with and without mapped files (`_peak`, `_own_peak`); empty if it is gone."""
     try:
         status = Path(f"/proc/{process.pid}/status").read_text()
     except OSError:
@@ -105,7 +105,7 @@ def memory_of(process: psutil.Process) -> dict[str, int]:
 
 
 class Trial:
-    """Stages of the benchmark; each continues in the state the previous ones left."""
+    """Stages of the benchmark. Each stage uses the results of the previous ones."""
 
     def __init__(self, service: Service, folder: Path, files: dict[str, Path], parameters: dict[str, Any]) -> None:
         self._service, self._folder, self._files, self._parameters = service, folder, files, parameters
@@ -113,7 +113,7 @@ class Trial:
         self._upload = self._job = ""
 
     def tus(self) -> dict[str, Any]:
-        """Upload the scene in a PATCH that is cut off halfway, and a second one that resumes where the service is."""
+        """Upload half of the scene in a PATCH request that is cut off, and resume at the offset the service reports."""
         path = self._files["scene"]
         size = path.stat().st_size
         name = base64.b64encode(path.name.encode()).decode()
@@ -130,7 +130,7 @@ class Trial:
         return {"went_on_at_mb": round(offset / 1e6, 1)}
 
     def _offset(self, where: str) -> int:
-        """Return the offset of an upload that no request is writing to."""
+        """Return the offset of an upload, once no request writes to it anymore."""
         answer = self._client.patch(where, content=b"", headers=self._patch_headers(0))
         return 0 if answer.status_code == 423 else int(answer.json()["offset"])
 
@@ -160,7 +160,7 @@ class Trial:
         return {name: plan[name] for name in ("gaussians", "views", "estimated_seconds", "memory_bytes")}
 
     def submit(self) -> dict[str, Any]:
-        """Run `sgsst submit --out`: upload in parts, stylize, download and verify."""
+        """Run `sgsst submit --out`: upload in parts, wait for the job, download and verify the result."""
         out = self._folder / "submitted.ply"
         command = [sys.executable, "-m", "api.cli", "submit", str(self._files["scene"]), "--json"]
         command += ["--style", str(self._files["style"]), "--cameras", str(self._files["cameras"])]
@@ -170,7 +170,7 @@ class Trial:
         return {**self._job_seconds(), "result_mb": round(out.stat().st_size / 1e6, 1)}
 
     def curl(self) -> dict[str, Any]:
-        """Submit a job with curl in one multipart request, and wait for it."""
+        """Submit a job with curl in one multipart request, and wait for its end."""
         command = ["curl", "--silent", "--show-error", "--fail-with-body", f"{self._service.url}/v1/jobs"]
         command += [part for role, path in self._files.items() for part in ("-F", f"{role}=@{path}")]
         started = time.perf_counter()
@@ -182,7 +182,7 @@ class Trial:
         return {"accepted_seconds": round(accepted, 1), **self._job_seconds()}
 
     def download(self) -> dict[str, Any]:
-        """Download the result with curl, cut it off, and fetch the rest with `curl -C -`."""
+        """Download the result with curl, interrupt the download, and resume it with `curl -C -`."""
         url = f"{self._service.url}/v1/jobs/{self._job}/artifacts/stylized.ply"
         size = int(self._client.head(url).headers["content-length"])
         out = self._folder / "downloaded.ply"
@@ -202,7 +202,7 @@ class Trial:
         return self._client.get(f"/v1/jobs/{self._job}").json()["status"] in ("succeeded", "failed")
 
     def _job_seconds(self) -> dict[str, Any]:
-        """Return the job's last attempt and its seconds by part."""
+        """Return the record of the job's last attempt, and the job's seconds by part."""
         job = self._client.get(f"/v1/jobs/{self._job}").json()
         assert job["status"] == "succeeded", job["error"]
         report = self._client.get(f"/v1/jobs/{self._job}/artifacts/report.json").json()
@@ -210,7 +210,7 @@ class Trial:
 
 
 def _run(command: list[str]) -> str:
-    """Run a command and return its output; raises CalledProcessError if it fails."""
+    """Run a command and return its output; raise CalledProcessError if it fails."""
     return subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.PIPE, text=True).stdout
 
 
@@ -220,7 +220,7 @@ def _sha256(path: Path) -> str:
 
 
 def write_inputs(folder: Path, millions: float, scene: Path | None) -> dict[str, Path]:
-    """Write the files of a job: a scene of the given size, or an existing file, with cameras and style."""
+    """Write a job's input files: cameras, style, and a scene of the given size unless `scene` is an existing file."""
     small, cameras, _ = small_scene()
     written, camera_file, style = write_files(
         folder, multiplied(small, int(millions * 1e6)) if scene is None else small, cameras
@@ -243,7 +243,7 @@ def run_stages(trial: Trial, memory: Memory, stages: list[str], api: Callable[[]
 
 
 def main() -> None:
-    """Run the stages, print and store."""
+    """Run the stages, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--millions", type=float, default=4.0)
     parser.add_argument("--scene", type=Path, help="instead of a generated scene")

@@ -1,9 +1,9 @@
-"""Steps on very large views under a memory limit: seconds and peak memory beside the plan's.
+"""Steps on very large views under a memory limit: seconds and peak memory, compared with the plan's predictions.
 
 python -m benchmarks.large_views SCENE.ply CAMERAS STYLE [--sizes 5187x3361 8192x5460] [--steps 10] [--memory 10]
 
-CAMERAS is a camera file, or orbit:N. Each size runs in a process of its own, so that peaks do not mix. If the steps of
-a size do not finish within --seconds, those that did are reported.
+CAMERAS is a camera file, or orbit:N. Each size runs in a separate process, so that it has its own memory peak. If the
+steps of a size do not finish within --seconds, only the finished ones are reported.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sgsst_core.scene.camera import Camera
 
 
 def main() -> None:
-    """Measure, print and store; with --size, measure one size and print it as JSON after every step."""
+    """Measure, print and store all sizes; with --size, measure one size and print its row as JSON after each step."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("cameras")
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def _stored() -> list[dict[str, Any]]:
-    """Return the stored rows of earlier runs, because sizes may be measured one at a time."""
+    """Return the stored rows of earlier runs. They are kept, so that sizes can be measured one at a time."""
     path = RESULTS / "large_views.json"
     return list(json.loads(path.read_text(encoding="utf-8"))["sizes"]) if path.exists() else []
 
@@ -62,7 +62,7 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _in_a_process(size: str, limit: float | None) -> list[dict[str, Any]]:
-    """Measure a size in a process. Returns one row with the steps that finished, or none."""
+    """Measure a size in a separate process. Return one row for the finished steps, or no row if none finished."""
     command = [sys.executable, "-m", "benchmarks.large_views", *sys.argv[1:], "--size", size]
     try:
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=limit)
@@ -73,7 +73,7 @@ def _in_a_process(size: str, limit: float | None) -> list[dict[str, Any]]:
 
 
 def _measure(arguments: argparse.Namespace) -> None:
-    """Run steps on one view; the first prepares it."""
+    """Run steps on one view; the first step prepares the view."""
     width, height = (int(side) for side in arguments.size.split("x"))
     scene = read_scene(arguments.scene).scene
     view = _of_size(read_views(arguments.cameras, scene, 1, width)[0], width, height)

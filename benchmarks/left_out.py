@@ -1,10 +1,11 @@
-"""Savings of each optimization that a plan makes, in seconds per iteration and in peak memory.
+"""Savings in time and memory from each component that a plan leaves out because the scene does not need it.
 
 python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 684] [--views 3] [--rounds 3]
 
-CAMERAS is a camera file, or orbit:N. Each configuration runs in a process of its own, so that peaks do not mix. The
-first one omits everything that the scene does not need; the next ones keep one item each; the last one keeps them all.
-The plan's predictions are printed beside the measured values.
+CAMERAS is a camera file, or orbit:N. Each configuration runs in a separate process, so that it has its own memory peak.
+The first configuration leaves out all components that the scene does not need; each of the next ones keeps one of them;
+the last one keeps all. Measured values are seconds per iteration and peak memory, printed beside the plan's
+predictions.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from sgsst_core.settings import EVERYTHING
 
 
 def main() -> None:
-    """Measure, print and store; with --keep, measure one configuration and print it as JSON."""
+    """Measure, print and store all configurations; with --keep, measure one and print it as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE.ply:CAMERAS")
     parser.add_argument("--style", type=Path, required=True)
@@ -61,7 +62,7 @@ def _in_a_process(scene: str, kept: Sequence[str]) -> dict[str, Any]:
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return seconds per iteration and peak memory, with the items of `--keep` kept."""
+    """Return seconds per iteration and peak memory of a job that keeps the components of `--keep`."""
     ply, _, cameras = arguments.scenes[0].partition("=")[2].partition(":")
     scene = read_scene(Path(ply)).scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)

@@ -1,4 +1,4 @@
-"""Storage of benchmark results, together with the machine that they were measured on."""
+"""Storage of benchmark results together with a description of the machine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PACKAGES = ("torch", "numpy", "numba")
 
 
 def describe_machine() -> dict[str, Any]:
-    """Describe processor, memory, GPU, versions and load of this machine, without which a figure means nothing."""
+    """Describe processor, memory, GPU, software versions and current load of this machine."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {
         "processor": _processor(),
@@ -36,7 +36,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def write_result(name: str, figures: dict[str, Any], folder: Path = RESULTS) -> Path:
-    """Write figures, machine and date to `NAME.json` in `folder`. Returns the path."""
+    """Write figures, machine and date to `NAME.json` in `folder`, and return the path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
     content = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "machine": describe_machine(), **figures}
@@ -46,7 +46,7 @@ def write_result(name: str, figures: dict[str, Any], folder: Path = RESULTS) -> 
 
 
 def _processor() -> str:
-    """Return the processor's name, or its architecture if the system has no name for it."""
+    """Return the processor's name, or its architecture if the name is unknown."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):

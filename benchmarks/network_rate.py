@@ -1,9 +1,10 @@
-"""Throughput of the feature network relative to its convolutions alone, and the time of a gradient by part.
+"""Throughput of the feature network compared with its convolutions alone, and time of a gradient by part.
 
 python -m benchmarks.network_rate [--size 1024] [--precisions float32 bfloat16] [--repeats 3]
 
-On one scale of a square view, the convolutions run one by one on inputs of the same sizes, and then the whole gradient
-runs with its statistics. Rates count the convolutions' multiplications and additions in both cases.
+The benchmark uses one scale of a square view. First it runs each convolution separately on an input of the same size,
+then the whole gradient including statistics. In both cases, rates count only the convolutions' multiplications and
+additions.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _DEEPEST = "conv5_1"
 
 
 def main() -> None:
-    """Measure, print and store."""
+    """Measure, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=1024)
     parser.add_argument("--precisions", nargs="+", default=["float32", "bfloat16"])
@@ -75,7 +76,7 @@ def _measure(weights: BackboneWeights, precision: str, size: int, repeats: int) 
 
 @torch.no_grad()
 def _convolutions_alone(weights: BackboneWeights, dtype: torch.dtype, size: int, repeats: int) -> tuple[float, float]:
-    """Return operations and seconds of a gradient's convolutions, forward and backward, each on warm memory."""
+    """Return operations and seconds of a gradient's convolutions, forward and backward, each after a warm-up."""
     operations = seconds = 0.0
     for name, (weight, bias) in weights.convolutions.items():
         out, into = int(weight.shape[0]), int(weight.shape[1])

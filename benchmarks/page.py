@@ -1,11 +1,11 @@
-"""Cost of the web page in a real browser with software WebGL: bytes, seconds, memory, frame times.
+"""Cost of the web page in a real browser with software WebGL: bytes, load times, memory, frame times.
 
 python -m benchmarks.page SCENE.ply... [--frames 5] [--width 640 --height 480]
 
-For each scene: seconds until the first Gaussians are drawn and until all of them are, memory of the browser's
-processes, and milliseconds per frame of a rotating view (sorted and drawn) and of a wipe (only drawn). For the page
-itself: bytes over the wire, largest paint, and blocking time, from the browser's own tracing. A GPU draws hundreds of
-times faster; the time for reading and sorting, and memory apart from textures, are the same.
+Figures of each scene: seconds until the first and until all Gaussians are drawn, memory of the browser's processes, and
+milliseconds per frame while the view rotates (sorting and drawing) and while the wipe moves (drawing only). Figures of
+the page itself, from the browser's tracing: transferred bytes, largest contentful paint, and total blocking time. A GPU
+draws hundreds of times faster, but needs the same time for reading and sorting, and the same memory except textures.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _SCENE = """async ([base, frames, width, height]) => {
 
 
 def memory_bytes() -> dict[str, int]:
-    """Return the resident bytes of this process's browser by kind of process; shared pages count once per process."""
+    """Return the resident bytes of the browser by kind of process; pages shared by processes count once in each."""
     found: dict[str, int] = {}
     for process in psutil.Process().children(recursive=True):
         try:
@@ -96,7 +96,7 @@ def memory_bytes() -> dict[str, int]:
 
 
 def measure_page(url: str) -> dict[str, Any]:
-    """Measure the first visit of the page, with an empty browser cache."""
+    """Measure the first visit to the page, with an empty browser cache."""
     with open_browser() as browser:
         watched = Watched(browser, url, width=1280, height=800)
         watched.page.goto(url)
@@ -106,7 +106,7 @@ def measure_page(url: str) -> dict[str, Any]:
 
 
 def measure_scene(url: str, path: Path, frames: int, size: tuple[int, int]) -> dict[str, Any]:
-    """Measure one scene in a browser of its own."""
+    """Measure one scene in a new browser."""
     with open_browser() as browser:
         watched = Watched(browser, url)
         watched.page.goto(f"{url}/#/jobs")

@@ -1,4 +1,4 @@
-"""Screenshots of the web page for docs/, taken from a service of its own that runs jobs on a real scene.
+"""Screenshots of the web page for docs/, from a temporary service that runs jobs on a real scene.
 
 python -m benchmarks.page_pictures SCENE.ply CAMERAS.json STYLE.jpg STYLE.jpg [--resolution 320] [--steps 150]
 """
@@ -25,7 +25,7 @@ _WIDTH = 1280
 
 
 def save(watched: Watched, name: str, folder: Path, width: int = _WIDTH) -> None:
-    """Save a screenshot of the window as page_NAME.webp, scaled to a width."""
+    """Save a screenshot of the window as page_NAME.webp, scaled to `width` pixels."""
     with Image.open(io.BytesIO(watched.page.screenshot())) as picture:
         size = (width, round(picture.height * width / picture.width))
         picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(
@@ -54,7 +54,7 @@ def finished(service: Service, job_id: str) -> bool:
 
 
 def shown_step(page: Any) -> int:
-    """Return the step that a job's page shows, or 0 if it shows none."""
+    """Return the number of the current step as shown on a job's page, or 0 if it shows none."""
     found = re.search(r"step (\d+)", page.locator(".state").inner_text())
     return int(found[1]) if found else 0
 

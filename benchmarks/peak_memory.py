@@ -18,7 +18,7 @@ from sgsst_core.timing import Timer
 
 
 def main() -> None:
-    """Measure, print and store; everything runs in this process, so its peak is that of the gradient."""
+    """Measure, print and store. The gradient runs in this process, so the process's peak is that of the gradient."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--memory", type=float, default=5.0, help="GB for activations")
     parser.add_argument("--width", type=int, default=5187)

@@ -1,4 +1,4 @@
-"""Images for benchmarks: photos included in scikit-image, at any size."""
+"""Images for benchmarks: photos from scikit-image, resized to any size."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from torch import Tensor
 
 
 def picture(name: str, height: int, width: int) -> Tensor:
-    """Return an image of scikit-image, for example "astronaut", as [height, width, 3] in 0 to 1, with fine grain.
+    """Return a photo of scikit-image, e.g. "astronaut", as [height, width, 3] from 0 to 1, with fine grain added.
 
-    Without grain, enlarged photos have no detail at full size, so the largest scale would be unlike that of a real
-    view.
+    Without grain, enlarged photos have no detail at full size, unlike real views.
     """
     pixels = torch.from_numpy(getattr(data, name)()[..., :3].copy()).float() / 255
     planes = F.interpolate(pixels.permute(2, 0, 1)[None], size=(height, width), mode="bicubic", align_corners=False)

@@ -1,11 +1,12 @@
-"""Accuracy of plans and of the remaining time: predictions of `sgsst plan` against what the job then takes.
+"""Accuracy of the time and memory that `sgsst plan` predicts, and of the remaining time that a running job reports.
 
     python -m benchmarks.plan_accuracy SCENE.ply:RESOLUTION[:COARSE:SOS] ... --cameras FILE --style STYLE [--views 6]
 
-Each case is planned by `sgsst plan` in one process and stylized in another, as by `sgsst stylize`, with the given steps
-in either phase. Compared are the seconds of a step on a view visited before, the additional seconds of a first visit,
-both by phase, peak memory, and the time of measurements. After each step the predicted remaining time is recorded, and
-compared with the time that the job then takes until the last file is written.
+Each case is planned by `sgsst plan` in one process, and runs like `sgsst stylize` in another process, with COARSE steps
+in phase 1 and SOS steps in phase 2. Predicted and measured values are compared for the seconds of a step on a view that
+was visited before, the additional seconds of a first visit (both by phase), peak memory, and time of measurements.
+After each step, the reported remaining time is recorded, and compared with the actual time until the last file is
+written.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from typing import Any
 
 from benchmarks.machine import write_result
 
-#: Steps of either phase if a case has none.
+#: Default steps of phase 1 and phase 2.
 _STEPS = (9, 9)
 
 
 def main() -> None:
-    """Measure, print and store; with --run, run one job and print its figures as JSON."""
+    """Measure, print and store all cases; with --run, run one job and print its figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="+", metavar="SCENE.ply:RESOLUTION[:COARSE:SOS]")
     parser.add_argument("--cameras", type=Path, required=True)
@@ -48,7 +49,7 @@ def main() -> None:
 
 
 def _options(case: str, arguments: argparse.Namespace) -> tuple[str, list[str]]:
-    """Return the scene of a case and its options for the command line."""
+    """Return the scene of a case, and its command line options."""
     scene, resolution, *steps = case.split(":")
     coarse, sos = steps or _STEPS
     options = ["--cameras", str(arguments.cameras), "--style", str(arguments.style), "--views", str(arguments.views)]
@@ -59,7 +60,7 @@ def _options(case: str, arguments: argparse.Namespace) -> tuple[str, list[str]]:
 
 
 def _case(case: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Run a case in two processes. Returns predicted and measured values, and their ratios."""
+    """Plan and run a case in two processes, and return predicted and measured values with their ratios."""
     scene, options = _options(case, arguments)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.json"
@@ -81,9 +82,9 @@ def _case(case: str, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _run(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Run one job from input files to output files. Returns what it took, and its predictions on the way."""
+    """Run one job from input files to output files, and return its measured values and predicted remaining times."""
     started = time.perf_counter()
-    # Imported here, because the time of imports is part of the job's.
+    # Imported here, because the time of imports is part of the job's time.
     from sgsst_core.report.machine import peak_memory
     from worker.execute import execute
     from worker.options import StylizeOptions

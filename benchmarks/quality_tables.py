@@ -1,4 +1,4 @@
-"""Results of several runs of `sgsst bench quality`, collected in benchmarks/results/quality.json and shown as Markdown.
+"""Collection of `sgsst bench quality` results in benchmarks/results/quality.json, and Markdown tables of them.
 
 python -m benchmarks.quality_tables add NAME FOLDER   # store what a run wrote to FOLDER/quality.json, under NAME
 python -m benchmarks.quality_tables show [NAME...]    # print tables of the judgments, and of the loss over time
@@ -23,7 +23,7 @@ _JUDGED = (
 
 
 def main() -> None:
-    """Store a run or print tables."""
+    """Store a run, or print tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     ways = parser.add_subparsers(dest="way", required=True)
     adding = ways.add_parser("add")
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def read_run(folder: Path) -> dict[str, Any]:
-    """Read the result of a run, with scene and style by name instead of by path."""
+    """Read the result of a run, with the paths of scene and style replaced by their names."""
     run: dict[str, Any] = json.loads((folder / "quality.json").read_text())
     run["scene"] = "/".join(Path(run["scene"]).parts[-2:])
     run["style"] = Path(run["style"]).name
@@ -55,7 +55,7 @@ def read_run(folder: Path) -> dict[str, Any]:
 
 
 def judged(outcomes: list[dict[str, Any]]) -> str:
-    """Return a table of the judgments, with the best style and color distance of stylized outcomes in bold."""
+    """Return a table of the judgments, with the best style and color distances of stylized outcomes in bold."""
     stylized = [outcome for outcome in outcomes if outcome["name"] != UNSTYLIZED]
     best = {figure: min(outcome[figure] for outcome in stylized) for figure in ("style", "color_distance")}
 
@@ -81,7 +81,7 @@ def judged(outcomes: list[dict[str, Any]]) -> str:
 
 
 def against_time(variants: dict[str, Any]) -> str:
-    """Return a table of loss and steps of each variant at each evaluation, with the range of its seconds."""
+    """Return a table of each variant's loss and number of steps at each evaluation, with the range of its seconds."""
     points = {name: variant["points"] for name, variant in variants.items() if variant["points"]}
     moments = [[point["seconds"] for point in column] for column in zip(*points.values(), strict=True)]
     heads = [f"{min(moment):.0f} to {max(moment):.0f} s" for moment in moments]

@@ -1,9 +1,10 @@
-"""Two single-threaded ranks against one, on all scales of a view, in turn within one run.
+"""Speedup of two single-threaded ranks over one, on all scales of a view.
 
 python -m benchmarks.ranks SCENE.ply CAMERAS STYLE [--ranks 2] [--sizes 1280x720,2048x2048] [--rounds 3]
 
-Ranks are gloo processes on this machine. Reported with the ratio are its limit from halos, the fraction of an iteration
-in which ranks wait for each other or for data, and the prediction of the planner's model from measurements on one rank.
+Ranks are gloo processes on this machine; iterations on one and on all ranks take turns. Also reported are the limit of
+the speedup due to halos, the fraction of an iteration in which ranks wait for each other or for data, and the speedup
+that the planner's model predicts from measurements on one rank.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def main() -> None:
 
 
 def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
-    """Run one rank's part of the comparison; rank 0 prints and stores."""
+    """Run one rank's part of the comparison; rank 0 prints and stores the figures."""
     torch.set_num_threads(1)
     scene = read_scene(arguments.scene).scene
     camera = spread(read_cameras(arguments.cameras), 1)[0]
@@ -105,14 +106,14 @@ def make(collectives: Collectives, scene: Any, view: Camera, style: Any, argumen
 
 
 def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]:
-    """Measure iterations on all ranks and on one, in turn; the first of each prepares the view and does not count."""
+    """Measure iterations on all ranks and on one, in turn. The first of each prepares the view and is not counted."""
     together = build(collectives)
     alone = build(ALONE) if collectives.rank == 0 else None
     steps: dict[str, list[dict[str, float]]] = {"together": [], "alone": []}
     sent: dict[str, int] = {}
     for turn in range(rounds + 1):
         for name, stylizer in (("together", together), ("alone", alone)):
-            collectives.all_gather(None)  # no other rank computes while one runs alone
+            collectives.all_gather(None)  # other ranks wait here while rank 0 runs alone
             if stylizer is not None:
                 before, used = stylizer.seconds, resource.getrusage(resource.RUSAGE_SELF)
                 record = stylizer.run_step()
@@ -164,7 +165,7 @@ def processor_seconds(before: resource.struct_rusage) -> dict[str, float]:
 
 
 def modeled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> dict[str, Any]:
-    """Return the prediction of the planner's model from one rank's seconds."""
+    """Return the figures that the planner's model predicts from one rank's seconds."""
     steps = figures["steps"]["alone"]
     network = sum(median(steps, part) for part in NETWORK)
     raster = sum(median(steps, part) for part in RASTER)
@@ -195,12 +196,12 @@ def modeled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> 
 
 
 def whole_piece(scale: int, height: int, width: int) -> Piece:
-    """Return a piece that covers all of a scale."""
+    """Return a work piece that covers the whole image at a scale."""
     return Piece(scale, (height, width), Rectangle(0, 0, height, width))
 
 
 def median(steps: list[dict[str, float]], part: str) -> float:
-    """Return the median seconds of a part of a step."""
+    """Return the median over steps of a part's seconds."""
     return statistics.median(step.get(part, 0.0) for step in steps) if steps else math.nan
 
 

@@ -1,11 +1,11 @@
-"""Rendering plus color gradient at 1280x720 with `reference` in float32, `cpu` and `cached`, as ratios within one run.
+"""Relative speed of the rasterizers `reference` (in float32), `cpu` and `cached` at 1280x720.
 
     python -m benchmarks.rasterizer [--scene point_cloud.ply --cameras cameras.json] [--repeats 15]
 
-All do the same work: one image from colors, one color gradient from an image gradient. What depends on the geometry
-alone (projection, depth order, tile intersections; for `cached` the weights too) is prepared in advance and timed
-separately, because a job does it once per view. The rasterizers take turns, each on one thread and on all threads. The
-fastest turn counts, because other programs disturbed it least.
+Each rasterizer computes one image from colors and one color gradient from an image gradient. Data that depend on the
+geometry alone (projection, depth order, tile intersections; for `cached` also the blend weights) are prepared in
+advance and timed separately, because a job computes them once per view. The rasterizers take turns, each on one thread
+and on all threads. The fastest turn counts, because other programs disturbed it least.
 """
 
 from __future__ import annotations
@@ -76,14 +76,14 @@ def timed(action: Callable[[], object]) -> float:
 
 
 def both(rasterizer: Rasterizer, colors: Tensor, image_gradient: Tensor, camera: Camera, threads: int) -> float:
-    """Return the seconds of forward plus backward pass with a number of threads."""
+    """Return the seconds of forward plus backward pass on `threads` threads."""
     torch.set_num_threads(threads)
     render = timed(lambda: rasterizer.render(colors, camera))
     return render + timed(lambda: rasterizer.color_gradient(image_gradient, camera))
 
 
 def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
-    """Return the fastest seconds of each rasterizer and the ratios between them, in turn on one view."""
+    """Run the rasterizers in turn on one view, and return the fastest seconds of each and the ratios between them."""
     colors = scene_colors(scene, camera)
     image_gradient = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
     threads = sorted({1, torch.get_num_threads()})
@@ -126,7 +126,7 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
 
 
 def scenes(arguments: argparse.Namespace) -> dict[str, tuple[Scene, Camera]]:
-    """Return the requested scene, or the real ones that are present, or a generated one."""
+    """Return the requested scene; by default the real scenes that are present, or else a generated one."""
     if arguments.scene:
         scene = read_scene(arguments.scene).scene
         cameras = read_cameras(arguments.cameras) if arguments.cameras else orbit(scene, 8)

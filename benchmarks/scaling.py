@@ -1,9 +1,9 @@
-"""Forecast of an SOS iteration on 1 to 64 GPUs, by the model that the planner uses to choose the number of ranks.
+"""Forecast of the time of an SOS iteration on 1 to 64 GPUs, by the planner's model for choosing the number of ranks.
 
 python -m benchmarks.scaling [--tflops 100] [--shown 0.65]
 
 Nothing here is measured on GPUs. The assumptions are the constants below; they are printed and stored with the table.
-`benchmarks.ranks` checks the same model, with the seconds of one CPU rank, against two ranks.
+`benchmarks.ranks` validates the same model on a CPU, by predicting the speedup of two ranks from one rank's seconds.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from sgsst_core.planning.ranks_model import IterationWork, Link
 from sgsst_core.scene.pyramid import scale_count
 
 RANKS = (1, 2, 4, 8, 16, 32, 64)
-#: Operations per pixel of VGG19 up to relu5_1 in the forward pass; the backward pass has as many.
+#: Operations per pixel in VGG19's forward pass up to relu5_1; the backward pass has as many.
 FLOP_PER_PIXEL = 2 * 0.72e6
-#: Links at four fifths of the data sheets' bandwidth in one direction, with the latency in seconds between two ranks.
+#: Links between two ranks: 80 % of the data sheet's bandwidth in one direction, and latency in seconds.
 LINKS = {
     "NVLink 4": Link(0.8 * 450e9, 5e-6),
     "PCIe 4.0 x16": Link(0.8 * 32e9, 10e-6),
     "25 Gb/s Ethernet": Link(0.8 * 25e9 / 8, 30e-6),
 }
-#: Height, width, optimized Gaussians, seconds of render and gradient, for a scene of Tanks and Temples and for the
-#: garden of Mip-NeRF 360 at full size.
+#: Height, width, number of optimized Gaussians, and seconds of render plus gradient, for a typical scene of Tanks and
+#: Temples and for the garden scene of Mip-NeRF 360 at full size.
 VIEWS = {"980x545": (545, 980, 2_500_000, 0.006), "5187x3361": (3361, 5187, 5_800_000, 0.030)}
-#: Fraction of the optimized Gaussians in a view: 65 % for the plush toy from its real cameras, 68 % for the biker in an
-#: orbit. Views of walk-through scenes show fewer.
+#: Fraction of the optimized Gaussians that a view shows: 65 % for the plush toy scene with its real cameras, 68 % for
+#: the biker scene in an orbit. Views of walk-through scenes show fewer.
 SHOWN_SHARE = 0.65
-#: Seconds per iteration on every rank for comparing statistics, the optimizer and launching kernels.
+#: Seconds per iteration that do not depend on the number of ranks: comparing statistics, optimizer, kernel launches.
 FIXED_SECONDS = 0.003
 
 
 def main() -> None:
-    """Forecast, print and store."""
+    """Compute the forecast, then print and store it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tflops", type=float, default=100.0, help="that one GPU sustains in VGG's convolutions")
     parser.add_argument("--shown", type=float, default=SHOWN_SHARE, help="share of the Gaussians that a view shows")
@@ -77,7 +77,8 @@ def main() -> None:
 def forecast(work: IterationWork) -> dict[str, Any]:
     """Return the forecast by number of ranks.
 
-    It consists of the speedup limit from halos, speedup and fraction of communication for each link, and bytes sent.
+    It consists of the speedup limit due to halos, the bytes sent, and for each link the speedup and the fraction of
+    time spent on communication.
     """
     one = max(loads(divide(work.pieces, work.halo, (1.0,)), work.halo))
     found = {}

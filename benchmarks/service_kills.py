@@ -1,11 +1,11 @@
-"""Random SIGKILLs of the service's processes, a hundred times, while it works through a queue of small jobs.
+"""Random SIGKILLs of the service's processes while it runs a queue of small jobs.
 
 python -m benchmarks.service_kills [--kills 100] [--rank-kills 6] [--seed 0]
 
-`sgsst serve` runs with its defaults except for `SETTINGS`. The benchmark counts accepted jobs that do not succeed
-(lost), results that are reported or stored twice (published twice), and PLY files that are not bit-identical to that of
-`sgsst stylize` with the same seed (different). A job on two ranks adds in another order, so its colors are compared
-with one rank's instead.
+`sgsst serve` runs with default settings except for `SETTINGS`. The benchmark counts accepted jobs that do not succeed
+(lost), results that are announced or stored twice (published twice), and PLY files that are not bit-identical to that
+of `sgsst stylize` with the same seed (different). A job on two ranks adds numbers in a different order, so its colors
+are compared with those of a one-rank job within a tolerance.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from tests.small_scenes import wall, write_files
 
 PARAMETERS = {"preset": "standard", "steps_sos": 60, "backbone": "vgg16", "early_stop": False}
 SEEDS = (1, 2)
-#: Steps of the job on two ranks: enough to survive all of its kills.
+#: Steps of the job on two ranks: enough that it still runs when all kills are done.
 RANK_STEPS = 200
-#: The benchmark itself ends attempts, so they must neither make the service give up nor lengthen its waits.
+#: Settings with which killed attempts neither make the service give up on a job nor lengthen its retry delays.
 SETTINGS: dict[str, Any] = {
     "SGSST_LEASE_SECONDS": "30",
     "SGSST_MAX_ATTEMPTS": "1000000",
@@ -63,7 +63,7 @@ _PATIENCE = 600.0
 
 @dataclass
 class Run:
-    """Service under attack, and the figures collected."""
+    """Service whose processes are killed, and the figures collected."""
 
     service: Service
     files: dict[str, Path]
@@ -114,7 +114,7 @@ class Run:
             self.submit(SEEDS[len(self.accepted) % len(SEEDS)])
 
     def strike(self, target: str, chance: random.Random) -> None:
-        """Kill once, and measure the recovery."""
+        """Kill one process, and measure the recovery."""
         if target == EVERYTHING:
             started = time.monotonic()
             self.service.stop(signal.SIGKILL)
@@ -128,23 +128,23 @@ class Run:
             if target == API:
                 self.call("GET", "/v1/jobs", params={"limit": 1})
                 self.api_back.append(time.monotonic() - struck)
-            elif before is not None and chance.random() < 0.6:  # otherwise the next kill may come before the job runs
+            elif before is not None and chance.random() < 0.6:  # otherwise, the next kill may precede the job's start
                 self._measure(before, struck)
         self.kills[target] += 1
 
     def _measure(self, before: Mapping[str, Any], struck: float) -> None:
-        """Wait until an interrupted job makes steps again, and record the time."""
+        """Wait until an interrupted job continues to make steps, and record the time."""
         while time.monotonic() - struck < _PATIENCE:
             job = self.call("GET", f"/v1/jobs/{before['id']}").json()
             if job["status"] in _FINISHED:
-                return  # it had finished when the dispatcher died
+                return  # the job had finished when the dispatcher died
             if job["attempt"] > before["attempt"] and job["status"] == "running":
                 self.running_again.append(time.monotonic() - struck)
                 return
             time.sleep(0.1)
 
     def kill(self, target: str, chance: random.Random) -> bool:
-        """Send SIGKILL to a random process of a kind. Returns False if none appears in time."""
+        """Send SIGKILL to a random process of a kind; return False if none appears in time."""
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline:
             found = self.service.processes(target)
@@ -157,7 +157,7 @@ class Run:
 
 
 def attack(run: Run, kills: int, chance: random.Random) -> None:
-    """Kill at random moments until the given number of kills is reached."""
+    """Kill processes at random moments until the given number of kills is reached."""
     due = {target: time.monotonic() + chance.expovariate(1 / mean) for target, mean in EVERY.items()}
     while sum(run.kills.values()) < kills:
         run.fill()
@@ -171,7 +171,7 @@ def attack(run: Run, kills: int, chance: random.Random) -> None:
 
 
 def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
-    """Run a job on two ranks and kill one of them repeatedly. Returns its id."""
+    """Run a job on two ranks, kill one of them repeatedly, and return the job's id."""
     if not kills:
         return None
     job_id = run.submit(SEEDS[0], workers=2, steps_sos=RANK_STEPS)
@@ -191,7 +191,7 @@ def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
 
 
 def wait_for_all(run: Run) -> dict[str, dict[str, Any]]:
-    """Wait until all accepted jobs have ended or time is up. Returns the last status of those that exist."""
+    """Wait until all accepted jobs have ended or time is up, and return the last status of each existing job."""
     deadline = time.monotonic() + _PATIENCE
     found: dict[str, dict[str, Any]] = {}
     while time.monotonic() < deadline:
@@ -207,7 +207,7 @@ def wait_for_all(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def published(run: Run, job_id: str) -> int:
-    """Return how often a job's result was reported, or stored on disk if that is more."""
+    """Return how often a job's result was announced or stored on disk, whichever is more."""
     text = run.call("GET", f"/v1/jobs/{job_id}/events").text
     told = text.count('"name": "stylized.ply"')
     ended = text.count('"status": "succeeded"')
@@ -216,12 +216,12 @@ def published(run: Run, job_id: str) -> int:
 
 
 def sha256(run: Run, job_id: str) -> str:
-    """Return the digest of a downloaded result."""
+    """Download a job's result, and return its digest."""
     return hashlib.sha256(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content).hexdigest()
 
 
 def distance(run: Run, job_id: str, one_rank: Path) -> float:
-    """Return the distance between a two-rank job's colors and one rank's, relative to how far the latter have moved."""
+    """Return the distance between the colors of a two-rank and a one-rank job, relative to the change by the latter."""
     path = run.service.data / "two.ply"
     path.write_bytes(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     two, one, before = (read_scene(each).scene.sh_dc for each in (path, one_rank, run.files["scene"]))
@@ -239,7 +239,7 @@ def spread(values: list[float]) -> dict[str, float | int | None]:
 
 
 def main() -> None:
-    """Attack the service, print and store the figures."""
+    """Run the benchmark, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--rank-kills", type=int, default=6)
@@ -256,7 +256,7 @@ def main() -> None:
 
 
 def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) -> dict[str, Any]:
-    """Run the attack and return all figures."""
+    """Run the service while killing its processes, and return all figures."""
     (folder / "inputs").mkdir()
     ply, cameras, style = write_files(folder / "inputs", wall())
     files = {"scene": ply, "cameras": cameras, "style": style}

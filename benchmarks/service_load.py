@@ -1,14 +1,14 @@
-"""Load that the API sustains while a job runs on the same machine: submissions, status, watchers, a large upload.
+"""Load that the API sustains while a job runs on the same machine: submissions, status requests, watchers, an upload.
 
 python -m benchmarks.service_load [--upload-mb 2000] [--watchers 1000] [--seconds 20] [--postgresql]
 
-Targets: 100 submissions per second by reference to uploads; status at 200 requests per second with a 99th percentile
-under 50 ms; 1000 watchers of server-sent events; an API that grows by less than 64 MB during an upload of 2 GB. The
-client runs on the same machine and uses some of its processors; its share is reported.
+Targets: 100 submissions per second of jobs whose files are already uploaded; 200 status requests per second with a 99th
+percentile latency under 50 ms; 1000 watchers of server-sent events; memory growth of the API of less than 64 MB during
+an upload of 2 GB. The client runs on the same machine; its CPU time is reported separately.
 
-With --postgresql the database is a PostgreSQL server whose commits are on disk before they are acknowledged. Two API
-processes share it, and requests and watchers alternate between them; the running job's events pass from one to the
-other.
+With --postgresql, the database is a PostgreSQL server with durable commits. Two API processes share it, and requests
+and watchers alternate between them, so half of the watchers receive the running job's events through the other API
+process.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from tests.api.service import Service
 from tests.postgres import fresh_database, server
 from tests.small_scenes import wall, write_files
 
-#: Parameters of a job that outlasts the benchmark, so that the others never run.
+#: Parameters of a job that outlasts the benchmark, so that jobs submitted later never start.
 LONG = {"preset": "standard", "steps_sos": 1_000_000, "backbone": "vgg16", "early_stop": False}
 SETTINGS: dict[str, Any] = {
     "SGSST_LEASE_SECONDS": "30",
@@ -55,7 +55,7 @@ _PIECE = 1 << 20
 
 
 async def upload(client: httpx.AsyncClient, path: Path) -> str:
-    """Upload a small file and return the upload's id."""
+    """Upload a small file, and return the upload's id."""
     name = base64.b64encode(path.name.encode()).decode()
     length = str(path.stat().st_size)
     begun = await client.post(
@@ -70,7 +70,7 @@ async def upload(client: httpx.AsyncClient, path: Path) -> str:
 class Connection:
     """Persistent connection with a minimal HTTP client.
 
-    A general-purpose client would use as much processor time as the API, on the same processors.
+    A general-purpose client would use as much CPU time as the API, on the same machine.
     """
 
     def __init__(self, url: str) -> None:
@@ -79,10 +79,10 @@ class Connection:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, method: str, path: str, body: bytes = b"") -> tuple[int, bytes]:
-        """Send a request and return status and body of the response.
+        """Send a request, and return status and body of the response.
 
         Raises:
-            OSError, EOFError: If the connection breaks; the next request opens a new one.
+            OSError, EOFError: If the connection breaks. The next request opens a new connection.
         """
         reader, writer = self._streams = self._streams or await asyncio.open_connection(self._host, self._port)
         try:
@@ -113,7 +113,7 @@ class Connection:
 
 
 async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float, made: list[str]) -> dict[str, Any]:
-    """Submit jobs by reference to uploads from several clients, as fast as possible; their ids go into `made`."""
+    """Submit jobs with uploaded files from several clients, as fast as possible, and append their ids to `made`."""
     took: list[float] = []
     failures: Counter[str] = Counter()
     end = time.perf_counter() + seconds
@@ -143,9 +143,9 @@ async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float,
 
 
 async def at_a_rate(urls: Sequence[str], path: Callable[[int], str], rate: float, seconds: float) -> dict[str, Any]:
-    """Send requests at fixed moments, whether or not earlier ones have been answered.
+    """Send requests at a constant rate, whether or not earlier ones have been answered.
 
-    Times count from the moment a request is due, including any wait for a free connection.
+    Response times are measured from the moment a request is due, including any wait for a free connection.
     """
     took: list[float] = []
     failures: Counter[str] = Counter()
@@ -181,9 +181,9 @@ async def at_a_rate(urls: Sequence[str], path: Callable[[int], str], rate: float
 
 
 async def with_processor(apis: list[psutil.Process], work: Awaitable[dict[str, Any]], count: str) -> dict[str, Any]:
-    """Await the figures of `work`, and add the processor time of API and client per request.
+    """Await the figures of `work`, and add the CPU time of API and client per request.
 
-    Unlike wall-clock time, it hardly depends on what else the machine does.
+    Unlike wall-clock time, CPU time hardly depends on the machine's other load.
     """
     processes = {"api": apis, "client": [psutil.Process()]}
     before = {name: _processor_seconds(some) for name, some in processes.items()}
@@ -205,12 +205,12 @@ def _memory(processes: list[psutil.Process]) -> int:
 async def watch(
     urls: Sequence[str], job_id: str, count: int, seconds: float, apis: list[psutil.Process]
 ) -> dict[str, Any]:
-    """Watch one running job with many clients. Returns how many are connected and how late events arrive."""
+    """Watch one running job with many clients, and return the number of connected clients and the delay of events."""
     before = _memory(apis)
     late: list[float] = []
     events = [0] * count
     connected = 0
-    opened = float("inf")  # past events do not count
+    opened = float("inf")  # events before this time do not count
 
     async def one(number: int) -> None:
         nonlocal connected
@@ -253,12 +253,12 @@ async def watch(
 
 
 def _moment(told: str | None) -> float:
-    """Convert a time from the API to seconds since 1970; 0 for None."""
+    """Convert a time from the API to seconds since 1970; return 0 for None."""
     return datetime.fromisoformat(told).timestamp() if told else 0.0
 
 
 async def large_upload(client: httpx.AsyncClient, path: Path, api: psutil.Process) -> dict[str, Any]:
-    """Upload one file in one request, and monitor the API's memory meanwhile."""
+    """Upload a large file in one request, and measure the API's memory meanwhile."""
     size = path.stat().st_size
     begun = await client.post("/v1/uploads", headers=_TUS | {"Upload-Length": str(size)})
     begun.raise_for_status()
@@ -294,7 +294,7 @@ async def large_upload(client: httpx.AsyncClient, path: Path, api: psutil.Proces
 
 
 def spread(values: list[float]) -> dict[str, float]:
-    """Return percentiles of seconds, in milliseconds."""
+    """Return percentiles of times in seconds, converted to milliseconds."""
     cuts = statistics.quantiles(values, n=1000, method="inclusive") if len(values) > 1 else values * 999
     return {f"p{name}_ms": round(1000 * cuts[index], 1) for name, index in (("50", 499), ("95", 949), ("99", 989))}
 
@@ -302,7 +302,7 @@ def spread(values: list[float]) -> dict[str, float]:
 async def measure(
     services: Sequence[Service], files: dict[str, Path], arguments: argparse.Namespace, large: Path
 ) -> dict[str, Any]:
-    """Measure all figures, one after the other; the first service has the dispatcher."""
+    """Measure all figures one after the other. The first of the services has the dispatcher."""
     service, urls = services[0], [each.url for each in services]
     apis = [process for each in services for process in each.processes(_API)]
     async with httpx.AsyncClient(base_url=service.url, timeout=120) as client:
@@ -312,7 +312,7 @@ async def measure(
         await _until_it_runs(client, running)
         figures: dict[str, Any] = {"job_steps_per_second_alone": await _speed(client, running, arguments.seconds / 2)}
         print(figures, flush=True)
-        # Before the watchers, because the memory they free in the API's heap would hide the growth.
+        # The upload comes before the watchers, whose freed memory in the API's heap would hide its growth.
         figures["upload"] = await large_upload(client, large, apis[0])
         print(figures["upload"], flush=True)
         asking = at_a_rate(urls, lambda number: f"/v1/jobs/{running}", 200, arguments.seconds)
@@ -350,7 +350,7 @@ async def _speed(client: httpx.AsyncClient, job_id: str, seconds: float) -> floa
 
 
 def _services(folder: Path, stack: contextlib.ExitStack, postgresql: bool) -> list[Service]:
-    """Return the services to measure; they are not started yet."""
+    """Return the services to measure, which are not started yet."""
     if not postgresql:
         return [Service(folder / "data", **SETTINGS)]
     database = fresh_database(stack.enter_context(server(durable=True)))
@@ -359,7 +359,7 @@ def _services(folder: Path, stack: contextlib.ExitStack, postgresql: bool) -> li
 
 
 def main() -> None:
-    """Measure, print and store."""
+    """Measure, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--upload-mb", type=int, default=2000)
     parser.add_argument("--watchers", type=int, default=1000)

@@ -22,7 +22,7 @@ _LABEL = 22
 
 
 def main() -> None:
-    """Render and write the image."""
+    """Render all scenes, and write the image."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cameras", help="camera file, or orbit:N")
     parser.add_argument("out", type=Path)

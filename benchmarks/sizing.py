@@ -1,11 +1,11 @@
-"""Memory and seconds of jobs on this machine by number of Gaussians and pixels, predicted for operators.
+"""Predicted memory and run time of jobs on this machine, by number of Gaussians and pixels, for operators.
 
 python -m benchmarks.sizing [--preset standard] [--views 50]
 
-The built-in scene is measured as for a job, and the planner's own model (`decide`) predicts the plans for other sizes.
-It assumes that a view shows half of the Gaussians, that blend weights grow in proportion to the pixels, and that the
-time of a render grows half with the pixels and half with the Gaussians. A dry run of a real scene is always more
-accurate.
+The built-in scene is probed as for a job, and the planner's own model (`decide`) predicts memory and time for other
+sizes. Assumptions: a view shows half of the Gaussians, the size of blend weights is proportional to the number of
+pixels, and one half of the rendering time is proportional to the number of pixels and the other half to the number of
+Gaussians. A dry run of a real scene is always more accurate.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SH_DEGREE = 3
 
 
 def measured(settings: Settings) -> Probe:
-    """Return the probe of the built-in scene."""
+    """Measure the built-in scene, and return its probe."""
     with tempfile.TemporaryDirectory() as folder:
         files = build_demo(Path(folder))
         scene, cameras = read_scene(files.ply).scene, read_cameras(files.cameras)
@@ -49,7 +49,7 @@ def measured(settings: Settings) -> Probe:
 
 
 def changed(probe: Probe, gaussians: int, width: int, views: int) -> Probe:
-    """Return the probe of a scene of another size, with other views."""
+    """Return the probe extrapolated to another number of Gaussians, and to other sizes and numbers of views."""
     height = width * 2 // 3
     before = probe.sizes[0][0] * probe.sizes[0][1]
     pixels = width * height / before
@@ -83,7 +83,7 @@ def _raster(cost: RasterCost, pixels: float, gaussians: float, views: float) -> 
 
 
 def table(probe: Probe, settings: Settings, views: int) -> str:
-    """Return a Markdown table of the GB of a process (and of its GPU) and the hours of a job, by Gaussians and size."""
+    """Return a Markdown table by Gaussians and view size: GB of the process (and of its GPU), and hours of the job."""
     lines = [
         f"| Gaussians | {' | '.join(f'{width}x{width * 2 // 3}' for width in WIDTHS)} |",
         f"|---|{'---:|' * len(WIDTHS)}",
@@ -91,7 +91,7 @@ def table(probe: Probe, settings: Settings, views: int) -> str:
     for gaussians in GAUSSIANS:
         cells = []
         for width in WIDTHS:
-            # As much memory as a plan uses at most: the scene's own, plus a machine's usual budget.
+            # The largest amount of memory that a plan uses: the scene's own, plus a machine's default budget.
             plan = decide(changed(probe, gaussians, width, views), settings, measured=True)
             assert plan.prediction is not None
             cells.append(_cell(plan.prediction))

@@ -1,4 +1,4 @@
-"""One SOS gradient of a 2048x2048 view, all scales: seconds and relative error against the published block method.
+"""Time and relative error of one SOS gradient of a 2048x2048 view, compared with the published block method.
 
 python -m benchmarks.sos_gradient [--size 2048] [--repeats 3]
 """
@@ -20,12 +20,12 @@ from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 
-#: Activations of a 2048x2048 view stay in memory: 1.3 KB per pixel in float32.
+#: Memory limit in bytes: enough to cache the activations of a 2048x2048 view, 1.3 KB per pixel in float32.
 MEMORY = 12 << 30
 
 
 def main() -> None:
-    """Measure, print and store."""
+    """Measure, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=2048)
     parser.add_argument("--repeats", type=int, default=3)

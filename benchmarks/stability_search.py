@@ -2,9 +2,10 @@
 
 python -m benchmarks.stability_search [--seconds 600] [--first 0] [--only SEED]
 
-Each number of the sequence defines a job (`drawn`). The job may be refused with an error of its own; otherwise it must
-stay within the bounds of `sgsst_core.bench.stability.situations`. Violations and other failures are printed and stored
-with their number, which `--only` runs again. Every failure found becomes a case (`job_cases`).
+Each seed defines a job (`drawn`). The job may be refused with one of the project's own errors; otherwise, it must stay
+within the bounds of `sgsst_core.bench.stability.situations`. Violations and unexpected errors are printed and stored
+with their seed, and `--only SEED` runs that job again. Each failure found in this way is added to the hard cases
+(`job_cases`).
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from sgsst_core.errors import SgsstError
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held
 
-#: Largest color coefficient; beyond it, a job may report divergence.
+#: Largest color coefficient; with a larger one, a job may report divergence.
 _MOST = 1e3
 
 
 def main() -> None:
-    """Search, print and store."""
+    """Search, then print and store the outcomes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=600.0, help="of searching; hours find what is rare")
     parser.add_argument("--first", type=int, default=0, help="number of the first job")
@@ -50,10 +51,10 @@ def main() -> None:
 
 
 def search(seconds: float, first: int = 0) -> tuple[Counter[str], dict[int, str]]:
-    """Run jobs for a time, from number `first` on; at least one job is run.
+    """Run the jobs from number `first` on, for the given time but at least one job.
 
     Returns:
-        How often each outcome occurred, and the problem of each job that violated a bound.
+        Number of jobs by outcome, and the problem of each job that violated a bound, by its number.
     """
     ended: Counter[str] = Counter()
     found: dict[int, str] = {}
@@ -69,10 +70,11 @@ def search(seconds: float, first: int = 0) -> tuple[Counter[str], dict[int, str]
 
 
 def outcome(situation: Situation) -> tuple[str, str | None]:
-    """Run a job and classify how it ended.
+    """Run a job, and classify its outcome.
 
     Returns:
-        "within its bounds", the name of the error that refused it, or "broken"; and the problem, or None.
+        Outcome and problem. The outcome is "within its bounds", the name of the error that refused the job, or
+        "broken"; the problem is None unless the job is broken.
     """
     try:
         result = strain(situation)
@@ -87,12 +89,13 @@ def outcome(situation: Situation) -> tuple[str, str | None]:
 
 
 def drawn(number: int) -> Situation:
-    """Return the job with this number; the same on every machine."""
+    """Return the job with this number, which is the same on every machine."""
     rng = random.Random(f"stability {number}")
     settings = _settings(rng)
     scene, style = _scene(rng), _style(rng)
     width, height = _side(rng), _side(rng)
-    # Whether the loss falls is checked only if steps are short and the loss is one that steps can reduce.
+    # A decrease of the loss is only checked for small learning rates, moderate content weights and views that are not
+    # tiny; other jobs may legitimately fail to reduce it.
     tame = settings["learning_rate"] <= 0.01 and 0 < settings["content_weight"] <= 3e3 and min(width, height) >= 16
     tame &= min(style.shape[:2]) >= 16 and float(style.std()) > 0.05 and settings["style_loss"] == "sos"
     tame &= settings.get("preserve_colors") is None and float(scene.sh_dc.abs().max()) < 5 and scene.sh_degree == 0
@@ -107,7 +110,7 @@ def _side(rng: random.Random) -> int:
 
 
 def _size(rng: random.Random, low: float, high: float) -> float:
-    """Draw a number whose logarithm is uniform."""
+    """Draw a number from a log-uniform distribution."""
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
@@ -157,7 +160,7 @@ def _style(rng: random.Random) -> Tensor:
 
 
 def _settings(rng: random.Random) -> dict[str, Any]:
-    """Draw some of the settings; the rest keeps its defaults."""
+    """Draw some of the settings; all others keep their defaults."""
     values: dict[str, Any] = {
         "steps_sos": STEPS,
         "steps_coarse": rng.choice([0, 1, 3]),
@@ -191,7 +194,7 @@ def _settings(rng: random.Random) -> dict[str, Any]:
 
 
 def _tell(number: int) -> None:
-    """Run one job and describe it."""
+    """Run one job, and print its description and outcome."""
     situation = drawn(number)
     scene = situation.scene
     print(f"{len(scene)} Gaussians of degree {scene.sh_degree}, style {tuple(situation.style.shape)}")

@@ -1,10 +1,10 @@
-"""Standard preset against the paper's schedule: loss on all views, and processor seconds, of both.
+"""Comparison of the standard preset with the paper's schedule: loss on all views and CPU seconds.
 
 python -m benchmarks.standard_preset SCENE.ply CAMERAS|orbit:N STYLE NAME [--only paper|standard]
 
-The paper's schedule is scaled to `--steps-coarse` and `--steps-sos` steps, at the paper's learning rate. Seconds are
-processor seconds, so that other work on the machine does not count; run it with one thread. With `--only`, the other
-run's figures come from the result file.
+The paper's schedule is shortened to `--steps-coarse` and `--steps-sos` steps, at the paper's learning rate. Times are
+CPU seconds, so that other programs on the machine do not matter; run the benchmark with one thread. With `--only`, the
+figures of the other schedule are read from the result file.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PAPER_RATE = 2.5e-3
 
 
 def main() -> None:
-    """Run, print and store."""
+    """Run both schedules, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("cameras", help="camera file, or orbit:N")
@@ -78,9 +78,9 @@ def _stored(name: str) -> dict[str, Any]:
 
 
 def _run(stylizer: Stylizer, own: Tensor) -> list[dict[str, Any]]:
-    """Run a job. Returns the loss on all views at the marks, relative to the scene's own colors [n, 3].
+    """Run a job, and return at each of `MARKS` the loss on all views, relative to that of the colors `own` [n, 3].
 
-    The loss of the first step is no reference, because `standard` starts from the style's colors.
+    The scene's own colors are the reference, not the first step's, because `standard` starts from the style's colors.
     """
     views = stylizer.views.covered
     start = stylizer.evaluate(views, own[stylizer.plan.seen])
@@ -101,7 +101,7 @@ def _run(stylizer: Stylizer, own: Tensor) -> list[dict[str, Any]]:
 
 
 def _verdict(results: dict[str, Any]) -> dict[str, Any]:
-    """Return when the standard preset reached the final loss of the paper's schedule, and its own final loss."""
+    """Return when the standard preset reached the final loss of the paper's schedule, and the preset's final loss."""
     last = results["paper"]["points"][-1]
     standard = results["standard"]["points"]
     reached = next((point for point in standard if point["relative"] <= last["relative"]), None)

@@ -1,11 +1,11 @@
-"""Training backgrounds and color initializations for object scans, judged by a network that no run optimizes.
+"""Comparison of training backgrounds and color initializations for object scans, by a network outside the loss.
 
 python -m benchmarks.training_background SCENE.ply STYLE NAME [--ways background,random+warm,...] [--seeds 0,1]
 
-A way is a training background (background, random, palette); "+warm" starts from the style's color distribution. All
-ways have the same views around the object and the same number of steps. Results are judged on novel views
-(`sgsst_core.quality.judge`). Rows are added to benchmarks/results/training_background.json, under NAME; with several
-seeds, figures are means.
+Each item of `--ways` is a training background (background, random, palette); with "+warm", colors are initialized from
+the style's color distribution. All runs have the same views around the object and the same number of steps. Results are
+judged on novel views (`sgsst_core.quality.judge`), and added to benchmarks/results/training_background.json, under
+NAME. With several seeds, figures are means.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from sgsst_core.scene.orbit import orbit
 from sgsst_core.stylizing.evaluation import mean_loss
 
 WAYS = ("background", "background+warm", "random", "random+warm", "palette", "palette+warm")
-#: Number of judged views, and of views per way on the sheet.
+#: Number of judged views, and of views per row on the contact sheet.
 JUDGED, SHOWN = 6, 3
 COLUMNS = ("style", "color_distance", "background_sensitivity", "content", "saturated", "loss", "seconds")
 
 
 def main() -> None:
-    """Run, print and store."""
+    """Run all jobs, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("style", type=Path)
@@ -82,7 +82,7 @@ def _settings(way: str) -> dict[str, Any]:
 
 
 def _judge(scene: Scene, style: torch.Tensor, between: list[Camera]) -> Judge:
-    """Make a judge of some views between those of the job, evenly spread."""
+    """Return a judge of `JUDGED` novel views, selected at even intervals from those between the job's views."""
     step = max(1, len(between) // JUDGED)
     return Judge(Lpips(), style, scene, make_rasterizer("cpu", scene), between[::step][:JUDGED])
 
@@ -96,9 +96,9 @@ def _row(judge: Judge, sh_dc: torch.Tensor) -> dict[str, float]:
 def _run(
     judge: Judge, scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]
 ) -> tuple[torch.Tensor, dict[str, float]]:
-    """Run a job. Returns its colors [N, 3] and its figures.
+    """Run a job, and return its colors [N, 3] and its figures.
 
-    The loss is on the background, relative to the start; seconds are processor seconds.
+    The loss is that of renders on the plain background, relative to its initial value; seconds are CPU seconds.
     """
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
     start = mean_loss(stylizer.start())
@@ -116,7 +116,7 @@ def _print(way: str, row: dict[str, float]) -> None:
 
 
 def _store(arguments: argparse.Namespace, ways: dict[str, dict[str, float]]) -> None:
-    """Add rows to the stored ones of the pair."""
+    """Add rows to the stored results of the same scene and style."""
     path = RESULTS / "training_background.json"
     pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
     told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
@@ -127,7 +127,7 @@ def _store(arguments: argparse.Namespace, ways: dict[str, dict[str, float]]) -> 
 
 
 def _keep(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
-    """Write the colors, and a sheet with a row per way: views on black, and the first one on white."""
+    """Write the colors, and a contact sheet with one row per way: views on black, then the first view on white."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras = judge.cameras[:SHOWN]
     rows = []

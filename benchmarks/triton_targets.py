@@ -1,10 +1,9 @@
-"""Compile the GPU kernels ahead of time for real targets, without a GPU or driver, and report their resource use.
+"""Ahead-of-time compilation of all GPU kernels for real targets, without a GPU or driver, and their resource usage.
 
     python -m benchmarks.triton_targets [--name triton_targets]
 
-Triton's interpreter accepts code that does not compile, so both are needed: the interpreter shows that the kernels
-compute the right numbers, and this benchmark that they compile. Registers and spills are read from the compilers'
-output.
+Triton's interpreter accepts code that does not compile, so both are needed: tests in the interpreter check the kernels'
+results, and this benchmark checks that they compile. Registers and spills are read from the compilers' output.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ _FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (kept
 
 @dataclass(frozen=True)
 class Target:
-    """Kernel as `sgsst_core.rasterizer` compiles it; `types` overrides `_TYPES` for some arguments."""
+    """Kernel with the constants that the project passes; `types` overrides `_TYPES` for some arguments."""
 
     kernel: Any
     constants: dict[str, Any]
@@ -93,7 +92,7 @@ def _of_cached_weights(form: str) -> dict[str, Target]:
 
 
 def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
-    """Return the kernels that read features, with position weights."""
+    """Return the kernels that read features and position weights."""
     features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
     matrix = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
     moments = {**matrix, "SPAN": SPAN_VALUES // channels, "P": POSITIONS}
@@ -114,7 +113,7 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
 
 
 def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
-    """Return the kernels that work on sums over features."""
+    """Return the kernels that process sums over features."""
     entries = block_of_entries(channels)
     block = {"ROWS": entries // block_of_channels(channels), "COLUMNS": block_of_channels(channels)}
     return {
@@ -133,7 +132,7 @@ def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
     }
 
 
-#: Number of channels of the widest layers, and of the pixels.
+#: Number of channels of the widest layers, and number of color channels.
 _WIDEST, _PIXELS = 512, 3
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _LOSS = {"GRAM": GRAM_WEIGHT, "MEAN": MEAN_WEIGHT, "STD": STD_WEIGHT, "EPS": 2.0**-23}
@@ -168,7 +167,7 @@ KERNELS: dict[str, Target] = {
 
 
 def compile_kernel(name: str, target: str) -> dict[str, Any]:
-    """Compile one kernel for one target. Returns registers, spills, shared memory and seconds."""
+    """Compile one kernel for one target, and return registers, spills, shared memory and compile time."""
     found = KERNELS[name]
     signature = {
         argument: "constexpr" if argument in found.constants else {**_TYPES, **found.types}[argument]
@@ -202,14 +201,14 @@ def _of_amd(assembly: str) -> dict[str, int]:
 
 
 def main() -> int:
-    """Compile everything, print and store the table."""
+    """Compile all kernels for all targets, then print and store the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--name", default=None, help="of the file in benchmarks/results; none is written without it")
     arguments = parser.parse_args()
     if os.environ.get("TRITON_INTERPRET") == "1":
         print("TRITON_INTERPRET is set: kernels would be interpreted, not compiled", file=sys.stderr)
         return 2
-    os.environ["TRITON_ALWAYS_COMPILE"] = "1"  # so that seconds are not those of a cache
+    os.environ["TRITON_ALWAYS_COMPILE"] = "1"  # bypass the cache, so that compile times are real
     table = {name: {target: compile_kernel(name, target) for target in TARGETS} for name in KERNELS}
     for name, targets in table.items():
         for target, used in targets.items():

@@ -1,10 +1,10 @@
-"""Animation around a scene, with the original on one side of a moving line and the stylized scene on the other.
+"""Animation of a camera path, with the original scene on one side of a moving line and the stylized one on the other.
 
 python -m benchmarks.wipe SCENE.ply STYLIZED.ply CAMERAS|orbit:N OUT.webp [--first 0] [--count 8] [--resolution 480]
 
-With orbit:N, the camera circles the scene in N views. With a camera file, it moves through `--count` cameras from
-`--first` on and back again, with three extra views between each two. Meanwhile the line crosses the image and returns.
-Quality is lowered until the file is no larger than `--bytes`.
+With orbit:N, the camera circles the scene in N views. With a camera file, it moves through `--count` cameras, starting
+at `--first`, and back again, with three interpolated views between consecutive cameras. Meanwhile, the line crosses the
+image and returns. Image quality is reduced until the file is no larger than `--bytes`.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _painter(scene: Scene, gray: float) -> Callable[[Camera], torch.Tensor]:
 
 
 def _way(arguments: argparse.Namespace, scene: Scene) -> list[Camera]:
-    """Return the cameras of all frames; the first one follows the last."""
+    """Return the cameras of all frames, which form a closed loop."""
     if arguments.cameras.startswith("orbit:"):
         count = int(arguments.cameras.removeprefix("orbit:"))
         return read_views(arguments.cameras, scene, count, arguments.resolution)
@@ -81,7 +81,7 @@ def _way(arguments: argparse.Namespace, scene: Scene) -> list[Camera]:
 
 
 def _smallest(frames: list[Image.Image], milliseconds: int, most: int) -> bytes:
-    """Encode an animated WebP at the best quality that is small enough."""
+    """Encode an animated WebP at the highest quality for which it has at most `most` bytes."""
     for quality in QUALITIES:
         target = io.BytesIO()
         first, *others = frames

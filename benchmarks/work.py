@@ -1,4 +1,4 @@
-"""Operations, memory traffic and launches of a GPU program, counted without computing anything."""
+"""Counts of the operations, memory traffic and kernel launches of PyTorch code, without executing it on a GPU."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torch.utils._pytree import tree_leaves
 
 @dataclass(frozen=True)
 class Work:
-    """Work of one launch.
+    """Work of one kernel launch.
 
     Attributes:
-        operations: Number of operations on its unit.
+        operations: Number of operations on `unit`.
         bytes: Memory traffic in bytes, if every argument is read once and every result written once.
-        unit: "convolution", "matrix" (products in the project's kernels, TF32 or float32) or "lanes" (instructions of
-            single threads).
+        unit: Hardware unit: "convolution", "matrix" (matrix products in the project's kernels, TF32 or float32) or
+            "lanes" (thread instructions).
     """
 
     operations: float = 0.0
@@ -28,18 +28,18 @@ class Work:
     unit: str = "convolution"
 
     def seconds(self, rates: Mapping[str, float]) -> float:
-        """Return the time by the roofline model: the maximum of compute and memory time, given rates per second."""
+        """Return the roofline time: the maximum of compute and memory time, given operations and bytes per second."""
         return max(self.operations / rates[self.unit], self.bytes / rates["bytes"])
 
 
-#: Operations without a launch: they only allocate memory or read a value on the host.
+#: Operations that launch no kernel: they only allocate memory or read a value on the host.
 _FREE = {"empty", "new_empty", "empty_like", "empty_strided", "lift_fresh", "_local_scalar_dense"}
 #: cuDNN fuses a ReLU with the convolution before it (`features.vgg`).
 _FUSED = {"relu_"}
 
 
 class Counted(TorchDispatchMode):
-    """Recorder of all launches on tensors of the device "meta", which have shapes but no values.
+    """Recorder of all kernel launches on tensors of the device "meta", which have shapes but no values.
 
     Attributes:
         works: Work of each launch, in order.
@@ -65,7 +65,7 @@ def _is_view(func: Any) -> bool:
 
 
 def _operations(name: str, args: Any, result: Any) -> float:
-    """Count the multiplications and additions of a convolution; PyTorch's other kernels are memory-bound."""
+    """Return the multiplications and additions of a convolution, or 0 for other kernels, which are memory-bound."""
     if name != "convolution":
         return 0.0
     weight: Tensor = args[1]
@@ -73,5 +73,5 @@ def _operations(name: str, args: Any, result: Any) -> float:
 
 
 def meta(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Return a tensor that has a shape only."""
+    """Return a meta tensor, which has a shape but no values."""
     return torch.empty(shape, dtype=dtype, device="meta")

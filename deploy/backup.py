@@ -1,15 +1,15 @@
-"""Back up and restore a service: its database and its file store.
+"""Backup and restoration of a service's database and file store.
 
-    python deploy/backup.py save FOLDER        # beside a running service
+    python deploy/backup.py save FOLDER        # the service may be running
     python deploy/backup.py restore FOLDER     # into an empty database, before API and dispatchers start
 
 Run it in the service's own environment (`SGSST_DATABASE`, `SGSST_ARTIFACTS`, `AWS_...`). PostgreSQL also needs
-`pg_dump` and `pg_restore` of the server's version or later. Files that FOLDER already has from an earlier backup are
-not copied again, because names of files are never written twice. Unfinished uploads in a local store are the exception.
+`pg_dump` and `pg_restore` of the server's version or later. Files that FOLDER already contains from an earlier backup
+are not copied again, because stored files never change. The exception is unfinished uploads in a local store.
 
-Files are copied before and after the database, so whatever its rows refer to exists in one of the two passes. The
-exception is a checkpoint that was created and replaced in between. The database is then saved again, up to three times
-in total; a job whose checkpoint is still missing restarts from the beginning.
+Files are copied twice, before and after the database is saved, so each file that a row refers to is in one of the two
+copies. The exception is a checkpoint that was created and replaced in between: if one is missing, the database is saved
+again, up to three times in total. A job whose checkpoint is still missing restarts from the first step.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from service.store.tables import ArtifactRow, BlobRow, JobRow, UploadPartRow
 
 #: Number of files copied concurrently.
 _AT_A_TIME = 8
-#: Maximum number of times the database is saved until all checkpoints that it refers to are copied.
+#: Maximum number of times the database is saved if checkpoints that it refers to are missing.
 _ATTEMPTS = 3
-#: Folders beside a local result store: inputs, and unfinished uploads, whose files grow.
+#: Folders beside a local result store: input files, and unfinished uploads, whose files still grow.
 _LOCAL_FOLDERS, _GROWING = ("blobs", "uploads"), "uploads"
-#: Prefix of the name of an incomplete file.
+#: File name prefix of incomplete files.
 _HALF = ".half-"
 
 
 class BackupError(Exception):
-    """Failed backup; the message says what to do."""
+    """Failure of a backup or restoration; the message says what to do."""
 
 
 def main() -> int:
-    """Run the command and return the exit status: 0 on success."""
+    """Run the command, and return the exit status: 0 on success."""
     parser = argparse.ArgumentParser(description="Back up a service, or restore it.")
     parser.add_argument("what", choices=("save", "restore"))
     parser.add_argument("folder", type=Path)
@@ -64,7 +64,7 @@ def main() -> int:
 
 
 def save(settings: ServiceSettings, folder: Path) -> None:
-    """Save database and files to a folder."""
+    """Save the database and all stored files to a folder."""
     store = Store(settings)
     folder.mkdir(parents=True, exist_ok=True)
     files = folder / "files"
@@ -81,7 +81,7 @@ def save(settings: ServiceSettings, folder: Path) -> None:
 
 
 def restore(settings: ServiceSettings, folder: Path) -> None:
-    """Restore files and database from a folder; rows of checkpoints without files are deleted."""
+    """Restore files and database from a folder, and delete database rows of checkpoints whose files are missing."""
     if not (folder / "database").exists():
         raise BackupError(f"{folder} holds no backup.")
     store = Store(settings)
@@ -108,7 +108,7 @@ def _checkpoints(store: Store) -> set[str]:
 
 
 def _places(settings: ServiceSettings) -> dict[str, ObjectStore]:
-    """Return the stores of files by the names of their folders in a backup."""
+    """Return the file stores by the names of their folders in a backup."""
     store = ObjectStore(settings.artifacts_url)
     if not store.local:
         return {"store": store}
@@ -125,7 +125,7 @@ def _copy_all(settings: ServiceSettings, files: Path) -> int:
 
 
 def _copy(source: ObjectStore, target: ObjectStore) -> int:
-    """Copy the files that the target lacks and return their number; files that vanish meanwhile are not needed."""
+    """Copy the files that the target lacks, and return their number. Files that are deleted meanwhile are skipped."""
     there = set() if Path(source.root).name == _GROWING else set(target.below(""))
     wanted = sorted(name for name in source.below("") if name not in there and not Path(name).name.startswith(_HALF))
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
@@ -144,7 +144,7 @@ def _copy_one(source: ObjectStore, target: ObjectStore, name: str) -> bool:
             half = path.with_name(f"{_HALF}{path.name}")
             half.parent.mkdir(parents=True, exist_ok=True)
             source.get(name, half)
-            # the final name only appears on complete files, so an interrupted copy is repeated next time
+            # only complete files get their final name, so an interrupted copy is repeated next time
             half.replace(path)
     except FileNotFoundError:
         return False
@@ -173,7 +173,7 @@ def _load(store: Store, folder: Path) -> None:
 
 
 def _run(program: str, *words: str, url: URL) -> None:
-    """Run a PostgreSQL program, which reads the server's address and the password from its environment."""
+    """Run a PostgreSQL program, with the server's address and password in environment variables."""
     where = {"PGHOST": url.host, "PGPORT": url.port, "PGUSER": url.username, "PGPASSWORD": url.password}
     where |= {"PGDATABASE": url.database, "PGPASSFILE": url.query.get("passfile")}
     environment = {**os.environ, **{name: str(value) for name, value in where.items() if value is not None}}
@@ -184,7 +184,7 @@ def _run(program: str, *words: str, url: URL) -> None:
 
 
 def _missing(store: Store, places: dict[str, ObjectStore]) -> list[str]:
-    """Return the files that rows refer to but that are missing; rows of missing checkpoints are deleted instead."""
+    """Return the missing files that database rows refer to, except checkpoints, whose rows are deleted instead."""
     there = {name: set(place.below("")) for name, place in places.items()}
     remote = "blobs" not in there
     blobs = {name.removeprefix(f"{BLOBS}/") for name in there["store"]} if remote else there["blobs"]

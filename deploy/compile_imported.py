@@ -1,4 +1,4 @@
-"""Import what the programs import, so that the image contains the bytecode: its root is read-only at run time."""
+"""Import all modules of the programs, so that the image contains their bytecode: it is read-only at run time."""
 
 from __future__ import annotations
 

@@ -1,12 +1,13 @@
-"""Lock the packages of the images in deploy/requirements with the digests of their files; pip installs no other file.
+"""Lock files of the container images' packages, with digests: pip only installs files with a listed digest.
 
-Versions come from constraints.txt. When they or the dependencies change, run this with uv (`pip install uv`):
+The files are in deploy/requirements. Versions come from constraints.txt. When versions or dependencies change, install
+uv (`pip install uv`) and run:
 
     python deploy/lock.py torch-2.13.0+cpu-cp311-cp311-manylinux_2_28_x86_64.whl
 
 The wheel of PyTorch without CUDA comes from https://download.pytorch.org/whl/cpu/torch/, because PyPI has none.
 
-`build.txt` has the build dependencies of the project, `common.txt` the packages of both images, `cpu.txt` and
+`build.txt` lists the project's build dependencies, `common.txt` the packages of both images, and `cpu.txt` and
 `cuda.txt` the additional packages of each image.
 """
 
@@ -23,7 +24,7 @@ FOLDER = ROOT / "deploy" / "requirements"
 #: Python version of the images.
 PYTHON = "3.11"
 HEAD = "# Written by deploy/lock.py.\n"
-#: Line in constraints.txt above the packages that only PyTorch with CUDA needs.
+#: Line in constraints.txt that precedes the packages that only PyTorch with CUDA needs.
 CUDA_SECTION = "# What PyTorch's CUDA build for Linux adds."
 
 
@@ -51,7 +52,7 @@ def cuda_packages() -> set[str]:
 
 
 def _compile(source: str, *options: str, given: str | None = None) -> dict[str, str]:
-    """Return the required packages by name, with the digests of their files."""
+    """Return the lock entries (version and file digests) of all required packages, by package name."""
     command = ["uv", "pip", "compile", source, *options, "--quiet", "--no-header", "--no-annotate"]
     command += ["--constraint", str(ROOT / "constraints.txt"), "--generate-hashes"]
     command += ["--python-version", PYTHON, "--python-platform", "x86_64-manylinux_2_28"]

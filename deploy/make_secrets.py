@@ -1,7 +1,8 @@
-"""Write the passwords of the composed services into their volumes; each is generated once, at the first start.
+"""Generation of the passwords of the services in compose.yaml, and their storage in volumes.
 
-A password in the environment takes precedence, at later starts too. The script runs as root in a container of its own
-before all others (`secrets` in compose.yaml). Every service mounts only the passwords that it needs.
+Each password is generated once, at the first start. A password in the environment takes precedence, at later starts
+too. The script runs as root in a separate container before all others (`secrets` in compose.yaml). Each service mounts
+only the passwords that it needs.
 """
 
 from __future__ import annotations
@@ -12,16 +13,17 @@ import secrets
 import sys
 from pathlib import Path
 
-#: User of the service's processes: libpq accepts a password file only if nobody else can read it.
+#: User ID of the service's processes. They must own the password file, because libpq only accepts one that nobody else
+#: can read.
 SERVICE_USER = 10001
 HOST, USER = "database", "sgsst"
 
 
 def make_secrets(folder: Path, given: dict[str, str]) -> None:
-    """Write all files in a folder.
+    """Write all password files to a folder.
 
     Args:
-        given: Environment variables; passwords with an empty or missing variable are generated.
+        given: Environment variables. If a password's variable is empty or missing, the password is generated.
     """
     password = _secret(folder / "database" / "password", given.get("SGSST_DATABASE_PASSWORD"))
     escaped = password.replace("\\", "\\\\").replace(":", "\\:")
@@ -41,16 +43,17 @@ def make_secrets(folder: Path, given: dict[str, str]) -> None:
 
 
 def _secret(path: Path, given: str | None) -> str:
-    """Return the given secret, the one in the file, or a new one, and store it in the file."""
+    """Return the given secret, or else the one in the file, or else a new one, and store it in the file."""
     secret = given or (path.read_text() if path.exists() else secrets.token_hex(32))
     _write(path, secret)
     return secret
 
 
 def _write(path: Path, text: str, *, private: bool = False) -> None:
-    """Write a file atomically; a private one is readable by the service only.
+    """Write a file atomically. If `private`, only the service's user can read it.
 
-    Other services run as users of their own images, so their files are protected by which services mount the volume.
+    Other services run as users of their own images, so the user ID cannot protect their files. They are protected by
+    mounting each volume only in the services that need it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")

@@ -19,7 +19,7 @@ from tests import networks
 
 
 def pytest_make_parametrize_id(val: object) -> str | None:
-    """Name bytes by their length, because their content (gzip times) may differ between processes."""
+    """Use the length of `bytes` parameters as test id, because their content (gzip times) may differ by process."""
     return f"{len(val)}-bytes" if isinstance(val, bytes) else None
 
 
@@ -36,7 +36,7 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Run PyTorch on one thread, for views so small that waking a second one takes longer than the work."""
+    """Run PyTorch on one thread: for small views, waking a second thread takes longer than the work."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -45,7 +45,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def vgg16_weights() -> BackboneWeights:
-    """Load the real VGG16 from the user's cache folder, after downloading it there once; fail if that is impossible."""
+    """Load the real VGG16 weights from the user's cache folder, which they are downloaded to if necessary."""
     try:
         fetch_network_weights("vgg16")
         return load_network_weights("vgg16")
@@ -55,19 +55,19 @@ def vgg16_weights() -> BackboneWeights:
 
 @pytest.fixture(scope="session")
 def tiny_weights() -> BackboneWeights:
-    """Return VGG16 with 16 channels per layer, for tests that compare two computations."""
+    """Return random weights of VGG16 with 16 channels per layer, for tests that compare two computations."""
     return networks.tiny_weights()
 
 
 @pytest.fixture(scope="session")
 def tiny_cache(vgg16_weights: BackboneWeights, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a cache folder with the tiny network as vgg16, for `SGSST_CACHE` of other processes. Read-only."""
+    """Return a cache folder with the tiny network as vgg16, for `SGSST_CACHE`. Tests must not change it."""
     return networks.install_tiny_weights(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture(scope="module")
 def tiny_installed(tiny_cache: Path) -> Iterator[Path]:
-    """Install the tiny network for commands in this process and for processes that it starts."""
+    """Make this process and its child processes use the tiny network as vgg16."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SGSST_CACHE", str(tiny_cache))
         yield tiny_cache

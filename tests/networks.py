@@ -1,4 +1,4 @@
-"""Feature networks so small that their share of a test's time is negligible."""
+"""Tiny feature networks, which take a negligible fraction of a test's time."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ CHANNELS = 16
 
 @functools.cache
 def tiny_weights(name: Literal["vgg16", "vgg19"] = "vgg16") -> BackboneWeights:
-    """Return a network's layers with `CHANNELS` channels each and fixed random weights.
+    """Return fixed random weights for a network's layers, with `CHANNELS` channels each.
 
-    It serves for tests that compare two computations, which any network can show.
+    They are for tests that compare two computations, for which any weights will do.
     """
     return BackboneWeights(
         name=name,
@@ -35,7 +35,7 @@ def tiny_weights(name: Literal["vgg16", "vgg19"] = "vgg16") -> BackboneWeights:
 
 
 def comparing_pixels(weights: BackboneWeights, factor: float = 20.0) -> BackboneWeights:
-    """Return the same network with the pixels compared too, multiplied by a factor."""
+    """Return the same network with the image's pixels as an additional compared layer, multiplied by `factor`."""
     return replace(weights, scales={**weights.scales, PIXELS: factor})
 
 
@@ -52,7 +52,7 @@ def install_tiny_weights(folder: Path) -> Path:
 
 
 def _random_layers(name: str) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-    """Return convolutions after He et al. (2015), which keep the size of features from layer to layer."""
+    """Return random convolutions with He initialization, which preserves the magnitude of features between layers."""
     generator = torch.Generator().manual_seed(16)
     layers, channels = {}, 3
     for block, count in enumerate(BLOCKS[name], start=1):

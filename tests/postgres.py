@@ -24,10 +24,10 @@ def is_installed() -> bool:
 
 
 class Postgres:
-    """A server that tests can stop, kill and start again.
+    """PostgreSQL server that tests can stop, kill and restart.
 
     Attributes:
-        url: URL without the name of a database.
+        url: URL of the server, without a database name.
     """
 
     def __init__(self, *, durable: bool) -> None:
@@ -50,7 +50,7 @@ class Postgres:
         self._started = f"-p {port} -k {self._folder} -c listen_addresses=127.0.0.1 -c fsync={fsync}"
 
     def start(self) -> None:
-        """Start the server, and wait until it answers."""
+        """Start the server, and wait until it accepts connections."""
         self._control("-o", self._started, "-l", str(self._folder / "log"), "-w", "start")
 
     def signal(self, number: int) -> None:
@@ -63,7 +63,7 @@ class Postgres:
             main.wait()
 
     def remove(self) -> None:
-        """End the server, and delete its folder."""
+        """Stop the server, and delete its folder."""
         self._control("-m", "immediate", "stop")
         shutil.rmtree(self._folder)
 
@@ -73,10 +73,10 @@ class Postgres:
 
 @contextmanager
 def controlled_server(*, durable: bool = False) -> Iterator[Postgres]:
-    """Run a server within the block. Yields it.
+    """Run a server within the block, and yield it.
 
     Args:
-        durable: Whether commits are on disk before they are acknowledged, as is needed for realistic timing.
+        durable: Whether commits are written to disk before they are acknowledged, as realistic timing requires.
     """
     made = Postgres(durable=durable)
     made.start()
@@ -88,13 +88,13 @@ def controlled_server(*, durable: bool = False) -> Iterator[Postgres]:
 
 @contextmanager
 def server(*, durable: bool = False) -> Iterator[str]:
-    """As `controlled_server`: its URL, without the name of a database."""
+    """Run a server within the block, and yield its URL, without a database name."""
     with controlled_server(durable=durable) as made:
         yield made.url
 
 
 def fresh_database(url: str) -> str:
-    """Create an empty database on a server and return its URL."""
+    """Create an empty database on a server, and return the database's URL."""
     name = f"t{os.urandom(6).hex()}"
     engine = create_engine(f"{url}/postgres", isolation_level="AUTOCOMMIT")
     with engine.connect() as connection:

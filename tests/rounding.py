@@ -1,4 +1,4 @@
-"""Emulation of NVIDIA's TF32 on a CPU: factors are rounded to 10 bits, products are summed in float32."""
+"""Emulation of NVIDIA's TF32 on a CPU: factors are rounded to 10 mantissa bits, products are summed in float32."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ _LOST = 13
 
 
 def to_tf32(values: Tensor) -> Tensor:
-    """Round float32 values to 10 bits, to nearest, ties to even."""
+    """Round float32 values to 10 mantissa bits, to nearest, ties to even."""
     bits = values.view(torch.int32)
     half_and_tie = (1 << _LOST - 1) - 1 + (bits >> _LOST & 1)
     return (bits + half_and_tie & ~((1 << _LOST) - 1)).view(torch.float32)
 
 
 class RoundedToTf32(FeatureNetwork):
-    """Float32 network whose convolutions round their factors.
+    """Float32 network whose convolutions round their factors to TF32.
 
     Args:
-        decisions: Network whose ReLU masks and pool positions replace those of the rounded one; None keeps its own.
+        decisions: Network whose ReLU masks and max pooling positions are used in the backward pass; None to use those
+            of the rounded network itself.
     """
 
     def __init__(self, *arguments: Any, decisions: FeatureNetwork | None = None) -> None:

@@ -1,4 +1,4 @@
-"""`python -m tests.shifted_clock SECONDS MODULE`: run a module as a process whose wall clock is wrong by so much."""
+"""Runner of a module in a process whose wall clock is wrong: `python -m tests.shifted_clock SECONDS MODULE`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 
 
 def main() -> None:
-    """Shift the wall clock, then run the module as a program."""
+    """Shift this process's wall clock, then run the module as a program."""
     seconds, module = float(sys.argv[1]), sys.argv[2]
     right, right_ns = time.time, time.time_ns
     time.time = lambda: right() + seconds

@@ -1,4 +1,4 @@
-"""Scenes, cameras and files so small that an optimizer step takes a few hundredths of a second."""
+"""Tiny scenes, cameras and files, with which an optimizer step takes a few hundredths of a second."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def wall(columns: int = 28, rows: int = 22, sh_degree: int = 0) -> Scene:
 
 
 def ball(count: int = 300) -> Scene:
-    """Return a ball of radius 0.7 at z = 3 with nothing around it, like an object scan."""
+    """Return a ball of radius 0.7 at z = 3 without a background, like an object scan."""
     generator = torch.Generator().manual_seed(6)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     return Scene(

@@ -1,4 +1,7 @@
-"""Tests that what README, CONTRIBUTING, CHANGELOG and docs/ refer to exists. `make docs` checks the anchors too."""
+"""Tests that the targets of references in README, CONTRIBUTING, CHANGELOG and docs/ exist.
+
+Anchors are checked by `make docs`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Docstrings and their entries start with a noun or a verb, as docs/style.md asks for."""
+"""Tests that docstrings and their entries start with a noun or a verb, as docs/style.md requires."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def prose(docstring: str) -> list[str]:
 
 
 def docstrings(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the line and text of each docstring of a file, those of private functions included."""
+    """Yield line and text of each docstring of a file, including those of private functions."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and (
             text := ast.get_docstring(node)

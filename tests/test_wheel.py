@@ -1,7 +1,7 @@
-"""Tests of the wheel, installed into an environment of its own and used from another folder.
+"""Tests of the wheel, which is installed into a new environment and used from another folder.
 
-The environment can import the packages of the present one, so nothing is downloaded, but not this project: files that
-the wheel lacks are missing there.
+The new environment can import third-party packages of the current one, so nothing is downloaded. It cannot import this
+project's source, so files that the wheel lacks are missing there.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PACKAGES = ("sgsst_core", "worker", "service", "api")
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the wheel in a copy of this working tree, because building leaves folders behind."""
+    """Build the wheel in a copy of the working tree, because building leaves folders behind."""
     copy = tmp_path_factory.mktemp("source")
     for name in PACKAGES:
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -43,7 +43,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Install the wheel into a new environment and return the folder of its commands."""
+    """Install the wheel into a new environment, and return the folder of its commands."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False)
     commands = folder / "bin"
@@ -57,7 +57,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(command: list[str | Path], folder: Path, **variables: str) -> str:
-    """Run a command in a folder outside this project. Returns its output; fails if the command does."""
+    """Run a command in a folder outside of this project, and return its output; fail if the command does."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(command, cwd=folder, env={**environment, **variables}, capture_output=True, text=True)
     assert done.returncode == 0, f"{command}:\n{done.stdout}\n{done.stderr}"

@@ -1,8 +1,8 @@
-"""Load on one PostgreSQL server from a long queue and from all writes of a fleet's dispatchers, measured by real calls.
+"""Load on one PostgreSQL server from a long queue and from all writes of a fleet's dispatchers.
 
-Each action of a dispatcher runs many times on several threads at once. How often a fleet does it follows from its jobs
-and from the service's own intervals. The server runs on this machine with durable commits, and so do the clients;
-processor seconds are those of the server alone.
+Each kind of store call that a dispatcher makes runs many times on several threads at once. The rate of these calls in a
+fleet is derived from its jobs and from the service's own intervals. Server and clients both run on this machine, and
+commits are durable. CPU seconds are those of the server alone.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _OWNERS, _THREADS, _EACH = 50, 4, 12
 _INPUTS = [{"role": "scene", "name": "scene.ply", "sha256": _SHA, "size": 10**9}]
 #: Seconds between previews (`ServiceSettings.preview_seconds`).
 _PREVIEW_SECONDS = 20.0
-#: Fraction of a saturated fleet's GPUs that are reserved for jobs on several GPUs (3 % were idle in simulation). At
-#: most this many dispatchers look in vain for a job to backfill.
+#: Fraction of a saturated fleet's GPUs that are reserved for multi-GPU jobs (3 % were idle in simulation). At most as
+#: many dispatchers as there are reserved GPUs poll for a short job to backfill and find none.
 _KEPT_GPUS = 0.03
 
 
@@ -61,7 +61,7 @@ def _fill(store: Store, queued: int) -> None:
 
 
 def _lease_query(store: Store) -> dict[str, float]:
-    """Return the milliseconds to find the next job, for both statements together; `least` is the undisturbed time."""
+    """Return the milliseconds of finding the next job, both statements together; `least` is the minimum."""
     took: list[float] = []
     started = 0.0
 
@@ -86,7 +86,7 @@ def _lease_query(store: Store) -> dict[str, float]:
 
 
 def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
-    """Return the statements, server time and rate of each call that a fleet makes."""
+    """Return number of statements, server time and rate of each store call that dispatchers make."""
     leases: dict[str, list[Lease]] = {f"host-{number}": [] for number in range(_THREADS)}
 
     def own() -> list[Lease]:
@@ -95,14 +95,14 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
 
     def take(*room: Callable[[Any], Any]) -> None:
         lease = store.leases.take(threading.current_thread().name, *room)
-        while lease is None:  # another thread has locked the row that is next
+        while lease is None:  # another thread has locked the next row
             lease = store.leases.take(threading.current_thread().name, *room)
         own().append(lease)
 
     def keeping(lets_in: bool) -> list[Callable[[Any], Any]]:
-        """Return filters for a job that does not fit, for which GPUs are reserved.
+        """Return filters that reject the first job, which is too large, and reserve GPUs for it.
 
-        The job after it may use the reserved GPUs, or no job may.
+        If `lets_in`, the next job may use the reserved GPUs; otherwise, no job may.
         """
         return [lambda job: False, lambda job: True, lambda kept: lambda job: lets_in]
 
@@ -175,7 +175,7 @@ def _cost(store: Store, port: int, call: Callable[[], Any]) -> dict[str, float]:
 
 
 def _server_seconds(port: int) -> float:
-    """Return the processor seconds of all server processes; connections stay open, so none of them ends."""
+    """Return the CPU seconds of all server processes. Connections stay open, so no server process exits meanwhile."""
     seconds = 0.0
     for connection in psutil.net_connections("tcp"):
         if connection.status == psutil.CONN_LISTEN and connection.laddr.port == port and connection.pid:
@@ -188,7 +188,7 @@ def _server_seconds(port: int) -> float:
 
 
 def _fleet(calls: dict[str, dict[str, float]], gpus: int, dispatchers: int) -> dict[str, Any]:
-    """Return how often a fleet makes each call, the total load, and the number of GPUs that saturate a core."""
+    """Return each call's rate in a fleet, the total load, and the number of GPUs whose calls saturate one core."""
     demand = Demand(gpus)
     jobs = demand.jobs(0.2, 0)
     a_second = demand.jobs_a_day * gpus / 1000 / 86_400
@@ -219,7 +219,7 @@ def _fleet(calls: dict[str, dict[str, float]], gpus: int, dispatchers: int) -> d
 
 
 def _reports(seconds: float) -> float:
-    """Return the number of progress reports in some seconds of steps."""
+    """Return the number of progress reports during the given seconds of steps."""
     count, now = 0.0, 0.0
     while now < seconds:
         now += progress_seconds(now)

@@ -1,7 +1,7 @@
 """Jobs of a simulated fleet: their sizes, owners and arrival times, determined by a seed.
 
-Seconds are those of `service.scheduling.job_size`, which a test compares with `benchmarks.forecast`. The actual time of
-a job differs from them by a random factor that its record does not reveal.
+Predicted times come from `service.scheduling.job_size`, which a test compares with `benchmarks.forecast`. A job's
+actual time is the predicted one times a random factor that the scheduler does not know.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from typing import Any
 from service.scheduling.job_size import JobSize, estimated_size
 from sgsst_core.planning.ranks_model import LEAST_GAIN
 
-#: Bytes of a Gaussian with SH of degree 3 in a PLY.
+#: Bytes of a Gaussian with SH of degree 3 in a PLY file.
 GAUSSIAN_BYTES = 248
-#: Seconds before a job's first step (process, CUDA and network); bytes per second from the store; seconds of planning,
-#: and steps it takes on top.
+#: Overhead before a job's first step: seconds to start the process, CUDA and the network; download rate from the file
+#: store in bytes per second; seconds of planning, and number of steps that planning makes.
 _START_SECONDS, _STAGING_BYTES, _PLAN_SECONDS, _PLAN_STEPS = 12.0, 1e9, 6.0, 10
-#: Standard deviation of the logarithm of a job's actual time over its predicted one.
+#: Standard deviation of the logarithm of actual over predicted time of a job.
 _SPREAD = 0.35
-#: Fraction of the jobs above the usual size that request a number of workers.
+#: Fraction of the jobs above the usual size whose request specifies the number of workers.
 _NAMES_WORKERS = 0.08
-#: Bursts per day, each from one key within a minute, and jobs per burst.
+#: Bursts per day (each from one API key within a minute), and jobs per burst.
 _BURSTS, _BURST_JOBS = 24, 250
-#: Relative variation of the arrival rate in the course of a day.
+#: Relative variation of the arrival rate over a day.
 _SWING = 0.25
 
 
 @dataclass(frozen=True)
 class Kind:
-    """Jobs of about one size.
+    """Class of jobs of similar size.
 
     Attributes:
         name: Name of the kind.
         preset: Preset of its jobs.
-        share: Fraction of all jobs; None for the kinds that fill the load up to the target.
+        share: Fraction of all jobs; None for kinds whose number is chosen such that the fleet's target load is reached.
         sides: Longer sides of views in pixels.
         gaussians: Minimum and maximum number of Gaussians.
     """
@@ -57,7 +57,7 @@ KINDS = (
     Kind("paper", "paper", None, (980, 1600), (1e6, 4e6)),
     Kind("paper, large", "paper", None, (5187,), (3e6, 8e6)),
 )
-#: Fraction of large jobs among the kinds without a share.
+#: Fraction of large jobs among the kinds whose `share` is None.
 _LARGE_PAPERS = 0.04
 
 
@@ -67,8 +67,8 @@ class SimulatedJob:
 
     Attributes:
         at: Arrival time in seconds from the start.
-        owner: Key that submits it.
-        kind: Name of its kind.
+        owner: API key that submits the job.
+        kind: Name of the job's `Kind`.
         parameters: Parameters of the job.
         scene_bytes: Size of the scene file.
         factor: Actual time relative to the predicted one.
@@ -83,7 +83,7 @@ class SimulatedJob:
 
     @property
     def inputs(self) -> list[dict[str, Any]]:
-        """Inputs as the store records them."""
+        """Input files as recorded in the database."""
         return [{"role": "scene", "name": "scene.ply", "sha256": "a" * 64, "size": self.scene_bytes}]
 
     @property
@@ -97,7 +97,7 @@ class SimulatedJob:
         return self.size.steps_coarse + self.size.steps_sos
 
     def seconds(self, gpus: int) -> float:
-        """Return the seconds of all steps on a number of GPUs."""
+        """Return the actual seconds of all steps on `gpus` GPUs."""
         return self.factor * self.size.seconds(gpus)
 
     def start_seconds(self) -> float:
@@ -106,7 +106,7 @@ class SimulatedJob:
         return _START_SECONDS + self.scene_bytes / _STAGING_BYTES + planning
 
     def planned(self, offered: int) -> int:
-        """Return how many of the offered GPUs its plan uses: the fewest beyond which more gain too little."""
+        """Return how many of the offered GPUs the job's plan uses: the point beyond which more GPUs gain too little."""
         if self.parameters.get("workers"):
             return offered
         seconds = [self.seconds(gpus) for gpus in range(1, offered + 1)]
@@ -125,11 +125,11 @@ class Demand:
 
     Attributes:
         gpus: Number of GPUs of the fleet.
-        load: GPU seconds requested, with each job on one GPU, relative to those available.
-        jobs_a_day: Jobs per day of all keys together, for a fleet of 1,000 GPUs; smaller fleets get a proportional
-            number.
-        keys: Number of keys that submit jobs.
-        greedy: Fraction of all jobs that the first key submits at once.
+        load: Requested GPU seconds (as if each job ran on one GPU) relative to available GPU seconds.
+        jobs_a_day: Jobs per day of all API keys together for a fleet of 1,000 GPUs; scaled in proportion for other
+            fleet sizes.
+        keys: Number of API keys that submit jobs.
+        greedy: Fraction of all jobs that the first API key submits at once.
     """
 
     gpus: int
@@ -139,7 +139,7 @@ class Demand:
     greedy: float = 0.05
 
     def jobs(self, hours: float, seed: int) -> list[SimulatedJob]:
-        """Return the jobs of some hours in the order of their arrival."""
+        """Return the jobs that arrive within `hours`, in order of arrival."""
         chance = random.Random(seed)
         count = round(self.jobs_a_day * self.gpus / 1000 * hours / 24)
         shares = self.shares(chance)
@@ -154,7 +154,7 @@ class Demand:
         return sorted(jobs, key=lambda job: job.at)
 
     def _times(self, count: int, seconds: float, chance: random.Random) -> Iterator[tuple[float, str | None]]:
-        """Yield the arrival times of jobs, with the key for jobs in a burst."""
+        """Yield arrival times, each with the API key if the job is in a burst and None otherwise."""
         greedy = round(self.greedy * count)
         for _ in range(greedy):
             yield 0.3 * seconds + chance.uniform(0, 60), "key_000"
@@ -172,7 +172,7 @@ class Demand:
                 yield at, None
 
     def shares(self, chance: random.Random) -> list[float]:
-        """Return the fraction of each kind, such that all jobs together make up the load."""
+        """Return each kind's fraction of all jobs, such that all jobs together produce the target load."""
         means = [_mean_seconds(kind, chance) for kind in KINDS]
         given = sum(kind.share or 0.0 for kind in KINDS)
         wanted = self.load * 1000 * 86_400 / self.jobs_a_day

@@ -1,4 +1,4 @@
-"""Figures of a simulated fleet: GPU utilization, waits by size and by key, cost of failures."""
+"""Figures of a simulated fleet: GPU utilization, waiting times by job size and by API key, cost of failures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.fleet_parts.simulation import Fleet, Record
 
-#: A job has starved if it waits longer than this plus its own run time.
+#: A job counts as starved if it waits longer than this plus its own run time.
 _STARVED_SECONDS = 3600.0
 
 
@@ -42,12 +42,12 @@ def figures(fleet: Fleet, seconds: float, warm_up: float) -> dict[str, Any]:
 
 
 def _wait(record: Record, now: float) -> float:
-    """Return the seconds until the first attempt, or so far if it has not started."""
+    """Return the waiting time before the first attempt; if there is none yet, the waiting time so far."""
     return (now if record.started is None else record.started) - record.job.at
 
 
 def spread(values: Iterable[float]) -> dict[str, float]:
-    """Return percentiles of seconds."""
+    """Return percentiles of times in seconds."""
     found = sorted(values)
     if not found:
         return {}
@@ -68,7 +68,7 @@ def _by(records: Sequence[Record], now: float, name: Any) -> dict[str, Any]:
 
 
 def _keys(records: Sequence[Record], now: float) -> dict[str, Any]:
-    """Return the waits of the greedy key, of the keys with most jobs, and a summary of all other keys."""
+    """Return waiting times of the greedy API key, of the keys with most jobs, and a summary of all other keys."""
     groups = _grouped(records, lambda record: record.job.owner)
     greedy = groups.pop("key_000", [])
     others = {key: spread(_wait(record, now) for record in own) for key, own in groups.items()}

@@ -1,9 +1,9 @@
 """Hosts under a simulated clock, with the service's own queue, fairness, leases and packing.
 
-Each host has a dispatcher. A dispatcher asks for work when it has free GPUs and there may be a job for it, within the
-half second in which a real one polls. Polls that find nothing are not simulated, but counted by
-`benchmarks.fleet_parts.database`. Leases are not renewed: they hold until a host fails, and then expire as late as they
-really would. Likewise, only the last checkpoint before a failure is published.
+Each host has a dispatcher. If it has free GPUs and there may be a job for them, it polls for work within half a second,
+as a real one does. Polls that find nothing are not simulated; `benchmarks.fleet_parts.database` measures their load.
+Leases are renewed less often than by real dispatchers, but those of a failed host expire as late as they really would.
+Likewise, only the last checkpoint before a failure is published.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from service.store.leases import Lease, Published
 from service.store.tables import ReservationRow
 
 LEASE_SECONDS, CHECKPOINT_SECONDS, POLL_SECONDS = 30.0, 60.0, 0.5
-#: Seconds after which a host polls again if it has free GPUs but fits none of the waiting jobs (a real one uses
+#: Seconds after which a host polls again if none of the waiting jobs fits its free GPUs (a real host uses
 #: `POLL_SECONDS`).
 _LOOK_AGAIN = 10.0
-#: Interval between renewals of a host's leases in seconds; real ones are renewed more often.
+#: Interval in seconds between renewals of a host's leases. Real dispatchers renew leases more often.
 _RENEWAL_SECONDS = 900.0
 #: Minimum and maximum seconds until a failed host is back.
 _REPAIR_SECONDS = (600.0, 3600.0)
@@ -46,14 +46,14 @@ _SHA = "a" * 64
 
 @dataclass
 class Record:
-    """Record of a job.
+    """Simulation record of a job.
 
     Attributes:
-        started: Time at which its first attempt started.
-        offered, planned: GPUs of its last attempt.
+        started: Start time of the first attempt.
+        offered, planned: Number of GPUs offered to the last attempt, and number used by its plan.
         held: GPU seconds of all attempts.
-        lost: GPU seconds of work that was lost.
-        done: Fraction of its steps that is saved.
+        lost: GPU seconds of lost work.
+        done: Fraction of the steps that is saved in a checkpoint.
     """
 
     job: SimulatedJob
@@ -69,7 +69,7 @@ class Record:
 
 @dataclass
 class Attempt:
-    """Attempt of a job that holds GPUs of a host."""
+    """Attempt of a job, which occupies GPUs of a host."""
 
     record: Record
     lease: Lease
@@ -81,7 +81,7 @@ class Attempt:
 
     @property
     def holding(self) -> Holding:
-        """Holding as a real attempt reports it: without an end before its first step, then with the right one."""
+        """Resources in use, as a real attempt reports them: with the expected end only after the first step."""
         if self.ends is None:
             return Holding(self.grant)
         pace = None if self.record.attempts > 1 else self.record.job.factor
@@ -90,7 +90,7 @@ class Attempt:
 
 @dataclass
 class Host:
-    """Machine with its dispatcher; `life` counts its restarts, so that events of an earlier life are ignored."""
+    """Machine with its dispatcher. `life` counts restarts, so that events from before a restart are ignored."""
 
     dispatcher: Dispatcher
     gpus: int
@@ -102,20 +102,20 @@ class Host:
 
     @property
     def held(self) -> list[Holding]:
-        """Holdings of its jobs."""
+        """Resources in use by the host's attempts."""
         return [attempt.holding for attempt in self.running.values()]
 
     @property
     def free(self) -> int:
-        """Number of GPUs that no job holds."""
+        """Number of unoccupied GPUs."""
         return self.gpus - sum(len(attempt.grant.gpus) for attempt in self.running.values()) if self.up else 0
 
 
 class Fleet:
-    """Hosts, their store and a clock.
+    """Simulated hosts, their database and their clock.
 
     Args:
-        folder: Folder of the store, preferably in memory.
+        folder: Folder of the database, preferably in memory.
         hosts: Number of hosts.
         gpus_each: GPUs per host.
         host_days: Mean days between failures of a host.
@@ -135,7 +135,7 @@ class Fleet:
         self._number = 0
         self._doing = ""
         self._waiting = 0
-        # Leases last long, so that few renewals are simulated; `_run_out` ends those of failed hosts.
+        # Leases are long, so that few renewals are simulated; `_run_out` ends leases of failed hosts in time.
         settings = ServiceSettings(data=folder, lease_seconds=2 * _RENEWAL_SECONDS, log_format="text")
         self.store: Store = open_store(settings, lambda: _EPOCH + self.now)
         self._prepare_store()
@@ -158,16 +158,16 @@ class Fleet:
         self.statements[self._doing] += 1
 
     def run(self, jobs: list[SimulatedJob], seconds: float, warm_up: float, patience: float = math.inf) -> float:
-        """Run the simulation; GPU seconds before the end of the warm-up do not count.
+        """Run the simulation. GPU seconds count from the end of the warm-up.
 
         Args:
-            jobs: Jobs that arrive.
-            seconds: Seconds to simulate.
-            warm_up: Seconds of the warm-up.
-            patience: Maximum seconds of computing, after which the simulation stops early.
+            jobs: Jobs with their arrival times.
+            seconds: Simulated seconds.
+            warm_up: Simulated seconds of the warm-up.
+            patience: Maximum wall-clock seconds, after which the simulation stops early.
 
         Returns:
-            Seconds simulated.
+            Number of seconds that were simulated.
         """
         started = time.perf_counter()
         self._at(warm_up, self._forget_held)
@@ -206,7 +206,7 @@ class Fleet:
         return self.now + self._chance.uniform(0, POLL_SECONDS)
 
     def _do(self, what: str) -> None:
-        """Attribute the following statements to this action."""
+        """Count subsequent SQL statements under the name `what`."""
         self._doing = what
         self.calls[what] += 1
 
@@ -219,7 +219,7 @@ class Fleet:
         self._at(self._soon(), self._somebody_looks)
 
     def _somebody_looks(self) -> None:
-        """Let hosts with free GPUs poll for work, in random order."""
+        """Schedule polls of all hosts with free GPUs, in random order."""
         hosts = [host for host in self.hosts if host.free and host.keeps_room_for is None]
         self._chance.shuffle(hosts)
         for host in hosts:
@@ -228,7 +228,7 @@ class Fleet:
             self._look(host)
 
     def _look(self, host: Host) -> None:
-        """Let a dispatcher take every job that fits, as the real one does in each round."""
+        """Lease all jobs that fit a host, as a real dispatcher does in each poll."""
         while host.free and self._waiting:
             self._do("lease")
             found = host.dispatcher.next_job(host.held)
@@ -317,7 +317,7 @@ class Fleet:
         self._at(self.now + self._chance.uniform(*_REPAIR_SECONDS), lambda: self._repair(host))
 
     def _lose(self, attempt: Attempt) -> None:
-        """Record as lost the work since the last checkpoint, or all of it before the first step."""
+        """Record the work since the last checkpoint as lost; before the first step, the whole attempt is lost."""
         record = attempt.record
         self._account(attempt)
         gpus = len(attempt.grant.gpus)
@@ -355,5 +355,5 @@ class Fleet:
 
 
 def _trust_the_memory(connection: Any, _record: Any) -> None:
-    """Turn off durability, which a simulated store does not need."""
+    """Turn off durability, which a simulated database does not need."""
     connection.execute("PRAGMA synchronous=OFF")

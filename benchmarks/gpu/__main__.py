@@ -1,11 +1,12 @@
-"""Measure the GPU of this machine (correctness, seconds, bytes), in one command and one file.
+"""Measure correctness, speed and memory use on this machine's GPU, in one command, with results in one file.
 
     python -m benchmarks.gpu [--quick] [--only PART ...] [--gaussians 1000000,3000000,6000000] [--out FILE.json]
 
-Needs PyTorch, Triton, NumPy, SciPy, Numba, psutil and safetensors. Parts that need more (pydantic for a job's settings,
-plyfile for a real scene) are skipped with the reason if it is missing. Takes less than nine minutes. Without a GPU it
-runs small sizes in Triton's interpreter, which tests the benchmark but says nothing about speed. Results are in
-benchmarks/results/gpu_DEVICE.json. The exit status is 1 if a part has failed.
+The benchmark needs PyTorch, Triton, NumPy, SciPy, Numba, psutil and safetensors. Parts that need another package
+(pydantic for a job's settings, plyfile for a real scene) are skipped if it is missing, and the reason is reported. All
+parts together take less than nine minutes. Without a GPU, small sizes run in Triton's interpreter, which tests the
+benchmark but says nothing about speed. Results are written to benchmarks/results/gpu_DEVICE.json. The exit status is 1
+if a part has failed.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ import torch
 from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.machine import RESULTS, write_result
 
-#: Time limit of each part in seconds, 535 in all. The first part that runs on the CPU compiles its kernels.
+#: Time limit of each part in seconds, 535 in total. The first part that uses the CPU rasterizer also compiles it.
 BUDGETS = {"parity": 60, "raster": 100, "network": 40, "step": 90, "curve": 120, "ranks": 45, "tests": 80}
-#: Factor on the limits without a GPU, where the processor may be busy and seconds mean nothing.
+#: Factor on the time limits without a GPU, where the CPU may be busy and times mean nothing.
 _PATIENCE = 5
 #: Packages of this repository. A missing one is an error, not a reason to skip a part.
 _OWN = ("api", "benchmarks", "service", "sgsst_core", "tests", "worker")
@@ -43,7 +44,7 @@ def main() -> int:
     """Run all parts, or the single part that this process was started for."""
     arguments = parse()
     if not torch.cuda.is_available():
-        os.environ["TRITON_INTERPRET"] = "1"  # read when kernels are first imported, in the parts' processes
+        os.environ["TRITON_INTERPRET"] = "1"  # read when a part's process first imports the kernels
     if arguments.findings:
         return run_part(arguments.only[0], arguments)
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
@@ -79,12 +80,12 @@ def sizes_of(arguments: argparse.Namespace) -> Sizes:
 
 
 def in_a_process(part: str, budget: float) -> dict[str, Any]:
-    """Run a part in a process. Returns status, seconds and findings, which may be incomplete if time ran out."""
+    """Run a part in a separate process, and return status, seconds and findings (incomplete after a timeout)."""
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         path, errors = Path(folder) / "findings.json", Path(folder) / "errors.txt"
         command = [sys.executable, "-m", "benchmarks.gpu", *_without_parts(sys.argv[1:]), "--only", part]
-        with errors.open("w") as stderr:  # in a session of its own, so that its child processes end with it
+        with errors.open("w") as stderr:  # in a separate session, so that its child processes can be killed with it
             process = subprocess.Popen([*command, "--findings", path], stderr=stderr, start_new_session=True)
             try:
                 status = process.wait(budget)
@@ -101,14 +102,14 @@ def in_a_process(part: str, budget: float) -> dict[str, Any]:
 
 
 def _without_parts(arguments: list[str]) -> list[str]:
-    """Return the options that all parts share."""
+    """Return the command line without options that select parts."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--only", nargs="+")
     return parser.parse_known_args(arguments)[1]
 
 
 def run_part(part: str, arguments: argparse.Namespace) -> int:
-    """Run one part in this process; its last finding is its status."""
+    """Run one part in this process, and add its status as the last finding."""
     found = Findings(arguments.findings)
     try:
         importlib.import_module(f"benchmarks.gpu.{part}").run(sizes_of(arguments), found)
@@ -125,7 +126,7 @@ def run_part(part: str, arguments: argparse.Namespace) -> int:
 
 
 def print_part(part: str, result: dict[str, Any]) -> None:
-    """Print a part as lines of a table."""
+    """Print the result of a part as rows of a table."""
     print(f"\n{part}: {result['status']}, {result['seconds']} s")
     if "reason" in result:
         print(f"  {result['reason']}")
@@ -134,7 +135,7 @@ def print_part(part: str, result: dict[str, Any]) -> None:
 
 
 def leaves(found: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
-    """Return all values with their paths; long lists are shortened to their ends."""
+    """Return all leaf values with their paths; of a long list, only the first and last values."""
     lines: list[tuple[str, Any]] = []
     for name, value in found.items():
         if isinstance(value, dict):

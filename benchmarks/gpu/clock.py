@@ -12,7 +12,7 @@ from sgsst_core.timing import wait_for
 
 
 def seconds(action: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Return the median time of some calls after a warm-up call, by events on a GPU and by the clock on a CPU."""
+    """Return the median time of `repeats` calls after a warm-up call, measured by CUDA events or the CPU's clock."""
     action()
     return statistics.median(_once(action, device) for _ in range(repeats))
 
@@ -32,7 +32,7 @@ def _once(action: Callable[[], object], device: torch.device) -> float:
 
 
 def waited_seconds(action: Callable[[], object], device: torch.device) -> float:
-    """Return the wall-clock seconds of one call, until the device has finished it."""
+    """Return the wall-clock seconds from the start of a call until the device has finished its work."""
     wait_for(device)
     started = time.perf_counter()
     action()
@@ -41,12 +41,12 @@ def waited_seconds(action: Callable[[], object], device: torch.device) -> float:
 
 
 def forget_peak(device: torch.device) -> None:
-    """Free unused memory and reset the peak."""
+    """Free unused memory, and reset the memory peak."""
     if device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
 
 
 def peak_bytes(device: torch.device) -> int | None:
-    """Return the peak of allocated memory on the device in bytes, or None on a CPU."""
+    """Return the peak of allocated device memory in bytes, or None on a CPU."""
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None

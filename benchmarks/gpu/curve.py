@@ -1,6 +1,6 @@
-"""Loss curve of a run of many steps on the GPU, compared with that of the CPU.
+"""Loss curve of a job with many steps on the GPU, compared with that of the same job on the CPU.
 
-The CPU's run is a process that sees no GPU; both run at the same time.
+Both run at the same time; the CPU's job is a separate process in which no GPU is visible.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-#: Largest relative difference from the CPU's loss. Means over rounds of all views are compared: Adam moves a color as
-#: far for a gradient that is only rounding error as for any other, so single losses scatter by as much.
+#: Bound on the relative difference from the CPU's loss, for means over rounds of all views. Single losses differ more:
+#: Adam normalizes gradients, so a color whose gradient is only rounding error moves as far as any other.
 BOUND = 1e-3
 VIEWS = 6
-#: Learning rate of the paper. At 0.02, losses of runs whose initial colors differ by 3e-7 end up a percent apart.
+#: Learning rate of the paper. At 0.02, an initial difference of 3e-7 in color grows to 1 % in the final loss.
 LEARNING_RATE = 2.5e-3
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Compare the losses step by step."""
+    """Compare the loss curves of GPU and CPU."""
     quick = sizes == QUICK
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "losses.json"
@@ -54,14 +54,14 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def largest_difference(losses: list[float], expected: list[float], window: int) -> float:
-    """Return the largest relative difference of geometric means over windows of steps."""
+    """Return the largest relative difference between geometric means over windows of steps."""
     differences = [math.log(a / b) for a, b in zip(losses, expected, strict=True)]
     starts = range(0, len(differences) - window + 1, window)
     return max(abs(sum(differences[start : start + window])) / window for start in starts)
 
 
 def follow(sizes: Sizes, rasterizer: str | None) -> tuple[str, list[float]]:
-    """Run the job. Returns the scene's name and the loss of every step."""
+    """Run the job, and return the scene's name and the loss of each step."""
     steps, side = sizes.curve
     name, scene, cameras = inputs(side, small=sizes == QUICK)
     settings = make_settings(
@@ -75,7 +75,7 @@ def follow(sizes: Sizes, rasterizer: str | None) -> tuple[str, list[float]]:
 
 
 def inputs(side: int, *, small: bool) -> tuple[str, Scene, list[Camera]]:
-    """Return a real scene if it is present and readable, otherwise a synthetic one."""
+    """Return a real scene with cameras if it is present and readable, otherwise a synthetic one."""
     folder = DATA / "scenes" / "snowmiku_plush"
     if not small and (folder / "cameras.json").is_file():
         try:
@@ -90,12 +90,12 @@ def inputs(side: int, *, small: bool) -> tuple[str, Scene, list[Camera]]:
 
 
 def synthetic(side: int, small: bool) -> tuple[Scene, list[Camera]]:
-    """Return a ball that fills the views."""
+    """Return a ball and cameras whose views it fills."""
     return surface_scene(60 if small else 20_000, degree=1), views(1 if small else VIEWS, side, side * 3 // 4)
 
 
 def main(arguments: list[str]) -> None:
-    """Run on the CPU and write the losses to the file given first."""
+    """Run the job on the CPU, and write the losses to the file named by the first argument."""
     sizes: Any = QUICK if "--quick" in arguments else Sizes()
     Path(arguments[0]).write_text(json.dumps(follow(sizes, "cpu")[1]))
 

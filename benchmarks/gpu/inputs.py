@@ -1,4 +1,4 @@
-"""Scenes, views, images and weights that are generated from seeds, so that no files are needed."""
+"""Scenes, views, images and network weights generated from seeds, so that the benchmark needs no files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
 
-#: Standard deviation of a Gaussian over the distance to its neighbors. Some thirty reach each point, as in scans.
+#: Standard deviation of a Gaussian relative to the distance between neighbors. About thirty Gaussians contribute to
+#: each point, as in scans.
 _OVERLAP = 1.0
 _CHANNELS = (64, 128, 256, 512, 512)
 
@@ -38,7 +39,7 @@ def surface_scene(count: int, degree: int = 0, seed: int = 0) -> Scene:
 
 
 def views(count: int, width: int, height: int) -> list[Camera]:
-    """Return cameras around the ball, which fills most of the height."""
+    """Return cameras around the ball, which fills most of each view's height."""
     up, center = torch.tensor([0.0, -1.0, 0.0]), torch.zeros(3)
     angles = torch.arange(count) * (2 * math.pi / max(count, 1))
     return [
@@ -51,7 +52,7 @@ def views(count: int, width: int, height: int) -> list[Camera]:
 
 
 def texture(height: int, width: int, seed: int = 0) -> Tensor:
-    """Return an image [height, width, 3] float32 in 0 to 1 with structure at several sizes."""
+    """Return an image [height, width, 3], float32 from 0 to 1, with structure at several scales."""
     generator = torch.Generator().manual_seed(seed)
     planes = torch.zeros((1, 3, height, width))
     for cell, strength in ((64, 0.5), (16, 0.3), (4, 0.2)):
@@ -61,9 +62,9 @@ def texture(height: int, width: int, seed: int = 0) -> Tensor:
 
 
 def network_weights() -> BackboneWeights:
-    """Return the installed weights of VGG19 or VGG16, or random ones of VGG19, which take the same time.
+    """Return the installed weights of VGG19 or VGG16, otherwise random weights of VGG19, which take the same time.
 
-    Random weights follow He et al. (2015), which keeps the size of features from layer to layer.
+    Random weights use He initialization, which preserves the magnitude of features from layer to layer.
     """
     try:
         return load_network_weights("auto")

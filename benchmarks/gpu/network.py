@@ -1,4 +1,4 @@
-"""Throughput of the feature network in TFLOP/s, forward and backward, and its fraction of the device's peak."""
+"""Throughput of the feature network's forward and backward pass in TFLOP/s and as a fraction of the device's peak."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.gpu.part import QUICK, Findings, Sizes, device
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride, use_whole_float32
 
-#: Dense TFLOP/s from the data sheets, by a substring of the device's name. The PCIe version of the H100 is slower.
+#: Dense TFLOP/s from the data sheets, by substring of the device's name. The PCIe version of the H100 is slower.
 PEAKS: dict[str, dict[str, float]] = {
     "H200": {"bfloat16": 989, "tf32": 495, "float32": 67},
     "H100": {"bfloat16": 989, "tf32": 495, "float32": 67},
@@ -45,7 +45,7 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def precisions(weights: BackboneWeights) -> dict[str, Callable[[], FeatureNetwork]]:
-    """Return functions that make the network, by name of the precision; float32 comes first."""
+    """Return functions that construct the network, by precision; float32 comes first."""
     found: dict[str, dict[str, Any]] = {"float32": {}, "bfloat16": {"dtype": torch.bfloat16}}
     if "tf32" in inspect.signature(FeatureNetwork).parameters:
         found["tf32"] = {"tf32": True}
@@ -67,7 +67,7 @@ def _passes(network: FeatureNetwork, picture: Tensor) -> dict[str, Callable[[], 
 
 
 def flop(weights: BackboneWeights, side: int) -> float:
-    """Count the operations of one pass over side x side pixels; the backward pass has as many."""
+    """Count the operations of a forward pass over side x side pixels; a backward pass has as many."""
     deepest = layer_stride(STYLE_LAYERS[-1])
     total = 0.0
     for name, (weight, _) in weights.convolutions.items():

@@ -1,4 +1,4 @@
-"""Image, coverage and color gradient of every available rasterizer against `reference` in float64."""
+"""Comparison of every available rasterizer (image, coverage, color gradient) with `reference` in float64."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 
-#: Relative distance from a cutoff within which float32 may decide otherwise, and bounds for images and for gradients.
-#: gsplat projects in float32 and computes exponentials with the fast intrinsic.
+#: By rasterizer: relative distance from an alpha or transmittance cutoff within which float32 rounding may change the
+#: decision, then error bounds for images and for gradients. They are larger for gsplat, which projects in float32 and
+#: uses the fast exponential intrinsic.
 RASTERIZERS: dict[RasterizerName, tuple[float, float, float]] = {
     "triton": (2e-5, 1e-5, 5e-6),
     "cached": (2e-5, 1e-5, 5e-6),
@@ -25,7 +26,7 @@ BACKGROUND = (1.0, 0.25, 0.5)
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Compare the rasterizers on one view. One that is unavailable is skipped with the reason, except for `triton`."""
+    """Compare all available rasterizers on one view. Raise an error if `triton` is unavailable."""
     gaussians, width, height = sizes.parity
     scene, camera = surface_scene(gaussians, degree=3), views(1, width, height)[0]
     for name, bounds in RASTERIZERS.items():
@@ -41,7 +42,7 @@ def run(sizes: Sizes, found: Findings) -> None:
 def compare(
     fast: Rasterizer, scene: Scene, camera: Camera, bounds: tuple[float, float, float], found: Findings
 ) -> None:
-    """Compare with the reference, except at pixels very close to a cutoff; those that jump are counted."""
+    """Compare with the reference, except at pixels very close to a cutoff; count those on the other side of it."""
     close, image_bound, gradient_bound = bounds
     alpha_max = getattr(fast, "alpha_max", None)
     options = {} if alpha_max is None else {"alpha_max": alpha_max}

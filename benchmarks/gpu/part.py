@@ -1,4 +1,4 @@
-"""Sizes and findings of the parts; findings are written to disk after every entry."""
+"""Problem sizes and findings of the benchmark's parts."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class Sizes:
 
     Attributes:
         gaussians: Numbers of Gaussians of the synthetic scenes, in ascending order.
-        view: (width, height) of their renders.
-        steps: (width, height, Gaussians) of SOS steps.
-        step_repeats: Number of steps that are timed.
-        parity: (Gaussians, width, height) of the comparison with `reference`.
-        network: Side in pixels of the image for the network.
-        curve: (steps, longer side in pixels) of the run that the CPU repeats.
+        view: (width, height) of their views.
+        steps: (width, height, Gaussians) for timed SOS steps.
+        step_repeats: Number of timed steps.
+        parity: (Gaussians, width, height) for the comparison with `reference`.
+        network: Side in pixels of the square image for the feature network.
+        curve: (steps, longer side in pixels) of the job that runs on both GPU and CPU.
         repeats: Repetitions of each timed call.
     """
 
@@ -55,7 +55,7 @@ def device() -> torch.device:
 
 
 class Findings:
-    """Findings of a part, written to a file after every entry, so that a part that is stopped keeps what it has.
+    """Findings of a part, written to a file after each entry, so that none are lost if the part is killed.
 
     Args:
         path: Path of the JSON file.
@@ -68,7 +68,7 @@ class Findings:
         self._write()
 
     def add(self, name: str, value: Any) -> None:
-        """Add a JSON-serializable value; the name "a/b" nests b in a."""
+        """Add a JSON-serializable value; with the name "a/b", it is entry `b` of the object `a`."""
         *groups, last = name.split("/")
         place = self.entries
         for group in groups:
@@ -77,7 +77,7 @@ class Findings:
         self._write()
 
     def check(self, name: str, error: float, bound: float) -> None:
-        """Add an error with its bound; if it exceeds the bound, the part counts as failed after it has finished."""
+        """Add an error with its bound. If it exceeds the bound, the part continues, but counts as failed."""
         passed = math.isfinite(error) and error <= bound
         self.add(name, {"error": error if math.isfinite(error) else str(error), "bound": bound, "passed": passed})
         if not passed:

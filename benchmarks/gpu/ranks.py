@@ -1,6 +1,6 @@
-"""Two ranks on one device compared with one rank.
+"""Comparison of the results of two ranks on one device with those of one rank.
 
-NCCL refuses two ranks on one GPU, so gloo transfers the tensors: this checks results, not speed.
+NCCL does not support two ranks on one GPU, so tensors are exchanged by gloo. The speed is therefore not representative.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from worker.ranks.process_group import ProcessGroupCollectives
 
 RANKS, STEPS = 2, 3
-#: Relative error bound of the first step's gradient, in the Euclidean norm. Near-ties of max pooling may be resolved
-#: differently.
+#: Bound on the relative error of the first step's gradient, in the Euclidean norm. It allows for near-ties in max
+#: pooling, which may be resolved differently.
 GRADIENT_BOUND = 1e-4
-#: Relative error bound of the change in color. It is larger, because Adam moves a color as far for a gradient that is
-#: only rounding error as for any other.
+#: Bound on the relative error of the change in color. It is larger, because Adam normalizes gradients, so a color whose
+#: gradient is only rounding error moves as far as any other.
 COLORS_BOUND = 1e-2
 
 
@@ -49,7 +49,7 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
-    """Return the gradient of a view before the first step, and the colors [N, 3] after the last."""
+    """Return the gradient of a view before the first step, and the colors [N, 3] after the last step."""
     quick = sizes == QUICK
     settings = make_settings(
         "standard", steps_coarse=0, steps_sos=STEPS, early_stop=False, keep=("ranks", "unseen"), rebalance=False,
@@ -85,5 +85,5 @@ def run_rank(rank: int, address: str, folder: str, sizes: Sizes) -> None:
 
 
 def _error(found: Tensor, expected: Tensor, start: Tensor) -> float:
-    """Return the error relative to the distance of the expected value from the start."""
+    """Return the error relative to the distance between expected and initial value."""
     return float((found.double() - expected.double()).norm() / (expected.double() - start.double()).norm())

@@ -1,4 +1,4 @@
-"""Time and memory of the rasterizer and of spherical harmonics, by number of Gaussians."""
+"""Time and memory of the rasterizer and of evaluating spherical harmonics, by number of Gaussians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DEGREE = 3
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Measure all sizes, first without cached weights, because those may use up the time."""
+    """Measure all sizes; measurements with cached weights come last, because they may exceed the time limit."""
     found.add("view", sizes.view)
     cameras = views(2, *sizes.view)
     for count in sizes.gaussians:
@@ -34,7 +34,7 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def _anew(scene: Scene, cameras: list[Camera], place: str, repeats: int, found: Findings) -> None:
-    """Measure survey, intersections, forward and backward pass without cached weights."""
+    """Measure survey, tile intersections, forward and backward pass without cached weights."""
     rasterizer = TritonRasterizer(scene, device=device(), max_intersection_bytes=0)  # caches the last view only
     survey_views(scene, cameras, rasterizer)  # compilation
     surveying = waited_seconds(lambda: survey_views(scene, cameras, rasterizer), device())
@@ -64,7 +64,7 @@ def _operands(rasterizer: Rasterizer, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _harmonics(scene: Scene, camera: Camera, place: str, repeats: int, found: Findings) -> None:
-    """Measure the kernel that a GPU uses; the interpreter must be asked for it explicitly."""
+    """Measure the Triton kernel for spherical harmonics, which is not the default in the interpreter."""
     sh_rest, means = held(scene.sh_rest).to(device()), scene.means.to(device())
     taken = seconds(lambda: kernel_rest_colors(sh_rest, means, camera, DEGREE), device(), repeats)
     found.add(f"{place}/seconds", taken)
@@ -72,7 +72,7 @@ def _harmonics(scene: Scene, camera: Camera, place: str, repeats: int, found: Fi
 
 
 def _kept(scene: Scene, camera: Camera, place: str, repeats: int, found: Findings) -> None:
-    """Measure the computation of a view's cached weights, and both passes with them."""
+    """Measure the computation of a view's blend weights, and forward and backward pass with cached weights."""
     forget_peak(device())
     rasterizer = make_rasterizer("cached", scene, device=device())
     colors, _ = _operands(rasterizer, camera)

@@ -1,4 +1,4 @@
-"""SOS steps on small and on the largest views: seconds by part, and peak memory against the plan."""
+"""SOS steps on small and very large views: seconds by part, and peak memory compared with the plan's prediction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WARM = 2
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Measure every size, on a GPU in every precision."""
+    """Measure all sizes; on a GPU, in all precisions."""
     precisions: tuple[Precision, ...] = get_args(Precision) if device().type == "cuda" else ("float32",)
     for width, height, gaussians in sizes.steps:
         scene = surface_scene(gaussians, degree=3)

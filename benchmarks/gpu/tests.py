@@ -1,4 +1,4 @@
-"""Tests marked `gpu`, run by pytest."""
+"""Run of all tests that are marked `gpu`, with pytest."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 from benchmarks.gpu.part import Findings, Sizes
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Exit statuses of pytest if every test passed, and if none was selected.
+#: Exit statuses of pytest that are no failure: all tests passed, or no test was selected.
 _FINE = (0, 5)
-#: Error texts of tests and files that need something this machine lacks, which says nothing about its GPU.
+#: Error texts of tests that need a package or file that this machine lacks. They say nothing about its GPU.
 _MISSING = ("ModuleNotFoundError", "the tests need VGG16")
 
 
 def run(sizes: Sizes, found: Findings) -> None:
-    """Run the tests and sort their outcomes.
+    """Run the tests, and add their outcomes to the findings.
 
     Raises:
         RuntimeError: If pytest itself has failed.
@@ -41,12 +41,12 @@ def run(sizes: Sizes, found: Findings) -> None:
 
 
 def marked_files() -> list[Path]:
-    """Return the test files that mention the mark."""
+    """Return the test files that contain the mark `gpu`."""
     return sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.gpu" in path.read_text("utf-8"))
 
 
 def outcome(case: Any) -> tuple[str, str, str]:
-    """Return name, outcome ("passed", "failed" or "skipped") and reason from an element of pytest's XML."""
+    """Return name, outcome ("passed", "failed" or "skipped") and reason from a test case in pytest's XML report."""
     name = f"{case.get('classname')}.{case.get('name')}".strip(".")
     problem = next((part for part in case if part.tag in ("failure", "error", "skipped")), None)
     if problem is None:

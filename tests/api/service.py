@@ -1,4 +1,4 @@
-"""The service as a user starts it, for tests: real processes, a folder of its own, and any free port."""
+"""Service for tests, started as a user starts it: real processes, a separate data folder, and a free port."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SETTINGS = {
 
 
 class Service:
-    """A process of `sgsst serve`, or of the API alone."""
+    """Service started by `sgsst serve`, or the API process alone."""
 
     def __init__(self, data: Path, *, alone: bool = False, **settings: str) -> None:
         self.data = data
@@ -80,7 +80,7 @@ class Service:
         return httpx.Client(base_url=self.url, headers=headers, timeout=60)
 
     def processes(self, module: str) -> list[psutil.Process]:
-        """Return the service's processes that run a module or have its name as title."""
+        """Return the service's processes that run `module` or have it as their title."""
         assert self._process is not None
         try:
             family = [psutil.Process(self._process.pid), *psutil.Process(self._process.pid).children(recursive=True)]
@@ -97,16 +97,16 @@ class Service:
         return found
 
     def process(self, module: str) -> psutil.Process | None:
-        """Return the first of `processes`."""
+        """Return the first of `processes(module)`, or None if there is none."""
         return next(iter(self.processes(module)), None)
 
     def kill(self, module: str) -> None:
-        """Kill a process of the service with SIGKILL."""
+        """Send SIGKILL to the process that runs `module`."""
         process = wait_for(lambda: self.process(module), f"a process {module}", self.said)
         process.send_signal(signal.SIGKILL)
 
     def survivors(self) -> list[psutil.Process]:
-        """Return all processes that the service has started and that are still alive, in any session."""
+        """Return all running processes that the service has started, including those in other sessions."""
         found = []
         for process in psutil.process_iter():
             try:
@@ -118,7 +118,7 @@ class Service:
         return found
 
     def stop(self, number: int = signal.SIGTERM) -> None:
-        """Stop the service as a user or the system would."""
+        """Stop the service with a signal, as a user or the system would."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(number)
             self._process.wait(PATIENCE)
@@ -131,7 +131,7 @@ class Service:
 
 
 def undisturbed(files: Mapping[str, Path], parameters: Mapping[str, Any], folder: Path) -> Path:
-    """Stylize the files with `sgsst stylize` on one rank, and return the PLY."""
+    """Stylize the files with `sgsst stylize` on one rank, and return the path of the resulting PLY."""
     out = folder / "stylized.ply"
     command = [sys.executable, "-m", "api.cli", "stylize", str(files["scene"]), "--style", str(files["style"])]
     command += ["--cameras", str(files["cameras"]), "--out", str(out)]
@@ -151,7 +151,7 @@ def _document() -> dict[str, Any]:
 
 
 def check_documented(answer: httpx.Response) -> None:
-    """Fail unless the OpenAPI document has a problem's status and code for the operation that answered it."""
+    """Fail unless the OpenAPI document lists the problem's status and code for the operation that returned it."""
     path, method = answer.request.url.path, answer.request.method.lower()
     for template, operations in _document()["paths"].items():
         pattern = re.sub(r"\{[a-z_]+\}", "[^/]+", template.replace("{name}", "(?s:.+)"))
@@ -167,7 +167,7 @@ def check_documented(answer: httpx.Response) -> None:
 def wait_for(
     condition: Callable[[], Any], what: str, said: Callable[[], str] = lambda: "", *, every: float = 0.1
 ) -> Any:
-    """Return the first true value of a condition; fail after PATIENCE seconds."""
+    """Return the first true value of a condition; fail after `PATIENCE` seconds."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         found = condition()

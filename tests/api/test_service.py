@@ -1,4 +1,4 @@
-"""End-to-end tests of the service: processes of `sgsst serve`, real jobs over HTTP, and killed processes."""
+"""End-to-end tests of the service: real processes of `sgsst serve`, jobs over HTTP, and killed processes."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def expected(files: dict[str, Path], service: Service, tmp_path_factory: pytest.
 
 @pytest.fixture(scope="module")
 def short_job(files: dict[str, Path], service: Service) -> str:
-    """Submit a job of few steps by the asynchronous client, and return it finished. It is for tests that only read."""
+    """Run a job of few steps through the asynchronous client, and return its id. Tests must not change the job."""
 
     async def sent() -> Job:
         async with AsyncClient(service.url) as client:
@@ -105,7 +105,7 @@ def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int
 
 
 def events(client: httpx.Client, job_id: str, after: int = 0) -> list[tuple[int, str, dict[str, Any]]]:
-    """Return all events until the service ends the stream."""
+    """Return all events until the service closes the stream."""
     headers = {"Last-Event-ID": str(after)} if after else {}
     found = []
     with client.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as stream:
@@ -124,7 +124,7 @@ def result(client: httpx.Client, job_id: str) -> bytes:
 
 
 def check_colors(client: httpx.Client, job_id: str, scene: Path) -> None:
-    """Check that the colors alone are those of the PLY, as float16."""
+    """Check that the file of stylized colors contains those of the PLY, rounded to float16."""
     found = np.frombuffer(client.get(f"/v1/jobs/{job_id}/artifacts/colors.f16").content, "<f2").reshape(-1, 3)
     stylized = PlyData.read(io.BytesIO(result(client, job_id)))["vertex"]
     exact = np.stack([stylized[f"f_dc_{channel}"] for channel in range(3)], 1).astype(np.float64)
@@ -133,7 +133,7 @@ def check_colors(client: httpx.Client, job_id: str, scene: Path) -> None:
 
 
 def check_course(client: httpx.Client, job_id: str, steps: list[int]) -> None:
-    """Check the history of the whole run, from the first reported step to the last."""
+    """Check the loss history of the whole job, from the first reported step to the last."""
     points = client.get(f"/v1/jobs/{job_id}/progress").json()["points"]
     assert {point["step"] for point in points} <= set(steps)
     assert points[0]["step"] == next(step for step in steps if step > 0)
@@ -451,7 +451,7 @@ def test_the_client_and_its_commands(service: Service, files: dict[str, Path], e
 
 
 def test_a_deleted_job_takes_its_files_along(service: Service, short_job: str) -> None:
-    """Runs last of the tests that use this job."""
+    """This test runs after all other tests that use the same job."""
     with service.client() as client:
         where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
         assert client.get(where).status_code == 200
@@ -461,6 +461,6 @@ def test_a_deleted_job_takes_its_files_along(service: Service, short_job: str) -
 
 
 def test_nothing_went_wrong_unnoticed(service: Service) -> None:
-    """Runs last on the shared service: its log has no traceback."""
+    """This test runs last, and checks that the log of the shared service contains no traceback."""
     assert "Traceback" not in service.said()
     assert os.listdir(service.data / "incoming") == []

@@ -1,4 +1,4 @@
-"""Tests of damaged weights of the feature network, from a bit on the disk to the service's answers."""
+"""Tests of a corrupted weight file of the feature network: effect of a flipped bit on the service's responses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ PARAMETERS = {"preset": "standard", "steps_sos": 3, "backbone": "vgg16", "early_
 
 
 class Unready(Service):
-    """A service that is waited for until it answers, ready or not."""
+    """Service whose `start` waits until it responds, even if it is not ready."""
 
     def ready(self) -> bool:
-        """Return whether the service answers."""
+        """Return whether the service responds."""
         try:
             return httpx.get(f"{self.url}/livez", timeout=5).status_code == 200
         except httpx.TransportError:
@@ -33,7 +33,7 @@ def cache(tiny_cache: Path, tmp_path: Path) -> Path:
 
 
 def flip_a_bit(path: Path) -> None:
-    """Flip one bit of a file as a disk does: its size and times stay the same."""
+    """Flip one bit of a file without changing its size and times, as a faulty disk does."""
     status = path.stat()
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4

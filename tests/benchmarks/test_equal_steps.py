@@ -1,4 +1,4 @@
-"""Tests of the color distance between image and style, which is independent of all loss terms."""
+"""Tests of the sliced color distance between image and style, which is not optimized by any loss term."""
 
 from __future__ import annotations
 

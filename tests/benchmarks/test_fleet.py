@@ -1,4 +1,4 @@
-"""Tests of a small simulated fleet: no job is lost or waits forever, and equal seeds give equal fleets."""
+"""Tests of a small simulated fleet: no job is lost or waits forever, and equal seeds give equal results."""
 
 from __future__ import annotations
 

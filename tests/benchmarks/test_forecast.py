@@ -1,4 +1,4 @@
-"""Tests of the forecast's arithmetic in cases with known results."""
+"""Tests of the forecast of step times, in cases with known results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `python -m benchmarks.gpu` in small sizes: all parts run, and the results have the expected fields."""
+"""Tests of `python -m benchmarks.gpu` at small sizes: all parts run, and the results have the expected fields."""
 
 from __future__ import annotations
 

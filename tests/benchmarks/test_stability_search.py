@@ -1,4 +1,4 @@
-"""Tests of the random search: it draws the same jobs on all machines, and reports those that exceed a bound."""
+"""Tests of the random search for unstable jobs: it draws the same jobs on all machines, and reports violated bounds."""
 
 from __future__ import annotations
 

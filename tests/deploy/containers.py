@@ -1,8 +1,8 @@
-"""Images and the compose file, built and run by buildah, podman and podman-compose as root.
+"""Container images and the compose file, built and run by buildah, podman and podman-compose as root.
 
-Images are cached in their own storage (`SGSST_TEST_CONTAINERS`, a folder in the user's cache by default), so they are
-built or pulled only once, and other containers of the machine are not affected. If no registry can be reached, Debian's
-base image is built from its packages, and pulled images are replaced by those of `stand_ins`.
+Images are cached in a separate storage (`SGSST_TEST_CONTAINERS`, by default a folder in the user's cache), so they are
+built or pulled only once, and other containers on the machine are not affected. If no registry can be reached, Debian's
+base image is built from packages, and images of third parties are replaced by those of `stand_ins`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SLIM.append('--customize-hook=rm -rf "$1"/var/lib/apt/lists/* "$1"/var/cache/ap
 
 
 def problem() -> str | None:
-    """Return why no containers can be run here; None if they can."""
+    """Return why this machine cannot run containers, or None if it can."""
     if sys.platform != "linux" or os.geteuid() != 0:
         return "containers are run by root, on Linux"
     for tool, package in TOOLS.items():
@@ -47,7 +47,7 @@ def compose_program() -> Path:
 
 
 class Containers:
-    """Podman with settings that need no systemd and no cgroup of its own.
+    """Podman, configured to run without systemd and without creating cgroups.
 
     Attributes:
         environment: Environment of every command.
@@ -69,7 +69,7 @@ class Containers:
         }
 
     def run(self, *command: str | Path, check: bool = True, variables: Mapping[str, str] | None = None) -> str:
-        """Return the output of a command; with `check` it must not fail."""
+        """Run a command and return its output. If `check`, fail if the command does."""
         ended = subprocess.run(
             command,
             env={**self.environment, **(variables or {})},
@@ -86,7 +86,7 @@ class Containers:
         return subprocess.run(command, env=self.environment, cwd=ROOT, capture_output=True).returncode == 0
 
     def provide(self, image: str, target: str | None = None) -> None:
-        """Provide an image: an existing one, a pulled one, or a replacement."""
+        """Make an image available: use the cached one, pull it, or build a replacement."""
         if self.succeeds("podman", "image", "exists", image) or self.succeeds("podman", "pull", "--quiet", image):
             return
         if target is not None:
@@ -95,7 +95,7 @@ class Containers:
             self._make_base(image)
 
     def build(self, tag: str, target: str) -> None:
-        """Build the project's image."""
+        """Build a target of the project's Dockerfile."""
         self._build(tag, target, ROOT, "--file", "deploy/Dockerfile", *_torch_wheels())
 
     def _build(self, tag: str, target: str, context: Path, *options: str) -> None:
@@ -119,7 +119,7 @@ class Containers:
 
 
 def _pip(*names: str) -> list[str]:
-    """Return values of this machine's pip settings."""
+    """Return the values of the given pip settings on this machine."""
     listed = subprocess.run([sys.executable, "-m", "pip", "config", "list"], capture_output=True, text=True).stdout
     found = []
     for line in listed.splitlines():
@@ -130,7 +130,7 @@ def _pip(*names: str) -> list[str]:
 
 
 def _package_sources() -> list[str]:
-    """Return volumes that let pip find packages in a build as it does here: its settings and their local folders."""
+    """Return volume options that give builds this machine's pip settings and local package folders."""
     paths = {Path(word.removeprefix("file://")) for word in _pip("cert", "find-links", "extra-index-url", "index-url")}
     roots = {path.parent if path.name == "simple" else path for path in paths if path.is_absolute() and path.exists()}
     if Path("/etc/pip.conf").exists():
@@ -139,14 +139,14 @@ def _package_sources() -> list[str]:
 
 
 def _torch_wheels() -> list[str]:
-    """Return the build argument for the wheel of PyTorch without CUDA if this machine has it in a folder."""
+    """Return the build argument for the wheel of PyTorch without CUDA, if it is in a local package folder."""
     folders = [word for word in _pip("find-links") if list(Path(word).glob("torch-*cpu*.whl"))]
     return ["--build-arg", f"TORCH_CPU={folders[0]}"] if folders else []
 
 
 @contextmanager
 def containers() -> Iterator[Containers]:
-    """Provide containers with the images of the compose file; skip the test if that is impossible."""
+    """Provide podman with all images of the compose file; skip the test if that is impossible."""
     if reason := problem():
         pytest.skip(reason)
     storage = os.environ.get("SGSST_TEST_CONTAINERS") or str(Path.home() / ".cache" / "sgsst-containers")

@@ -1,4 +1,4 @@
-"""`deploy/backup.py`: a running service is saved, lost with all its data, and restored elsewhere."""
+"""Tests of `deploy/backup.py`: a running service is saved, all its data are deleted, and it is restored elsewhere."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def s3() -> Iterator[str]:
 
 
 def bucket(s3: str, name: str) -> dict[str, str]:
-    """Create a bucket and return the environment of a service that stores its files there."""
+    """Create a bucket, and return the environment of a service that stores its files there."""
     assert httpx.put(f"{s3}/{name}").status_code == 200
     return {**environment_of(s3), "SGSST_ARTIFACTS": f"s3://{name}/service"}
 
@@ -69,7 +69,7 @@ def has_ended(client: httpx.Client, job_id: str) -> bool:
 
 
 def lose(service: Service) -> None:
-    """Kill all processes at once."""
+    """Kill all processes of a service at once."""
     for process in service.survivors():
         process.send_signal(signal.SIGKILL)
     wait_for(lambda: not service.survivors(), "the end of all processes")

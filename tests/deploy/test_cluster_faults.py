@@ -1,4 +1,4 @@
-"""Failing machines in a working cluster: a few cases of `benchmarks.cluster_faults`."""
+"""Tests of machine failures in a cluster at work: a short run of `benchmarks.cluster_faults`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def folder() -> Iterator[Path]:
 
 
 def networks() -> set[str]:
-    """Return the network devices and namespaces of `benchmarks.cluster_hosts` on this machine."""
+    """Return the network devices and namespaces that `benchmarks.cluster_hosts` has created on this machine."""
     commands = (["ip", "-o", "link"], ["ip", "netns", "list"])
     said = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for command in commands)
     return {name for text in said for name in re.findall(r"sgsst\d[\w-]*", text)}

@@ -1,4 +1,4 @@
-"""`deploy/Dockerfile` and `deploy/compose.yaml`: built, started, used from outside, killed, and stopped."""
+"""Tests of `deploy/Dockerfile` and `deploy/compose.yaml`: services are built, started, used, killed and stopped."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def podman() -> Iterator[Containers]:
 
 
 class Composed:
-    """Services of the compose file, with their own project name and port."""
+    """Services of the compose file, with a separate project name and port."""
 
     def __init__(self, podman: Containers, weights: Path) -> None:
         self.podman = podman
@@ -61,12 +61,12 @@ class Composed:
         return f"{PROJECT}_{service}_1"
 
     def kill(self, service: str) -> None:
-        """Kill a service's first process like a crash, without podman's knowledge; podman restarts it."""
+        """Kill the main process of a service's container directly, like a crash, so that podman restarts it."""
         pid = int(self.podman.run("podman", "inspect", "--format", "{{.State.Pid}}", self.name(service)))
         os.kill(pid, signal.SIGKILL)
 
     def said(self) -> str:
-        """Return the ends of all logs."""
+        """Return the last lines of all services' logs."""
         names = self.podman.run("podman", "ps", "--all", "--format", "{{.Names}} {{.Status}}")
         logs = [
             subprocess.run(
@@ -81,7 +81,7 @@ class Composed:
         return "\n---\n".join([names, *logs])
 
     def health(self) -> dict[str, Any]:
-        """Return the content of `/readyz`; empty if it does not respond."""
+        """Return the response of `/readyz`; an empty dictionary if there is none."""
         try:
             return dict(httpx.get(f"{self.url}/readyz", timeout=5).json())
         except (httpx.TransportError, ValueError):
@@ -92,7 +92,7 @@ class Composed:
         return httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {self.key}"}, timeout=60)
 
     def job(self, job_id: str) -> dict[str, Any]:
-        """Return a job from the API; empty if it does not respond."""
+        """Return a job from the API; an empty dictionary if the API does not respond."""
         try:
             with self.client() as client:
                 return dict(client.get(f"/v1/jobs/{job_id}").json())
@@ -184,7 +184,7 @@ def test_health_is_that_of_the_process(composed: Composed) -> None:
 
 
 def curl(composed: Composed, files: tuple[Path, Path, Path], parameters: dict[str, Any]) -> dict[str, Any]:
-    """Submit a job."""
+    """Submit a job with curl, and return the response."""
     ply, cameras, style = files
     command = ["curl", "-sS", "-H", f"Authorization: Bearer {composed.key}", f"{composed.url}/v1/jobs"]
     command += ["-F", f"scene=@{ply}", "-F", f"cameras=@{cameras}", "-F", f"style=@{style}"]
@@ -193,7 +193,7 @@ def curl(composed: Composed, files: tuple[Path, Path, Path], parameters: dict[st
 
 
 def seen(look: Callable[[], bool], composed: Composed, what: str) -> None:
-    """Wait for a condition; a new container compiles kernels again, which takes minutes on a busy machine."""
+    """Wait for a condition, for minutes if necessary, because each new container compiles kernels again."""
     until = time.monotonic() + PATIENCE
     while not look():
         assert time.monotonic() < until, f"waited in vain for {what}\n{composed.said()}"

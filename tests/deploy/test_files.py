@@ -1,4 +1,4 @@
-"""Shell scripts and Dockerfiles pass their linters."""
+"""Tests that shell scripts and Dockerfiles pass their linters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 def lint(tool: str, *words: str | Path) -> None:
-    """Run a linter of this Python's environment, which must report nothing."""
+    """Run a linter that is installed in this Python environment, and fail if it reports anything."""
     program = Path(sys.executable).parent / tool
     if not program.exists():
         pytest.skip(f"{tool} is missing: see the extra [dev]")

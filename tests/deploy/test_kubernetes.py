@@ -1,4 +1,4 @@
-"""`deploy/kubernetes`: rendered by kustomize, validated against schemas of Kubernetes and KubeRay, with invariants."""
+"""Tests of `deploy/kubernetes`: manifests are rendered by kustomize, and checked against schemas and invariants."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OVERLAYS = ("small", "gpu")
 each_overlay = pytest.mark.parametrize("overlay", OVERLAYS)
 #: Path where Kubernetes clients look for a token.
 TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"
-#: Secrets that the documents ask for.
+#: Secrets that operators have to create, according to the documentation.
 SECRETS = {"sgsst-database", "sgsst-store", "sgsst-ray", "sgsst-tls"}
 
 
@@ -58,7 +58,7 @@ def of_kind(overlay: str, kind: str) -> list[dict[str, Any]]:
 
 
 def pods(overlay: str) -> list[dict[str, Any]]:
-    """Return the templates of all pods."""
+    """Return the templates of all pods of an overlay."""
     found = [each["spec"]["template"] for each in objects(overlay) if each["kind"] in ("Deployment", "Job")]
     for cluster in of_kind(overlay, "RayCluster"):
         found.append(cluster["spec"]["headGroupSpec"]["template"])
@@ -146,7 +146,7 @@ def policies_of(overlay: str) -> dict[str, dict[str, Any]]:
 
 
 def selected(overlay: str, policy: str) -> set[str]:
-    """Return the names of the pods that a policy selects."""
+    """Return the names of the pods that a network policy selects."""
     selector = policies_of(overlay)[policy]["podSelector"]
     found = set()
     for labels in (pod["metadata"]["labels"] for pod in pods(overlay)):
@@ -178,7 +178,7 @@ def test_only_the_api_can_be_reached(overlay: str) -> None:
 
 @each_overlay
 def test_pods_reach_what_they_need_alone(overlay: str) -> None:
-    """Name server, database, store and Ray's other pods; with an autoscaler, the API server of Kubernetes too."""
+    """These are DNS, database, file store and Ray's other pods; with an autoscaler, also the Kubernetes API server."""
     policies = {name: spec for name, spec in policies_of(overlay).items() if "egress" in spec}
     (cluster,) = of_kind(overlay, "RayCluster")
     scales = bool(cluster["spec"].get("enableInTreeAutoscaling"))
@@ -243,7 +243,7 @@ def test_images_can_be_named_by_their_digests(tmp_path: Path) -> None:
 
 
 def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[dict[str, Any]]:
-    """Return the objects of the overlay `gpu` after an operator's change to its kustomization."""
+    """Return the objects of the overlay `gpu` after `change` has modified its kustomization, as an operator might."""
     shutil.copytree(FOLDER, folder / "kubernetes")
     overlay = folder / "kubernetes" / "overlays" / "gpu"
     kustomization = yaml.safe_load((overlay / "kustomization.yaml").read_text())

@@ -1,4 +1,4 @@
-"""Alert rules and dashboard: their syntax, when alerts fire, and that they only use metrics of `/metrics`."""
+"""Tests of alert rules and dashboard: valid syntax, conditions of alerts, and use of existing metrics only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.api.service import Service
 pytestmark = pytest.mark.slow
 MONITORING = Path(__file__).resolve().parents[2] / "deploy" / "monitoring"
 OPERATIONS = MONITORING.parents[1] / "docs" / "operations.md"
-#: Names of metrics in a query, unlike names of functions.
+#: Pattern of metric names in a query, which does not match function names.
 _METRIC = re.compile(r"\bsgsst_\w+")
 
 
@@ -29,7 +29,7 @@ def rules() -> dict[str, str]:
 
 
 def queries() -> list[str]:
-    """Return all expressions of alerts and dashboard."""
+    """Return all PromQL expressions of alerts and dashboard."""
     board = json.loads((MONITORING / "dashboard.json").read_text())
     return [*rules().values(), *(target["expr"] for panel in board["panels"] for target in panel["targets"])]
 

@@ -1,4 +1,4 @@
-"""`deploy/requirements`: packages that pip installs in the images, in tested versions and with digests of all files."""
+"""Tests of the lock files in `deploy/requirements`: tested versions, and digests of all files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGE |= {"platform_machine": "x86_64", "implementation_name": "cpython", "platf
 
 
 def packages(file: str) -> dict[str, str]:
-    """Return versions by name; every package must have a digest, and the file must contain nothing else."""
+    """Return the versions in a lock file by package; fail on packages without digests and on any other content."""
     found: dict[str, str] = {}
     for line in (FOLDER / f"{file}.txt").read_text().replace(" \\\n", "").splitlines():
         if line.startswith("#"):

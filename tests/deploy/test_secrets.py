@@ -1,4 +1,4 @@
-"""`deploy/make_secrets.py` and `deploy/compose.yaml`: no service starts with a publicly known password."""
+"""Tests of `deploy/make_secrets.py` and `deploy/compose.yaml`: no service starts with a publicly known password."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deploy/three_hosts.sh`: the service on hosts that share nothing but a database and an object store."""
+"""Test of `deploy/three_hosts.sh`: the service on hosts that share only a database and an object store."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 def missing() -> str | None:
-    """Return which program this machine lacks; None if it has all."""
+    """Return which required program this machine lacks, or None if it has all."""
     for tool in ("curl", "setpriv", "initdb"):
         if shutil.which(tool) is None and not list(Path("/usr/lib/postgresql").glob(f"*/bin/{tool}")):
             return f"{tool} is missing: apt-get install -y curl util-linux postgresql"

@@ -1,4 +1,4 @@
-"""`deploy/two_hosts.sh`: one job on two hosts, which are namespaces of this machine, with a cold cache."""
+"""Test of `deploy/two_hosts.sh`: one job on two hosts with cold caches, simulated by namespaces of this machine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PROBE = f"sgsst-p{os.getpid()}"
 
 
 def problem() -> str | None:
-    """Return why this machine cannot act as two hosts; None if it can."""
+    """Return why this machine cannot simulate two hosts, or None if it can."""
     if sys.platform != "linux" or os.geteuid() != 0:
         return "network namespaces are made by root, on Linux"
     for tool in ("ip", "unshare", "nsenter", "setpriv"):
@@ -43,9 +43,9 @@ def problem() -> str | None:
 
 
 def run(command: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    """Run a script of `deploy/` to its end.
+    """Run a script of `deploy/`, and wait for its end.
 
-    If the tests are interrupted, the script receives SIGTERM rather than SIGKILL, so that it removes its hosts.
+    If the tests are interrupted, the script receives SIGTERM instead of SIGKILL, so that it can remove its hosts.
     """
     held = ["setpriv", "--pdeathsig", "TERM", *command]
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -60,7 +60,7 @@ def run(command: list[str], environment: dict[str, str]) -> subprocess.Completed
 
 
 def assert_removed(network: re.Match[str] | None) -> None:
-    """Assert that the network whose number a script printed is gone with its hosts."""
+    """Assert that the network whose number a script has printed no longer exists, nor do its hosts."""
     assert network is not None
     left = subprocess.run(["ip", "-o", "link"], capture_output=True, text=True, check=True).stdout
     left += subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout

@@ -1,4 +1,4 @@
-"""Counters of a device's work by the line of the project that caused it."""
+"""Counters of the simulated device's work, by the line of the project's code that caused it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _WATCHED = tuple(str(_ROOT / folder) + "/" for folder in ("sgsst_core", "worker"
 
 @dataclass
 class Counts:
-    """Kernel launches, waits of the host for the device, and bytes copied between them, by line of the project.
+    """Number of kernel launches, host synchronizations and copied bytes by line of the project's code.
 
     Keys are lines such as "sgsst_core/loss/sos.py:310", or "?" for work that no line of the project caused.
     """

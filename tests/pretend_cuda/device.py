@@ -1,9 +1,8 @@
-"""Tensors that report "cuda:0" as their device but compute on the CPU, and count the work that a GPU would get.
+"""Tensors that report "cuda:0" as their device, but compute on the CPU and count the work that a GPU would do.
 
-Every PyTorch operation on such a tensor passes through `dispatch`, which refuses to mix devices as CUDA does and counts
-kernels, waits of the host and copies. The number of kernels follows from the name of the operation. It is one, except
-for operations in `_KERNELS`, and zero if the operation only creates a view or allocates memory. Libraries on a GPU may
-launch a few more.
+Every PyTorch operation on such a tensor passes through `dispatch`. As CUDA does, it refuses to mix devices. It also
+counts kernels, host synchronizations and copies. An operation counts as one kernel, unless `_KERNELS` lists another
+number, or as none if it only creates a view or allocates memory. On a GPU, libraries may launch a few more.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from torch.utils._pytree import tree_leaves, tree_map
 from tests.pretend_cuda.counts import Counts, calling_line
 
 DEVICE = torch.device("cuda", 0)
-#: Counters of this process.
+#: Global counters of this process.
 counts = Counts()
 
 
 class _Capture(threading.local):
-    """State of a graph capture, which affects one thread only.
+    """Thread-local state of a graph capture.
 
     Attributes:
-        recorders: Callbacks for each operation, its arguments, its keyword arguments and its result, all with CPU
-            tensors.
+        recorders: Callbacks that receive each captured operation, its arguments, its keyword arguments and its result,
+            all with CPU tensors.
     """
 
     def __init__(self) -> None:
@@ -58,7 +57,7 @@ _WAITS = {
     "_local_scalar_dense", "nonzero", "masked_select", "equal", "unique_consecutive", "_unique2", "unique_dim",
     "bincount", "repeat_interleave", "is_nonzero", "linalg_lstsq", "histc",
 }  # fmt: skip
-#: Operations that accept CPU tensors together with those of the device.
+#: Operations that accept a mix of CPU tensors and simulated tensors.
 _MIXED = {"copy_", "_to_copy", "index", "index_put_", "index_put", "_index_put_impl_", "_pin_memory"}
 
 
@@ -90,7 +89,7 @@ class PretendTensor(Tensor):
     __array__ = numpy
 
     def record_stream(self, stream: Any) -> None:
-        """Do nothing: operations run immediately, so no memory is freed too early."""
+        """Do nothing, because operations run immediately, so no memory is freed too early."""
 
     def tolist(self) -> Any:
         return self.cpu().tolist()
@@ -101,18 +100,18 @@ class PretendTensor(Tensor):
 
 
 def inner(value: Any) -> Any:
-    """Return the CPU tensor of a tensor on the device; return any other value unchanged."""
+    """Return the CPU tensor that holds the values of a simulated tensor; return any other value unchanged."""
     return value.host if isinstance(value, PretendTensor) else value
 
 
 def wait(line: str | None = None) -> None:
-    """Count a wait of the host for the device."""
+    """Count a host synchronization: a wait of the host for the device."""
     refuse_in_capture("the host waits for the device")
     counts.waits[line or calling_line()] += 1
 
 
 def refuse_in_capture(what: str) -> None:
-    """Raise an error as CUDA does for an operation that a graph cannot contain.
+    """Raise an error if a graph is being captured, as CUDA does for operations that graphs do not support.
 
     Raises:
         RuntimeError: If a graph is being captured.
@@ -122,13 +121,13 @@ def refuse_in_capture(what: str) -> None:
 
 
 def launch(kernels: int = 1) -> None:
-    """Count kernel launches. Kernels that a graph captures are not launched."""
+    """Count kernel launches, unless a graph is being captured."""
     if not capture.recorders:
         counts.launches[calling_line()] += kernels
 
 
 def dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """Run an operation of PyTorch on the CPU, and count the work that CUDA would do."""
+    """Run a PyTorch operation on the CPU, and count the work that CUDA would do."""
     name = func._schema.name.removeprefix("aten::")
     leaves = tree_leaves((args, kwargs))
     on_device = [leaf for leaf in leaves if isinstance(leaf, PretendTensor)]
@@ -153,7 +152,7 @@ def dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def _wrapped(func: Any, result: Any, leaves: list[Any]) -> Any:
-    """Wrap a result as a tensor on the device. An argument that was changed in place is returned as the same object."""
+    """Wrap a result as a simulated tensor. For an in-place operation, return the argument itself."""
     changed = {id(leaf.host): leaf for leaf in leaves if isinstance(leaf, PretendTensor)}
 
     def wrap(value: Any) -> Any:
@@ -204,7 +203,10 @@ def _count(name: str, func: Any, args: Any, kwargs: dict[str, Any], to_device: b
 
 
 def _count_copy(source: Tensor, *, waits: bool) -> None:
-    """Count a copy between host and device. CPU scalars need no wait, since they are passed with the launch."""
+    """Count a copy between host and device, and a host synchronization if `waits`.
+
+    CPU scalars need no synchronization, because they are passed with the launch.
+    """
     refuse_in_capture("a copy between host and device")
     counts.copies[calling_line()] += source.numel() * source.element_size()
     if waits and not (source.dim() == 0 and not isinstance(source, PretendTensor)):
@@ -212,7 +214,7 @@ def _count_copy(source: Tensor, *, waits: bool) -> None:
 
 
 def _is_staged(host: Tensor) -> bool:
-    """Return whether a copy can be asynchronous: from pinned memory, or so small that the driver stages it."""
+    """Return whether a copy is asynchronous: from pinned memory, or so small that the driver stages it."""
     return _is_pinned(host) or (not isinstance(host, PretendTensor) and host.numel() * host.element_size() <= 1 << 16)
 
 
@@ -221,14 +223,14 @@ def _is_pinned(tensor: Tensor) -> bool:
 
 
 class _Factories(TorchDispatchMode):
-    """Mode that also sends operations to `dispatch` that create tensors on the device."""
+    """Mode that sends operations that create tensors on the simulated device to `dispatch`."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return dispatch(func, args, kwargs or {})
 
 
 class _Moves(TorchFunctionMode):
-    """Mode that intercepts calls that would fail in a PyTorch built without CUDA before they reach `dispatch`."""
+    """Mode that intercepts calls that fail before they reach `dispatch` if PyTorch was built without CUDA."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
@@ -256,7 +258,7 @@ def _is_cuda(device: Any) -> bool:
 
 
 def _to(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-    """Replace `Tensor.to`, with support for the simulated device."""
+    """Replacement of `Tensor.to` that supports the simulated device."""
     copy = kwargs.pop("copy", False)
     device, dtype, non_blocking, memory_format = torch._C._nn._parse_to(*args, **kwargs)
     device = tensor.device if device is None else device
@@ -271,7 +273,7 @@ def _to(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
 
 @contextmanager
 def modes() -> Iterator[None]:
-    """Allow tensors on the simulated device within the block, and in threads that start in it."""
+    """Support tensors on the simulated device within the block, and in threads that are started there."""
     _let_tensors_be_on_cuda()
     run = threading.Thread.run
 
@@ -288,10 +290,10 @@ def modes() -> Iterator[None]:
 
 
 def _let_tensors_be_on_cuda() -> None:
-    """Register the device guard of the CPU, which does nothing, for CUDA if PyTorch was built without CUDA.
+    """Register the CPU's device guard, which does nothing, for CUDA if PyTorch was built without CUDA.
 
-    Indexing and a few other operations need a guard before they reach `dispatch`. Guards are pointers in a table by
-    device type (c10/core/impl/DeviceGuardImplInterface.h); that of CUDA is the second one.
+    Indexing and a few other operations need a guard before they reach `dispatch`. PyTorch stores pointers to guards in
+    a table by device type (c10/core/impl/DeviceGuardImplInterface.h); the second entry is CUDA's.
     """
     library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / "libc10.so"))
     guards = (ctypes.c_void_p * 2).in_dll(library, "_ZN3c104impl26device_guard_impl_registryE")

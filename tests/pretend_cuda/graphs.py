@@ -14,16 +14,16 @@ from tests.pretend_cuda import device
 
 @contextmanager
 def plainly() -> Iterator[None]:
-    """Disable the modes of the device within the block, for computations of the interpreter itself."""
+    """Disable the simulated device's modes within the block, for internal computations of Triton's interpreter."""
     with torch._C.DisableTorchFunction(), torch.utils._python_dispatch._disable_current_modes():
         yield
 
 
 class CUDAGraph:
-    """Captured operations, which a replay repeats on the same tensors.
+    """Simulated CUDA graph: recorded operations, which a replay repeats on the same tensors.
 
-    On a GPU, capturing computes nothing. Here the operations do run during capture, so their results are set to NaN at
-    its end. Only a replay makes them valid.
+    On a GPU, operations do not run during capture. Here they do, so their results are set to NaN at the end of the
+    capture. They are valid only after a replay.
     """
 
     def __init__(self, keep_graph: bool = False) -> None:
@@ -32,7 +32,7 @@ class CUDAGraph:
         self._done = False
 
     def record(self, func: Any, args: Any, kwargs: Any, result: Any) -> None:
-        """Store an operation. Views and allocations are skipped, since their memory stays where it is."""
+        """Store an operation. Views and allocations are skipped, because a replay uses the same memory."""
         schema = getattr(func, "_schema", None)
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
         places = {tensor.untyped_storage().data_ptr() for tensor in given}
@@ -48,7 +48,7 @@ class CUDAGraph:
         self._steps.append((func, args, kwargs, into))
 
     def end(self) -> None:
-        """End the capture, and invalidate the results that it computed."""
+        """Finish the capture, and set the results of its operations to NaN."""
         self._done = True
         with plainly():
             for tensor in self._written:
@@ -57,7 +57,7 @@ class CUDAGraph:
         self._written.clear()
 
     def replay(self) -> None:
-        """Repeat all operations; counts as one launch."""
+        """Repeat all operations. This counts as one launch."""
         if not self._done:
             raise RuntimeError("Called CUDAGraph::replay without a preceding successful capture.")
         device.refuse_in_capture("another graph")
@@ -74,7 +74,7 @@ class CUDAGraph:
 def graph(
     cuda_graph: CUDAGraph, pool: Any = None, stream: Any = None, capture_error_mode: str = "global"
 ) -> Iterator[None]:
-    """Capture the work of this thread within the block, as `torch.cuda.graph` does."""
+    """Capture the operations of this thread within the block, as `torch.cuda.graph` does."""
     device.refuse_in_capture("another capture")
     device.wait()
     device.capture.recorders.append(cuda_graph.record)

@@ -1,4 +1,4 @@
-"""Replacement of Triton kernels by PyTorch in tests of other parts, because Triton's interpreter is slow."""
+"""Replacement of Triton kernels by PyTorch in tests of other code, because Triton's interpreter is slow."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ from sgsst_core.loss import terms
 
 
 def leave_out_kernels(patch: pytest.MonkeyPatch) -> None:
-    """Compute statistics and style loss with PyTorch only."""
+    """Compute statistics and style loss with PyTorch operations instead of Triton kernels."""
     for module in (fused_statistics, terms):
         patch.setattr(module, "has_kernels", lambda device, channels: False)

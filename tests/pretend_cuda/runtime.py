@@ -21,7 +21,7 @@ MEMORY = 140 << 30
 
 
 class Stream:
-    """Stream of the simulated device. All streams are the same, and operations run immediately."""
+    """Stream of the simulated device. All streams are equivalent, because operations run immediately."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.device = device.DEVICE
@@ -39,7 +39,7 @@ class Stream:
         return event
 
     def synchronize(self) -> None:
-        """Count a wait of the host."""
+        """Count a host synchronization."""
         device.wait()
 
     def query(self) -> bool:
@@ -48,7 +48,7 @@ class Stream:
 
 
 class Event:
-    """Event with a time of the host's clock."""
+    """Event that records a time of the host's clock."""
 
     def __init__(self, enable_timing: bool = False, blocking: bool = False, **_: Any) -> None:
         self._timed = enable_timing
@@ -62,18 +62,18 @@ class Event:
         self._moment = time.perf_counter()
 
     def wait(self, stream: Stream | None = None) -> None:
-        """Do nothing: a stream waits, not the host."""
+        """Do nothing, because the stream waits, not the host."""
 
     def query(self) -> bool:
         """Return whether the event has been recorded."""
         return self._moment is not None
 
     def synchronize(self) -> None:
-        """Count a wait of the host."""
+        """Count a host synchronization."""
         device.wait()
 
     def elapsed_time(self, end: Event) -> float:
-        """Return the milliseconds to a later event. Both must have been recorded with timing."""
+        """Return the milliseconds from this event to `end`. Both must have been recorded with timing enabled."""
         if not (self._timed and end._timed):
             raise ValueError("Both events must be created with argument 'enable_timing=True'.")
         if self._moment is None or end._moment is None:
@@ -82,14 +82,14 @@ class Event:
 
 
 class _Selected(nullcontext[None]):
-    """Replacement of `torch.cuda.device`. The only device is always selected."""
+    """Replacement of `torch.cuda.device`, which does nothing because there is only one device."""
 
     def __init__(self, to: Any) -> None:
         super().__init__()
 
 
 def _set_device(to: Any) -> None:
-    """Replace `torch.cuda.set_device`, which requires an index or a device with an index."""
+    """Replacement of `torch.cuda.set_device`. Like CUDA's, it requires an index, or a device with an index."""
     torch.cuda._utils._get_device_index(to)
 
 
@@ -113,7 +113,7 @@ def _count_launch(original: Any) -> Any:
 
 @contextmanager
 def pretend_cuda() -> Iterator[Counts]:
-    """Provide a simulated CUDA device within the block, and yield its counters, which start at zero."""
+    """Simulate a CUDA device within the block, and yield its counters, which start at zero."""
     from triton.runtime.interpreter import GridExecutor
 
     properties = mock.Mock(total_memory=MEMORY, multi_processor_count=132, L2_cache_size=50 << 20, name="pretend")

@@ -1,4 +1,4 @@
-"""Tests that the simulated device behaves like CUDA in the respects that other tests rely on."""
+"""Tests of the simulated CUDA device: it behaves like a real one in the respects that other tests rely on."""
 
 from __future__ import annotations
 

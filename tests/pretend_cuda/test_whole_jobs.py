@@ -1,4 +1,4 @@
-"""Tests of whole jobs on a simulated CUDA device: they run, and their steps need few waits, copies and launches."""
+"""Tests of whole jobs on a simulated CUDA device: steps need few synchronizations, copies and launches."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def counts() -> Iterator[Counts]:
 
 
 def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 32), **settings: Any) -> StylizeRequest:
-    """Write the inputs of a job with two tiny views at two or more scales and a few steps per phase; return it."""
+    """Write the inputs of a job with two tiny views, at least two scales and a few steps; return the request."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True)
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
@@ -54,7 +54,7 @@ def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 3
 
 
 def go_on(job: Job, steps: int | None = None) -> Result:
-    """Run a job, or with `steps` interrupt it after that many steps."""
+    """Run a job; if `steps` is given, interrupt it after that many steps."""
     return execute(
         job,
         progress=lambda progress: None,
@@ -110,7 +110,7 @@ def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: P
 
 
 def in_regions(asked: StylizeRequest) -> StylizeRequest:
-    """Return the job with a region that has its own style and a frozen region."""
+    """Return the job's request with two additional regions: one with its own style, one frozen."""
     options = region_options(
         ["right:half-space=1,0,0,0", "low:half-space=0,1,0,1"], [f"right={asked.styles[0].path}"], ["right=3"], ["low"]
     )

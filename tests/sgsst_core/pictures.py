@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def picture(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return an image [height, width, 3] in 0 to 1 with edges, gradients and texture."""
+    """Return an image [height, width, 3] from 0 to 1 with edges, gradients and texture."""
     generator = torch.Generator().manual_seed(seed)
     result = torch.zeros((1, 3, height, width), dtype=torch.float64)
     for cell, strength in ((64, 0.5), (16, 0.3), (4, 0.2)):
@@ -18,13 +18,13 @@ def picture(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.f
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return the norm of the difference over the norm of the expected value."""
+    """Return the norm of the difference divided by the norm of the expected value."""
     expected = expected.double()
     return float((value.double() - expected).norm() / expected.norm())
 
 
 def nearly_one_color(height: int = 40, width: int = 50) -> Tensor:
-    """Return an image [h, w, 3] float32 of 100 plus up to seven times its rounding error, 2^-17.
+    """Return an image [h, w, 3] float32 with values from 100 to 100 + 7 * 2^-17: eight adjacent float32 numbers.
 
     Its mean is not representable in float32.
     """

@@ -1,4 +1,4 @@
-"""Small generated scenes and cameras for the rasterizer tests."""
+"""Small synthetic scenes and cameras for tests of rasterizers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sgsst_core.scene.gaussians import Scene
 
 
 def camera(width: int = 70, height: int = 45, *, focal: float = 60.0, pose: Tensor | None = None) -> Camera:
-    """Return a camera with a principal point off center, at the origin and looking along +z unless a pose is given."""
+    """Return a camera with an off-center principal point. By default it is at the origin and looks along +z."""
     pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
     return Camera("test", width, height, focal, focal * 1.1, width / 2 + 1.3, height / 2 - 0.7, pose)
 
@@ -54,14 +54,14 @@ def single(
     scales: tuple[float, float, float] = (0.1, 0.1, 0.1),
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
 ) -> Scene:
-    """Return one Gaussian, with opacity and scales as they are, not as files store them."""
+    """Return one Gaussian. Opacity and scales are activated values, not logits and logarithms as in files."""
     return together([(mean, opacity, scales, quat)])
 
 
 def together(
     gaussians: list[tuple[tuple[float, ...], float, tuple[float, ...], tuple[float, ...]]],
 ) -> Scene:
-    """Return a scene from tuples (mean, opacity, scales, quat)."""
+    """Return a scene of Gaussians given as tuples (mean, opacity, scales, quat)."""
     means, opacities, scales, quats = zip(*gaussians, strict=True)
     count = len(means)
     return Scene(
@@ -82,7 +82,7 @@ def empty_scene() -> Scene:
 
 
 def colors_of(scene: Scene, seed: int = 5) -> Tensor:
-    """Return random colors in 0 to 2, float32."""
+    """Return random colors [N, 3] from 0 to 2, float32."""
     return 2 * torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(seed))
 
 

@@ -1,4 +1,4 @@
-"""Tests that PyTorch's large tensors are in huge pages, if Linux provides them."""
+"""Tests that PyTorch's large tensors use huge pages, if Linux provides them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ print(next(line.split()[1] for line in open("/proc/self/smaps_rollup") if line.s
 
 @pytest.mark.parametrize("switch", ["0", None])
 def test_large_tensors_lie_in_huge_pages(switch: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unless the user's environment says otherwise."""
+    """The user's environment variables take precedence over the default."""
     if not _ENABLED.exists() or "[madvise]" not in _ENABLED.read_text():
         pytest.skip("this system gives no huge pages, or gives them to everybody")
     monkeypatch.delenv("THP_MEM_ALLOC_ENABLE", raising=False)

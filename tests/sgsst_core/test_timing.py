@@ -1,4 +1,4 @@
-"""Tests of exclusive times by name, measured by the clock and by events of a simulated stream."""
+"""Tests of the timer of nested, named blocks, with the host's clock and with events of a simulated stream."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sgsst_core.timing import Timer
 
 
 class Stream:
-    """Device that runs asynchronously; each piece of work takes a given number of its own seconds."""
+    """Simulated stream of an asynchronous device, on which each piece of work takes a given time."""
 
     def __init__(self) -> None:
         self.given = 0.0
@@ -32,7 +32,7 @@ class Stream:
 
 
 class PretendEvent:
-    """Event of `Stream` with CUDA's rules: it has no time before the device reaches it."""
+    """Event of a simulated `Stream`. As in CUDA, its time is unknown until the device has reached it."""
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
@@ -58,7 +58,7 @@ class PretendEvent:
 
 
 def step(timer: Timer, work: Any) -> None:
-    """Run nested blocks, also with the same name inside and outside, and work between blocks, which counts for none."""
+    """Run nested blocks, including one within another of the same name, and work outside of all blocks."""
     with timer("loss"):
         work(1.0)
         with timer("forward"):

@@ -1,4 +1,4 @@
-"""Check that tests apply to the hard cases of `sgsst bench stability`."""
+"""Shared check of the tests that run the hard cases of `sgsst bench stability`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ LARGEST_GROWTH = 1 << 30
 
 
 def check(case: Case) -> None:
-    """Check that a case in its small size stays within its error bound and the memory limit."""
+    """Run the small version of a case, and check its error bound and memory limit."""
     found = measure(case)
     result = found.result
     assert result.passed, f"{case.name}: {case.measure} {result.error:.3g}, bound {result.bound:.3g}. {result.note}"

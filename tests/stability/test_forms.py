@@ -1,4 +1,4 @@
-"""Hard cases of compressed scene files and of orbits."""
+"""Tests of hard cases of compressed scene files and of orbits."""
 
 from __future__ import annotations
 

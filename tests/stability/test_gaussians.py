@@ -1,4 +1,4 @@
-"""Hard cases of Gaussians: values, shapes, opacities and positions that overflow, cancel or divide by zero."""
+"""Tests of hard cases of Gaussians: values that can cause overflow, cancellation or division by zero."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_stays_within_its_bound(case: Case) -> None:
 
 
 def test_the_cut_offs_are_met_to_the_ulp() -> None:
-    """The fast projection and the reference both skip one float32 ulp below 1/255, and draw one ulp above."""
+    """The fast projection and the reference both skip an opacity one ulp below 1/255, and draw one an ulp above."""
     scene = gaussians._opacities_at_the_cut()
     for index, visible in ((0, 0), (2, 1), (3, 1)):
         one = scene.subset(torch.tensor([index]))

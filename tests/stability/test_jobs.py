@@ -1,4 +1,4 @@
-"""Hard cases of whole jobs: the smallest jobs that use all features."""
+"""Tests of hard cases of whole jobs: the smallest jobs that use all features."""
 
 from __future__ import annotations
 

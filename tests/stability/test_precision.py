@@ -1,4 +1,4 @@
-"""Hard cases of precision: long sums, half precision, the order of summation."""
+"""Tests of hard cases of precision: long sums, half precision, the order of summation."""
 
 from __future__ import annotations
 

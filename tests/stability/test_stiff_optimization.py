@@ -1,4 +1,4 @@
-"""Hard cases of the optimizer: gradients of all magnitudes, steps too large or too many, resuming."""
+"""Tests of hard cases of the optimizer: gradients of all magnitudes, too large or too many steps, resuming."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hard cases of style and content: images without texture or with extreme values, and channels without variance."""
+"""Tests of hard cases of style and content: no texture, extreme values, channels without variance."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Hard cases of the GPU kernels, run on a GPU if there is one, else in Triton's interpreter.
+"""Tests of hard cases of the GPU kernels, run on a GPU if there is one, otherwise in Triton's interpreter.
 
-The interpreter takes milliseconds where a GPU takes microseconds. Cases of thousands of Gaussians are therefore reduced
-to hundreds here; `sgsst bench stability` runs them in full size on a GPU.
+The interpreter is about a thousand times slower than a GPU. Cases with thousands of Gaussians are therefore reduced to
+hundreds here; `sgsst bench stability` runs them at full size on a GPU.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def needles() -> Scene:
 
 
 def around_the_camera() -> Scene:
-    """Return Gaussians that contain the camera, with centers just behind the near plane and farther away."""
+    """Return Gaussians that extend to the camera, with centers just behind the near plane and farther away."""
     means = torch.tensor([[0.0, 0.0, 0.21], [0.5, -0.5, 0.3], [-3.0, 2.0, 1.0], [0.0, 1.0, 2.0]])
     sizes = torch.tensor([0.5, 3.0, 30.0, 1e4]).log()
     return replace(repeated(4, logit=-1.0), means=means, scales=sizes[:, None].repeat(1, 3))

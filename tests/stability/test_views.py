@@ -1,4 +1,4 @@
-"""Hard cases of views: sizes, fields of view, empty views, and views with too many intersections."""
+"""Tests of hard cases of views: sizes, fields of view, empty views, and views with too many intersections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of jobs on one rank, from input files to output files, including resuming and a full disk."""
+"""Tests of whole jobs on one rank, from input files to output files, including resuming and a full disk."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 def go_on(
     job: Job, steps: int | None = None, checkpoint_seconds: float = 60.0, warnings: list[str] | None = None
 ) -> Result:
-    """Run a job, or with `steps` interrupt it after that many steps."""
+    """Run a job; if `steps` is given, interrupt it after that many steps."""
     made = 0
 
     def count(progress: object) -> None:
@@ -209,7 +209,7 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
 
 
 def with_scene(request: StylizeRequest, scene: Scene, **options: object) -> StylizeRequest:
-    """Return the same job with another scene and a file of its colors alone."""
+    """Return the same job with another scene, and with a colors file as additional output."""
     write_scene(request.source.scene, scene)
     return replace(request, source=request.source.model_copy(update=options), colors=True)
 

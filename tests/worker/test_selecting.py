@@ -1,4 +1,4 @@
-"""Tests of regions of a loaded scene."""
+"""Tests of selecting the Gaussians of regions in a loaded scene."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def file(tmp_path: Path) -> SceneFile:
 
 
 def with_property(path: Path, values: np.ndarray, *, text: bool = False, order: str = "<") -> None:
-    """Add a property `extra` to a PLY."""
+    """Add a property `extra` with these values to a PLY file."""
     rows = PlyData.read(path)["vertex"].data
     kinds = [*rows.dtype.descr, ("extra", values.dtype.newbyteorder("=").str)]
     more = np.empty(len(rows), kinds)

@@ -471,7 +471,7 @@ def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: py
 
 @pytest.mark.parametrize("command", ["plan", pytest.param("stylize", marks=pytest.mark.slow)])
 def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, command: str) -> None:
-    """The bar of a terminal shows the survey, and there are enough views for the signal to arrive during it."""
+    """The progress bar shows when the survey runs; there are enough views for the signal to arrive meanwhile."""
     views, out = 2000, files.out if command == "stylize" else files.out.with_name("plan.json")
     inputs = [str(files.ply), "--style", str(files.style), "--orbit", str(views), "--backbone", "vgg16"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "120"}
@@ -492,7 +492,7 @@ def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, comm
 
 
 def _shown_until(terminal: int, pattern: str | None) -> str:
-    """Return what a program writes to its terminal until a pattern matches; with None, until the program ends."""
+    """Return a program's terminal output until a pattern matches it; if `pattern` is None, until the program ends."""
     shown = ""
     while pattern is None or not re.search(pattern, shown):
         try:

@@ -1,4 +1,4 @@
-"""Tests of artistic controls on the command line: shown in the plan, applied to the result, checked before the run."""
+"""Tests of artistic controls on the command line: they are validated, shown in the plan and applied to the result."""
 
 from __future__ import annotations
 

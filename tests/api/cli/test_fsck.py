@@ -61,7 +61,7 @@ def service(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
 
 @dataclass
 class Files:
-    """Files of a service, with methods that lose and damage them."""
+    """Stored files of a service, with methods that delete and damage them."""
 
     folder: Path
     settings: ServiceSettings = field(init=False)
@@ -108,7 +108,7 @@ class Files:
         return self.store.inputs.parts(row.id)[0].location
 
     def orphan(self, name: str) -> None:
-        """Create a file that no row refers to."""
+        """Create a file that no database row refers to."""
         objects = self.place(name)
         if objects.local:
             Path(objects.root, name).parent.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,7 @@ class Files:
 
 
 def run(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, dict[str, str]]]:
-    """Run the command; return its exit code and its findings by file name."""
+    """Run `sgsst fsck`; return its exit code and its findings by file name."""
     capsys.readouterr()
     code = main(["fsck", "--json", *options])
     found = {finding["name"]: finding for finding in json.loads(capsys.readouterr().out)}

@@ -1,4 +1,4 @@
-"""Tests that commands, API parameters and the reference share one declaration per option, with its words and bounds."""
+"""Tests that command line, API and reference documentation use the same help text and bounds of each option."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_commands_and_parameters_have_every_option() -> None:
 
 
 def outside(option: Declared) -> list[float]:
-    """Return numbers just outside an option's bounds."""
+    """Return the numbers just outside an option's bounds."""
     found: list[float] = []
     for item in option.limits:
         if isinstance(item, Ge | Le):
@@ -108,7 +108,7 @@ def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.
 
 
 def test_bounds_have_settings_numbers_and_no_other(capsys: pytest.CaptureFixture[str]) -> None:
-    """A bound itself is valid or not, as the help says."""
+    """Whether the bound itself is valid is as the help text says."""
     assert {name for name, option in OPTIONS.items() if option.bounds} == {name for name, _ in BEYOND}
     assert OPTIONS["similar_views"].bounds == "0<=x<1"
     assert OPTIONS["near"].bounds == "x>0"

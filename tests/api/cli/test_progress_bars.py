@@ -1,4 +1,4 @@
-"""Tests of a job's progress: a bar on a terminal, and lines at intervals in a log."""
+"""Tests of a job's progress output: a bar on a terminal, and lines at intervals otherwise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from worker.description import Prepared
 
 
 def shown(*, terminal: bool) -> str:
-    """Return the output for a small job."""
+    """Return the progress output of a small job."""
     console = Console(file=io.StringIO(), force_terminal=terminal, width=120, color_system=None)
     with job_bar(console) as bar:
         for done, left in [(0, None), (3, 125.0), (8, 0.0)]:

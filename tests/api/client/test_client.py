@@ -45,14 +45,14 @@ def store(service: Service) -> Iterator[Store]:
 
 @pytest.fixture(autouse=True)
 def no_waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Allow as many attempts as outside of tests, without waits between them."""
+    """Remove the waits between retries; the number of retries stays the same."""
     monkeypatch.setattr("api.client.events.FIRST_WAIT", 0.0)
     with stamina.set_testing(True, attempts=TRIES):
         yield
 
 
 class Awaited:
-    """Adapter that lets tests call an `AsyncClient` like a `Client`, in an event loop of its own."""
+    """Adapter that lets tests call an `AsyncClient` like a `Client`, in a separate event loop."""
 
     def __init__(self, url: str) -> None:
         self._runner = asyncio.Runner()
@@ -189,7 +189,7 @@ def test_a_job_from_its_upload_to_its_removal(
 
 
 def finish(store: Store, service: Service, job_id: str, content: bytes, folder: Path) -> bytes:
-    """Play the dispatcher for a queued job, whose result is the given content."""
+    """Finish a queued job in place of a dispatcher, with the given content as its result."""
     while (lease := store.leases.take("test")) is not None and lease.job_id != job_id:
         store.leases.stop(lease)
     assert lease is not None
@@ -263,11 +263,11 @@ def test_one_upload_serves_many_jobs(connect: Any, service: Service, files: dict
 
 
 class Relay:
-    """Proxy that forwards connections to a server, and cuts each one off after a number of bytes of its answer.
+    """Proxy that forwards connections to a server, and cuts each one off after a number of bytes of its response.
 
     Args:
         port: Port of the server on this machine.
-        limits: Bytes of each connection, in order; later connections are not cut off.
+        limits: Number of bytes after which each connection is cut off, in order; later connections are not cut off.
     """
 
     def __init__(self, port: int, limits: list[int]) -> None:
@@ -375,7 +375,7 @@ def test_events_go_on_where_they_broke_off(
 def test_uploads_go_on_where_they_broke_off(
     connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The answer to a part is lost. The client sends the part again, and the service refuses it as already received."""
+    """The response to a part is lost. The client sends the part again; the service refuses it as already received."""
     monkeypatch.setattr(uploads, "PART_BYTES", 20_000)
     # Connections stay open: the first one of each relay passes the answer to the creation, not that to the first part.
     with Relay(int(service.environment["SGSST_PORT"]), [900]) as relay, connect(relay.url) as client:

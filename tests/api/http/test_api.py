@@ -65,7 +65,7 @@ def client(service: Service) -> Iterator[httpx.Client]:
 
 
 def form(files: dict[str, bytes], **changed: bytes | tuple[str, bytes] | None) -> list[tuple[str, Any]]:
-    """Return multipart fields. A changed field may have a file name of its own; None removes it."""
+    """Return multipart fields. `changed` has new contents, or pairs (file name, content); None omits a field."""
     names = {"scene": "scene.ply", "cameras": "cameras.json", "style": "style.png"}
     parts: list[tuple[str, Any]] = []
     for role in {**files, **changed}:
@@ -76,7 +76,7 @@ def form(files: dict[str, bytes], **changed: bytes | tuple[str, bytes] | None) -
 
 
 def refused(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
-    """Check the format of a problem document, and return it."""
+    """Check that a response is a problem document with this status and code, and return the document."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     check_documented(answer)
@@ -96,7 +96,7 @@ def jobs_of(client: httpx.Client) -> list[str]:
 
 
 def png(width: int, height: int, rows: bytes) -> bytes:
-    """Return a PNG that declares this size."""
+    """Return a PNG whose header declares this size, with `rows` as its compressed pixel data."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -347,7 +347,7 @@ def test_the_command_line_sends_every_parameter(
 
 
 def raw(service: Service, head: str, body: bytes, *, close: bool = True) -> bytes:
-    """Return the service's answer to exactly these bytes."""
+    """Return the service's raw response to exactly these bytes."""
     host, port = service.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=30) as connection:
         connection.sendall(head.replace("\n", "\r\n").encode() + b"\r\n\r\n" + body)

@@ -1,4 +1,4 @@
-"""Test of the running service with a reader process that a scene has taken over."""
+"""Test of the running service with a reader process that is compromised by a malicious scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of files that the disk has lost or changed: they are neither sent nor used, and a new upload restores them."""
+"""Tests of stored files that were lost or corrupted: they are neither sent nor used, and a new upload restores them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the OpenAPI document: complete, with an example of everything, and all examples valid."""
+"""Tests that the OpenAPI document is complete and contains valid examples of everything."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def examples_of(described: dict[str, Any]) -> list[object]:
 
 
 def check(where: str, described: dict[str, Any]) -> None:
-    """Fail if there is no example, or one that violates its schema."""
+    """Fail if there is no example, or if one violates its schema."""
     found = examples_of(described)
     assert found, f"{where}: no example"
     schema = {**described["schema"], "components": DOCUMENT["components"]}
@@ -47,7 +47,7 @@ def check(where: str, described: dict[str, Any]) -> None:
 
 
 def bodies(operation: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield every media type of the request and the answers."""
+    """Yield every media type of the request and of the responses."""
     for kind, body in operation.get("requestBody", {}).get("content", {}).items():
         yield f"request {kind}", body
     for status, answer in operation["responses"].items():

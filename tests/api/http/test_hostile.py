@@ -1,4 +1,4 @@
-"""Tests of hostile requests against the real API: each gets a problem document, and leaves no files or used memory."""
+"""Tests of hostile requests: the API responds with a problem document, and keeps no files or memory afterwards."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory: pytest.TempPathFactory) -> Files:
-    """Return the scene in other formats."""
+    """Return the test scene as files in compressed formats."""
     folder, scene = tmp_path_factory.mktemp("packed"), wall()
     found: Files = {}
     for form in PACKED_FORMS:
@@ -106,7 +106,7 @@ def store(service: Service) -> Iterator[Store]:
 
 @pytest.fixture(autouse=True)
 def unharmed(service: Service) -> Iterator[None]:
-    """Check around each test that the API is the same process, has not grown or failed, and left no partial file."""
+    """Check after each test that the API has not crashed, failed or grown, and has left no partial file."""
     before = api_of(service)
     logged = service.log.stat().st_size
     Path(f"/proc/{before.pid}/clear_refs").write_text("5")  # reset the peak memory
@@ -137,7 +137,7 @@ def memory_of(process: psutil.Process, field: str) -> int:
 
 
 def form(files: Files, **changed: bytes | tuple[str, bytes] | None) -> list[tuple[str, Any]]:
-    """Return multipart fields. A changed field may have a file name of its own; None removes it."""
+    """Return multipart fields. `changed` has new contents, or pairs (file name, content); None omits a field."""
     names = {"scene": "scene.ply", "cameras": "cameras.json", "style": "style.png"}
     parts: list[tuple[str, Any]] = []
     for role in {**files, **changed}:
@@ -148,7 +148,7 @@ def form(files: Files, **changed: bytes | tuple[str, bytes] | None) -> list[tupl
 
 
 def refused(answer: httpx.Response, status: int, *codes: str) -> dict[str, Any]:
-    """Check the format of a problem document, and return it."""
+    """Check that a response is a problem document with this status and one of the codes, and return the document."""
     assert answer.status_code == status, f"{answer.status_code} {answer.text[:500]}"
     assert answer.headers["content-type"] == "application/problem+json"
     check_documented(answer)
@@ -170,7 +170,7 @@ def count_jobs(store: Store) -> int:
 
 
 def header(scene: bytes, old: str, new: str | bytes) -> bytes:
-    """Return the scene with one change in its header."""
+    """Return the scene file with one replacement in its header."""
     end = scene.index(b"end_header") + len(b"end_header")
     assert old.encode() in scene[:end]
     return scene[:end].replace(old.encode(), new.encode() if isinstance(new, str) else new, 1) + scene[end:]
@@ -185,7 +185,7 @@ def with_faces(scene: bytes, declared: str, data: bytes) -> bytes:
 
 
 def before_vertices(scene: bytes, declared: str, data: bytes) -> bytes:
-    """Insert another element before the Gaussians."""
+    """Insert another PLY element before the Gaussians."""
     changed = header(scene, VERTEX, declared + VERTEX)
     start = changed.index(b"end_header\n") + len(b"end_header\n")
     return changed[:start] + data + changed[start:]
@@ -278,7 +278,7 @@ SCENES: list[tuple[str, Make]] = [
 
 
 def with_bound(scene: bytes, value: float) -> bytes:
-    """Return a compressed PLY with another first bound."""
+    """Return a compressed PLY whose first bound is replaced by `value`."""
     start = scene.index(b"end_header\n") + 11
     return scene[:start] + struct.pack("<f", value) + scene[start + 4 :]
 
@@ -310,7 +310,7 @@ def zipped(name: str, data: bytes) -> bytes:
 
 
 def text_scene(scene: bytes, first: str) -> bytes:
-    """Return an ASCII scene with the header of `scene`; its first row starts with the given word."""
+    """Return an ASCII PLY with the header of `scene`, whose first row starts with the word `first`."""
     head = header(scene, "binary_little_endian", "ascii")
     head = head[: head.index(b"end_header\n") + 11]
     values = head.count(b"property")
@@ -331,7 +331,7 @@ def test_scenes_that_lie(client: httpx.Client, store: Store, files: Files, packe
 def test_packed_scenes_are_told_by_their_content(
     client: httpx.Client, store: Store, files: Files, packed: Files, what: str
 ) -> None:
-    """The format is detected whatever the file name, for files in the request and for tus uploads."""
+    """The format is detected regardless of the file name, for files in the request and for tus uploads."""
     answer = client.post("/v1/jobs", files=form(files, scene=("my scan.ply", packed[what])))
     assert answer.status_code == 202, answer.text
     headers = {**TUS, "Upload-Length": str(len(packed[what]))}
@@ -350,20 +350,20 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def png(width: int, height: int, *chunks: bytes) -> bytes:
-    """Return a PNG that declares this size in RGB pixels."""
+    """Return an RGB PNG whose header declares this size, with these chunks."""
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
     return b"\x89PNG\r\n\x1a\n" + head + b"".join(chunks) + chunk(b"IEND", b"")
 
 
 def zeros(size: int) -> bytes:
-    """Return deflated zero bytes, without allocating all of them."""
+    """Return `size` zero bytes compressed with deflate, without allocating all of them."""
     packer = zlib.compressobj(9)
     parts = [packer.compress(bytes(MB)) for _ in range(size // MB)]
     return b"".join(parts) + packer.compress(bytes(size % MB)) + packer.flush()
 
 
 def jpeg(width: int, height: int) -> bytes:
-    """Return a JPEG whose header declares a larger size than it has."""
+    """Return a small JPEG whose header declares this larger size."""
     file = io.BytesIO()
     Image.new("RGB", (16, 16)).save(file, "JPEG")
     data = file.getvalue()
@@ -372,7 +372,7 @@ def jpeg(width: int, height: int) -> bytes:
 
 
 def jpeg_of_scans(count: int) -> bytes:
-    """Return a progressive JPEG of 20 megapixels whose last scan is repeated."""
+    """Return a progressive JPEG of 20 megapixels whose last scan is repeated `count` times."""
     file = io.BytesIO()
     Image.new("L", (5000, 4000), 128).save(file, "JPEG", progressive=True)
     data = file.getvalue()
@@ -391,7 +391,7 @@ def text_bomb() -> bytes:
 
 
 def tagged() -> bytes:
-    """Return a PNG whose EXIF points beyond its own end."""
+    """Return a PNG whose EXIF data contain an offset beyond their end."""
     file = io.BytesIO()
     info = PngImagePlugin.PngInfo()
     info.add(b"eXIf", b"MM\0*\0\0\0\x08\xff\xff" + b"\x01\x12\0\x03\xff\xff\xff\xff\xff\xff\xff\xf0" * 4)
@@ -517,7 +517,7 @@ def test_models_whose_other_files_lie(client: httpx.Client, files: Files, name: 
 
 
 def test_camera_files_cannot_ask_for_files_of_the_machine(client: httpx.Client, files: Files, tmp_path: Path) -> None:
-    """For a transforms.json without sizes, the reader opens the image that it names, wherever that is."""
+    """If a transforms.json lacks image sizes, the reader opens the image at any path that the file contains."""
     there = tmp_path / "secret.png"
     there.write_bytes(files["style"])
     told = set()
@@ -719,7 +719,7 @@ MAY_BE_NEGATIVE = {"elevation", "style_rotation"}  # angles
 
 
 def told(client: httpx.Client, parameters: str) -> httpx.Response:
-    """Return the answer to a job with these parameters. Its files do not exist, but parameters are checked first."""
+    """Submit a job with these parameters and files that do not exist, because parameters are validated first."""
     body = f'{{"scene": "upl_00000000000", "style": "upl_00000000000", "parameters": {parameters}}}'
     return post(client, body.encode(), "application/json")
 
@@ -1007,7 +1007,7 @@ def test_keys_that_are_none(client: httpx.Client, header: bytes) -> None:
 
 @pytest.fixture(scope="module")
 def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Create a job with results, as a dispatcher leaves it. Its name attempts header injection."""
+    """Create a finished job with results, whose name attempts header injection."""
     with service.client() as client:
         name = 'x"; Set-Cookie: a=b <script>/../../é'
         data = {"parameters": json.dumps({"name": name})}
@@ -1138,7 +1138,7 @@ def lines(head: str) -> bytes:
 
 
 def exchange(service: Service, head: str, body: bytes = b"") -> tuple[bytes, bytes]:
-    """Return head and body of the answer to exactly these bytes, up to the end of the connection."""
+    """Send exactly these bytes, read until the connection is closed, and return head and body of the response."""
     with connect(service) as connection:
         connection.sendall(lines(head) + body)
         answer = b""
@@ -1149,7 +1149,7 @@ def exchange(service: Service, head: str, body: bytes = b"") -> tuple[bytes, byt
 
 
 def answer_on(connection: socket.socket) -> tuple[bytes, bytes]:
-    """Return head and body of the next answer, which declares its length. The connection stays open."""
+    """Return head and body of the next response, which must have a Content-Length. The connection stays open."""
     connection.settimeout(60)
     answer = connection.recv(65536)
     while not (found := re.search(rb"content-length: ([0-9]+)\r\n.*?\r\n\r\n", answer, re.DOTALL | re.IGNORECASE)) or (
@@ -1162,7 +1162,7 @@ def answer_on(connection: socket.socket) -> tuple[bytes, bytes]:
 
 
 def closed(connection: socket.socket) -> bytes:
-    """Return everything until the service closes the connection; fail if it does not."""
+    """Return all bytes until the service closes the connection; fail if it does not."""
     connection.settimeout(60)
     answer = b""
     try:
@@ -1191,7 +1191,7 @@ def test_slow_clients_are_cut_off_and_block_nobody(service: Service, client: htt
 
 
 def test_clients_that_drip_are_cut_off(service: Service) -> None:
-    """A byte now and then is not a stall, but far below the minimum rate."""
+    """A client that sends single bytes at intervals does not stall, but is far below the minimum rate."""
     head = lines(
         f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
     )
@@ -1275,7 +1275,7 @@ def test_heads_that_make_no_sense(service: Service, client: httpx.Client, data: 
 
 
 def test_a_chunk_that_makes_no_sense(service: Service) -> None:
-    """A malformed chunk of a body that is being read is answered once, and what follows is not taken for a request."""
+    """A malformed chunk gets one response, and subsequent bytes are not interpreted as a request."""
     start = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}"
     with connect(service) as connection:
         connection.sendall(lines(start + "\nTransfer-Encoding: chunked\nExpect: 100-continue"))
@@ -1298,7 +1298,7 @@ def test_a_head_that_is_too_large(service: Service) -> None:
 
 
 def send_on(connection: socket.socket, more: bytes, most: int = 60 * MB) -> int:
-    """Send the same bytes until the service closes; return how many went out, at most about `most`."""
+    """Send the same bytes repeatedly until the service closes or `most` bytes are sent; return the number of bytes."""
     sent = 0
     with contextlib.suppress(OSError):
         while sent < most:
@@ -1345,7 +1345,7 @@ def test_requests_that_wait_for_no_answer(service: Service) -> None:
 
 
 def test_a_body_that_nobody_reads_has_to_end(service: Service) -> None:
-    """The request is answered before its body arrives. A byte now and then does not hold the connection open."""
+    """The response is sent before the body arrives. Single bytes at intervals do not keep the connection open."""
     for rest in (b"", b"x"):
         with connect(service) as connection:
             connection.sendall(lines("POST /livez HTTP/1.1\nContent-Length: 1000000"))
@@ -1534,7 +1534,7 @@ def test_paths_write_no_lines_of_the_log(service: Service, client: httpx.Client)
 
 
 def test_nothing_of_all_that_is_left(service: Service, client: httpx.Client, store: Store) -> None:
-    """Runs last: the service is as ready as before, and every file has its row."""
+    """This test runs last: the service is still ready, and a database row refers to each stored file."""
     assert client.get("/readyz").status_code == 200
     metrics = client.get("/metrics").text
     assert not re.findall(r'sgsst_requests_total\{[^}]*status="(?!503)5\d\d"\} [1-9]', metrics)

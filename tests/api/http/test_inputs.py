@@ -1,4 +1,4 @@
-"""Tests of files as answers: inputs of a job, its images, its loss history, and hostile names."""
+"""Tests of downloaded files: a job's inputs, images and loss history, also with hostile names."""
 
 from __future__ import annotations
 

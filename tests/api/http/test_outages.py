@@ -1,4 +1,4 @@
-"""Tests with a stopped, killed or locked database: requests get 503 with Retry-After, and health checks answer."""
+"""Tests with a stopped, killed or locked database: requests get 503 with Retry-After, and health checks still work."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.small_scenes import wall, write_files
 
 #: Concurrent requests: more than an API process has threads for.
 MANY = 60
-#: Seconds that a health check may take on a busy machine; if it waited for requests, it would take minutes.
+#: Timeout of a health check on a busy machine in seconds. If it waited for other requests, it would take minutes.
 HEALTH_SECONDS = 10.0
 #: Operations that need no database.
 WITHOUT_DATABASE = {("get", "/livez"), ("get", "/readyz"), ("options", "/v1/uploads")}
@@ -36,7 +36,7 @@ CODES = ("database-unavailable", "database-busy")
 
 @dataclass
 class Outage:
-    """A service whose database can be stopped or killed."""
+    """Service whose database can be stopped or killed."""
 
     service: Service
     key: str
@@ -50,7 +50,7 @@ class Outage:
 
     @contextlib.contextmanager
     def kind(self, name: str) -> Iterator[None]:
-        """Make the database unavailable during the block."""
+        """Make the database unavailable within the block."""
         self.postgres.signal(signal.SIGSTOP if name == "stopped" else signal.SIGKILL)
         try:
             yield
@@ -79,7 +79,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 def open_service(data: Path, database: str | None, files: dict[str, bytes]) -> Iterator[tuple[Service, str, str, str]]:
-    """Yield a service that requires keys, a key, and a job and an upload of its owner."""
+    """Yield a service that requires keys, a key, and the ids of a job and of an upload that belong to the key."""
     settings = {"SGSST_REQUIRE_KEYS": "true", **({"SGSST_DATABASE": database} if database else {})}
     with Service(data, alone=True, **settings) as service:
         store = open_store(ServiceSettings(data=data, database=database))
@@ -128,7 +128,7 @@ def request(client: httpx.Client, method: str, path: str, outage: Outage, files:
 
 
 def check_away(answer: httpx.Response) -> None:
-    """Fail unless the answer reports that the database is unavailable, and when to retry."""
+    """Fail unless the response says that the database is unavailable and when to retry."""
     assert answer.status_code == 503, (answer.request.method, str(answer.request.url), answer.text)
     assert int(answer.headers["retry-after"]) > 0
     if answer.request.method != "HEAD":
@@ -137,7 +137,7 @@ def check_away(answer: httpx.Response) -> None:
 
 
 def check_health(service: Service, ready: int) -> None:
-    """Fail unless both health checks answer."""
+    """Fail unless liveness responds with 200 and readiness with the status `ready`."""
     assert httpx.get(f"{service.url}/livez", timeout=HEALTH_SECONDS).status_code == 200
     answer = httpx.get(f"{service.url}/readyz", timeout=HEALTH_SECONDS)
     assert answer.status_code == ready, answer.text
@@ -145,7 +145,7 @@ def check_health(service: Service, ready: int) -> None:
 
 
 def at_once(send: Callable[[], httpx.Response]) -> contextlib.ExitStack:
-    """Start MANY requests; at the end of the block, wait for their answers and check them."""
+    """Start `MANY` concurrent requests; at the end of the block, wait for the responses and check them."""
     stack = contextlib.ExitStack()
     pool = stack.enter_context(ThreadPoolExecutor(MANY))
     answers = [pool.submit(send) for _ in range(MANY)]
@@ -228,7 +228,7 @@ def test_a_locked_database_is_busy_and_can_be_read(tmp_path: Path, files: dict[s
 
 
 def test_waiting_for_a_lock_is_bounded_for_all_writers_together(tmp_path: Path) -> None:
-    """One writer at a time waits for a locked database; the others do not each wait for a time-out of their own."""
+    """Only one writer at a time waits for a locked database; timeouts of other writers do not add up."""
     store: Store = open_store(ServiceSettings(data=tmp_path), answer_seconds=0.5)
     with contextlib.closing(sqlite3.connect(tmp_path / "sgsst.db")) as other:
         other.isolation_level = None

@@ -106,7 +106,7 @@ def test_nor_for_who_has_left_without_events(service: Service, files: dict[str, 
 def begin_and_leave(
     service: Service, client: httpx.Client, files: dict[str, bytes], both: int, **parameters: Any
 ) -> None:
-    """Start planning a job, disconnect at the first event, and wait for one of `both` processes to end."""
+    """Start a dry run, disconnect at the first event, and wait until fewer than `both` inspecting processes run."""
     with connect_sse(client, "POST", "/v1/jobs", **request(files, **parameters)) as source:
         next(source.iter_sse())
     wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")

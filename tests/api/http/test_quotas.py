@@ -95,7 +95,7 @@ def owner_and_key(service: Service, quotas: Quotas) -> tuple[str, str]:
 
 
 def on_disk(service: Service) -> int:
-    """Return the bytes of all inputs that the service stores or receives, for all owners."""
+    """Return the total bytes of stored inputs and unfinished uploads of all owners."""
     found = {}
     for folder in ("blobs", "incoming", "uploads", "inspections"):
         for path in (service.data / folder).rglob("*"):
@@ -146,7 +146,7 @@ MB = 1_000_000
 
 
 def body_of(scene: int) -> tuple[bytes, dict[str, str]]:
-    """Return a multipart body with a unique scene of this size, and its headers."""
+    """Return a multipart body with a unique scene of `scene` bytes, and the request headers."""
     content = b"ply\n" + os.urandom(32) + bytes(scene)
     request = httpx.Request("POST", "http://x", files={"scene": ("scene.ply", content)})
     return request.read(), {"Content-Type": request.headers["content-type"]}
@@ -276,7 +276,7 @@ def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: d
 @pytest.mark.skipif(not is_installed(), reason="PostgreSQL's server is not installed")
 @pytest.mark.slow
 def test_of_a_hundred_requests_at_once_none_passes_a_limit(tmp_path: Path, files: dict[str, bytes]) -> None:
-    """On PostgreSQL, where concurrent transactions do not see each other's rows."""
+    """The test uses PostgreSQL, where concurrent transactions do not see each other's rows."""
     limits = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_JOBS_PER_KEY": "7"}
     with (
         server(durable=True) as url,
@@ -306,7 +306,7 @@ def test_of_a_hundred_requests_at_once_none_passes_a_limit(tmp_path: Path, files
 
 
 def at_once(service: Service, text: str, path: str, **request: Any) -> dict[int, int]:
-    """Send a request a hundred times concurrently; return how often each status was answered."""
+    """Send a request a hundred times concurrently; return the number of responses by status."""
     with service.client(text) as client, ThreadPoolExecutor(100) as pool:
         answers = list(pool.map(lambda _: client.post(path, timeout=PATIENCE, **request).status_code, range(100)))
     return {status: answers.count(status) for status in set(answers)}

@@ -1,4 +1,4 @@
-"""Schemathesis against the real API: for valid and invalid requests, no 5xx, and no answer outside the document."""
+"""Tests of the real API with Schemathesis: no request causes a 5xx or a response that the OpenAPI document lacks."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ load_all_checks()
 
 
 def refuses_what_is_wrong(ctx: Any, response: Response, case: schemathesis.Case) -> bool | None:
-    """Check like the library, with two exceptions.
+    """Run Schemathesis's check that invalid requests are refused, with two exceptions.
 
-    Unknown headers and query parameters are ignored, as usual in HTTP. All refusals with 4xx are accepted, such as 412
-    and 460 of tus.
+    The API may ignore unknown headers and query parameters, as usual in HTTP. It may refuse requests with any 4xx
+    status, such as 412 and 460 of the tus protocol.
     """
     known = {parameter["name"] for parameter in case.operation.definition.raw.get("parameters", [])}
     unknown = "x-schemathesis-unknown-property" in case.headers or not known.issuperset(case.query or {})
@@ -46,15 +46,15 @@ def refuses_what_is_wrong(ctx: Any, response: Response, case: schemathesis.Case)
 
 
 def refuses_what_lacks_a_header(ctx: Any, response: Response, case: schemathesis.Case) -> bool | None:
-    """Check like the library, but also accept 412, which tus answers if its version is missing."""
+    """Run Schemathesis's check of missing headers, but accept 412, which tus requires if its version is missing."""
     return None if response.status_code == 412 else missing_required_header(ctx, response, case)
 
 
 def checks() -> list[Any]:
-    """Return all checks of the library except one.
+    """Return all checks of Schemathesis except that valid bodies are accepted.
 
-    A body that matches the schema may be refused for reasons that the document cannot express, such as files that were
-    never sent or a wrong offset.
+    A body that matches the schema may be refused for reasons that a schema cannot express, such as files that were
+    never uploaded, or a wrong offset.
     """
     own = {
         "positive_data_acceptance": None,
@@ -88,7 +88,7 @@ def key(store: Store) -> str:
 @schemathesis.openapi.from_dict(DOCUMENT).parametrize()
 @settings(max_examples=20, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
 def test_every_operation(case: schemathesis.Case, service: Service, key: str) -> None:
-    """Examples, limits of every parameter, unsupported methods and random input."""
+    """Requests include the examples, limits of every parameter, unsupported methods and random input."""
     case.call_and_validate(
         base_url=service.url, checks=checks(), timeout=60, headers={"Authorization": f"Bearer {key}"}
     )
@@ -96,7 +96,7 @@ def test_every_operation(case: schemathesis.Case, service: Service, key: str) ->
 
 # --- chains --------------------------------------------------------------------------------------------------------
 
-#: The same chains in every run.
+#: Settings with which each run generates the same chains of requests.
 BOUNDS = settings(
     max_examples=40,
     stateful_step_count=8,
@@ -106,13 +106,13 @@ BOUNDS = settings(
     phases=[Phase.generate],
     suppress_health_check=list(HealthCheck),
 )
-#: Operations that are reachable by links only: ids cannot be guessed.
+#: Operations that chains only reach by links, because ids cannot be guessed.
 JOBS = ("get_job", "cancel_job", "delete_job", "watch_job")
 ENDS = ("cancel_job", "retry_job")
 ARTIFACTS = ("list_artifacts", "get_artifact")
 INPUTS = ("get_progress", "list_inputs", "get_input")
 UPLOADS = ("get_upload", "head_upload", "append_upload", "delete_upload")
-#: Parameters that are not only well-formed but valid, so that requests create what links lead to.
+#: Parameters that are not only well-formed but valid, so that requests create resources that links refer to.
 RIGHT: dict[str, dict[str, Any]] = {
     "dry_run": {"type": "boolean", "enum": [False]},
     "Upload-Length": {"type": "integer", "minimum": 100, "maximum": 200},
@@ -122,7 +122,7 @@ RIGHT: dict[str, dict[str, Any]] = {
 
 
 class Uploaded:
-    """A small scene whose files are uploaded once. Plays the dispatcher for its jobs."""
+    """Small scene whose files are uploaded once, with methods that finish its jobs in place of a dispatcher."""
 
     def __init__(self, service: Service, store: Store, key: str, folder: Path) -> None:
         self._store = store
@@ -132,7 +132,7 @@ class Uploaded:
         self._ids = [_upload(self._client, path) for path in (self._ply, style, cameras)]
 
     def document(self) -> dict[str, Any]:
-        """Return the document with the ids of these files in every job: a schema cannot express which ids exist."""
+        """Return the OpenAPI document with these files' ids in all jobs: schemas cannot express which ids exist."""
         found = copy.deepcopy(DOCUMENT)
         scene, style, cameras = self._ids
         seed = {"type": "integer", "minimum": 0, "maximum": 9}
@@ -151,7 +151,7 @@ class Uploaded:
         return found
 
     def finish_jobs(self) -> None:
-        """Finish every waiting job with results, as a dispatcher does (`test_service` runs a real one)."""
+        """Finish all queued jobs with results, in place of a dispatcher (`test_service` runs a real one)."""
         while (lease := self._store.leases.take("test")) is not None:
             result = self._artifacts.put(lease.job_id, lease.epoch, "stylized.ply", self._ply)
             self._store.leases.begin(lease)
@@ -159,7 +159,7 @@ class Uploaded:
             self._store.leases.succeed(lease, [result], {"steps": 1})
 
     def delete_jobs(self) -> None:
-        """Delete all jobs, so that every chain starts without any."""
+        """Delete all jobs, so that each sequence of requests starts without jobs."""
         self.finish_jobs()
         for job in self._client.get("/v1/jobs", params={"limit": 200}).json()["jobs"]:
             assert self._client.delete(f"/v1/jobs/{job['id']}").status_code == 204
@@ -175,7 +175,7 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     ("path", "behind"),
     [
         ("/v1/jobs(?!.*(artifacts|inputs|progress))", JOBS),
-        # Again on their own: among all operations, chains rarely cancel and then retry, or list and then take.
+        # Separate chains, because those above rarely cancel and then retry a job, or list and then get its files.
         ("/v1/jobs($|/{job_id}/(cancel|retry))", ENDS),
         ("/v1/jobs($|/{job_id}/artifacts)", ARTIFACTS),
         ("/v1/jobs($|/{job_id}/(inputs|progress))", INPUTS),
@@ -183,7 +183,7 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
     ],
 )
 def test_chains_of_requests(service: Service, key: str, uploaded: Uploaded, path: str, behind: tuple[str, ...]) -> None:
-    """Stateful test: ids from answers are used in the requests that the document links to them."""
+    """Stateful test: ids from responses are used in the requests that the document links to them."""
     followed: Counter[str] = Counter()
     loaded = schemathesis.openapi.from_dict(uploaded.document()).include(path_regex=f"^{path}")
     loaded.config.update(base_url=service.url)

@@ -1,4 +1,4 @@
-"""Tests of browser sessions: a key is sent once, then a cookie; pages of other sites cannot use it."""
+"""Tests of browser sessions: the key is sent once, then a cookie, which pages of other sites cannot use."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def refused(answer: httpx.Response, status: int, code: str) -> None:
 
 
 def job_of(store: Store, owner: str) -> str:
-    """Create a job of a scene that was never sent, so that nothing runs it."""
+    """Create a job whose scene was never uploaded, so that it never runs."""
     sha256 = "a" * 64
     store.inputs.add_blob(sha256, "aa/a", 10)
     inputs = [{"role": "scene", "name": "scene.ply", "sha256": sha256, "size": 10}]
@@ -253,7 +253,7 @@ def test_reading_changes_nothing_wherever_it_comes_from(browser: httpx.Client, s
 
 
 def test_other_sites_sign_nobody_in(service: Service, key: str) -> None:
-    """Otherwise another site could make a user work under a key of its own."""
+    """Otherwise, another site could sign users in with the attacker's key."""
     with service.client() as browser:
         for headers in ELSEWHERE[:-1]:
             sent = {name: value.replace("SELF", service.url) for name, value in headers.items()}

@@ -1,4 +1,4 @@
-"""Tests of two API processes on one data folder: in any order of writes, every file matches its digest."""
+"""Tests of two API processes that share a data folder: for any order of writes, stored files match their digests."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def begin(client: httpx.Client, length: int) -> str:
 
 
 class Patch:
-    """A PATCH request that is sent a few bytes at a time."""
+    """PATCH request that is sent a few bytes at a time."""
 
     def __init__(self, service: Service, where: str, offset: int, content: bytes, *, expect: bool = False) -> None:
         self.content, self.sent = content, 0
@@ -76,7 +76,7 @@ class Patch:
         return self.sent == len(self.content)
 
     def send(self, count: int) -> None:
-        """Send more bytes. A service that has refused the request may have closed the connection."""
+        """Send more bytes, ignoring a closed connection, because the service may have refused the request."""
         part = self.content[self.sent : self.sent + count]
         try:
             self.socket.sendall(part)
@@ -86,7 +86,7 @@ class Patch:
         self.sent += len(part)
 
     def status(self) -> int:
-        """Return the status of the answer after the last byte; 0 if the connection was closed without one."""
+        """Return the status of the response; 0 if the connection was closed without a response."""
         answer = b""
         try:
             while part := self.socket.recv(4096):
@@ -101,7 +101,7 @@ class Patch:
 
 
 def interleave(pair: Pair, clients: tuple[httpx.Client, httpx.Client], order: random.Random) -> set[int]:
-    """Let several requests write to one upload concurrently, in both processes; return the statuses of the answers."""
+    """Write to one upload by concurrent requests to both processes, and return the response statuses."""
     length = order.choice([1, 7, 64, 1000, 300_000])
     where = begin(clients[0], length)
     statuses: set[int] = set()
@@ -112,7 +112,7 @@ def interleave(pair: Pair, clients: tuple[httpx.Client, httpx.Client], order: ra
         statuses |= write_at_once(pair, where, shown["offset"], length, turn, order)
 
     def finished() -> dict[str, Any] | None:
-        """Return the upload once it is complete, and send its rest as soon as no other request writes to it."""
+        """Return the upload if it is complete; otherwise, try to send its rest."""
         shown = clients[0].get(where).json()
         if not shown["complete"]:
             rest = b"z" * (length - shown["offset"])
@@ -126,7 +126,7 @@ def interleave(pair: Pair, clients: tuple[httpx.Client, httpx.Client], order: ra
 
 
 def write_at_once(pair: Pair, where: str, offset: int, length: int, turn: int, order: random.Random) -> set[int]:
-    """Send the rest of an upload in two or three requests, a few bytes of each in turn; some are cut off."""
+    """Send the rest of an upload in two or three interleaved requests, some of which are cut off."""
     writers = [
         Patch(pair.services[order.randrange(2)], where, offset, bytes([65 + 4 * turn + number]) * (length - offset))
         for number in range(order.choice([2, 2, 3]))
@@ -140,7 +140,7 @@ def write_at_once(pair: Pair, where: str, offset: int, length: int, turn: int, o
 
 
 def check_digest(pair: Pair, sha256: str, length: int) -> None:
-    """Check that a file has the digest of its name."""
+    """Check that a stored file has the digest that it is named after."""
     row = pair.store.inputs.blobs([sha256])[sha256]
     content = (pair.data / "blobs" / row.location).read_bytes()
     assert (hashlib.sha256(content).hexdigest(), len(content)) == (sha256, length)
@@ -157,7 +157,7 @@ def run(pair: Pair, count: int, seed: int) -> None:
 
 
 def test_a_file_is_not_written_to_by_two_processes(pair: Pair) -> None:
-    """The second of two writers is refused. Otherwise the digest of its bytes would name the bytes of the first."""
+    """The second of two writers is refused. Otherwise, a file could be named by the digest of other content."""
     with pair.services[0].client() as client:
         where = begin(client, 1000)
         first = Patch(pair.services[0], where, 0, b"x" * 1000, expect=True)

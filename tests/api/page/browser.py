@@ -1,4 +1,4 @@
-"""A real browser for tests of the page: Chromium, driven by Playwright, with WebGL in software."""
+"""Browser for tests of the web page: Chromium, driven by Playwright, with software WebGL."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ document.addEventListener("securitypolicyviolation", ({ violatedDirective, block
 
 
 def missing() -> str | None:
-    """Return why there is no browser; None if there is one."""
+    """Return why no browser can be started, or None if one can."""
     try:
         import playwright.sync_api  # noqa: F401
     except ImportError:
@@ -45,14 +45,14 @@ def missing() -> str | None:
 
 
 def chromium() -> str | None:
-    """Return the path of the browser."""
+    """Return the path of Chromium, or None if there is none."""
     named = os.environ.get("SGSST_CHROMIUM")
     return named or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @contextmanager
 def open_browser(*flags: str) -> Iterator[Any]:
-    """Yield a browser of Playwright's synchronous API. No asyncio event loop can run inside the block."""
+    """Yield a browser of Playwright's synchronous API. No asyncio event loop can run within the block."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
@@ -62,7 +62,7 @@ def open_browser(*flags: str) -> Iterator[Any]:
 
 
 class Watched:
-    """A page that is watched for errors and forbidden requests.
+    """Browser page that records errors and requests to other origins.
 
     Attributes:
         page: Page of Playwright.
@@ -96,18 +96,18 @@ class Watched:
         assert not violations, violations
 
     def settled(self) -> None:
-        """Wait until the 3D view shows its whole scene, sorted for its camera."""
+        """Wait until the 3D view shows the whole scene, sorted for the current camera."""
         self.page.locator("canvas[data-state=settled]").wait_for()
 
     def wipe(self, key: str) -> None:
-        """Press a key on the slider: Home shows only the right side, End only the left one."""
+        """Press a key on the wipe's slider: "Home" shows only the right-hand scene, "End" only the left-hand one."""
         slider = self.page.get_by_label("Wipe", exact=True)
         slider.wait_for()
         slider.focus()
         self.page.keyboard.press(key)
 
     def pixels(self) -> NDArray[np.float64]:
-        """Return the 3D view as saved by the page, [h, w, 3], 0 to 255."""
+        """Return the image that the page saves of the 3D view, [h, w, 3], 0 to 255."""
         self.settled()
         with self.page.expect_download() as download:
             self.page.get_by_role("button", name="Save image").click()
@@ -116,7 +116,7 @@ class Watched:
 
 
 def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
-    """Return a scene file as rendered by `sgsst render`, [h, w, 3], 0 to 255."""
+    """Render a scene file with `sgsst render`, [h, w, 3], 0 to 255."""
     found = read_scene(scene).scene
     colors = view_colors(found.sh_dc, rest_colors(found.sh_rest, found.means, camera))
     image = make_rasterizer("cpu", found).render(colors, camera)
@@ -124,7 +124,7 @@ def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
 
 
 def psnr(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
-    """Return the peak signal-to-noise ratio of images [h, w, 3] of 0 to 255, in decibels."""
+    """Return the peak signal-to-noise ratio in decibels between images [h, w, 3] with values from 0 to 255."""
     assert found.shape == wanted.shape, (found.shape, wanted.shape)
     return float(10 * np.log10(255**2 / max(float(((found - wanted) ** 2).mean()), 1e-9)))
 
@@ -161,9 +161,10 @@ VIEW = """async ([base, scene, cameras, name, width, height]) => {
 
 
 def view_script(steps: str = "(viewer, source, picture) => picture()") -> str:
-    """Return `VIEW` with these steps.
+    """Return the script `VIEW` with these steps.
 
-    Steps are a function of the viewer, the scene, a function that returns a base64 PNG, and the address of the modules.
+    Steps are a JavaScript function. Its arguments are the viewer, the scene, a function that returns the current view
+    as a base64 PNG, and the base URL of the page's modules.
     """
     return VIEW.replace("STEPS", steps)
 
@@ -174,5 +175,5 @@ def decoded(png: str) -> NDArray[np.float64]:
 
 
 def serve_files(page: Any, folder: Path) -> None:
-    """Answer the page's requests for `/given/NAME` with files of a folder."""
+    """Serve the files of a folder to the page as `/given/NAME`."""
     page.route("**/given/*", lambda route: route.fulfill(path=folder / route.request.url.rsplit("/", 1)[1]))

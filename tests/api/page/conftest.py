@@ -14,7 +14,7 @@ from tests.api.service import Service
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Yield a browser for this module only: while it is open, nothing else may use asyncio."""
+    """Yield a browser for one test module. While it is open, nothing else may use asyncio."""
     reason = missing()
     if reason:
         pytest.skip(reason)

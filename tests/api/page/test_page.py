@@ -1,4 +1,4 @@
-"""Tests of the page as a user sees it, in a real browser with a real service."""
+"""Tests of the web page from a user's perspective, in a real browser with a real service."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
 
 
 def submit(service: Service, files: dict[str, Path], key: str | None = None, **parameters: Any) -> str:
-    """Submit a job by the API, without the page, and return its id."""
+    """Submit a job through the API instead of the page, and return its id."""
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     with service.client(key) as client:
         answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(STEPS | parameters)})
@@ -65,7 +65,7 @@ def choose(watched: Watched, files: dict[str, Path]) -> None:
 
 
 def set_options(watched: Watched, **values: Any) -> None:
-    """Fill in options, which are in a collapsed section."""
+    """Expand the section of options, and fill in the given ones."""
     page = watched.page
     page.locator(".presets input").first.wait_for()
     page.locator("details.fold", has_text="All options").evaluate("(fold) => { fold.open = true; }")
@@ -134,7 +134,7 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
 
 
 def frame_of(watched: Watched, like: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the camera's frame in the center of the 3D view, resized like another image."""
+    """Return the central part of the 3D view that the job's camera shows, resized to the size of `like`."""
     pixels = watched.pixels()
     height, width = pixels.shape[:2]
     h, w = min(height, width * 3 / 4), min(width, height * 4 / 3)
@@ -216,7 +216,7 @@ def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_pat
 
 
 def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """The stream resumes where it stopped, and the loss history is complete."""
+    """After a restart of the server, the event stream resumes where it stopped, and the loss history is complete."""
     job_id = submit(service, files, **LONG)
     watched = visit(f"/#/jobs/{job_id}")
     page = watched.page
@@ -365,7 +365,7 @@ def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) 
 
 
 def reach(page: Any, there: Callable[[], bool]) -> None:
-    """Press Tab until a condition holds."""
+    """Press Tab until the condition holds."""
     for _ in range(60):
         page.keyboard.press("Tab")
         if there():
@@ -457,7 +457,7 @@ def _new_key(service: Service, name: str) -> str:
 
 
 def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
-    """A weighted mix of two styles and a frozen half: the job has what the page sends."""
+    """The job has the settings that the page has sent: a weighted mix of two styles, and one frozen half."""
     night = tmp_path / "night.png"
     Image.new("RGB", (64, 64), (20, 30, 90)).save(night)
     watched = visit()
@@ -512,7 +512,7 @@ def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) 
 
 
 def touch(watched: Watched, places: list[list[tuple[float, float]]]) -> None:
-    """Put fingers down, move them from position to position, and lift them."""
+    """Simulate fingers that touch the screen, move from position to position, and are lifted."""
     device = watched.context.new_cdp_session(watched.page)
     for number, fingers in enumerate(places):
         points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(fingers)]
@@ -523,7 +523,7 @@ def touch(watched: Watched, places: list[list[tuple[float, float]]]) -> None:
 
 
 def shown(pixels: NDArray[np.float64]) -> int:
-    """Return the number of pixels that are not background, which is black."""
+    """Return the number of pixels that differ from the black background."""
     return int((pixels.max(axis=2) > 20).sum())
 
 

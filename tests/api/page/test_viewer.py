@@ -1,4 +1,4 @@
-"""Tests of the 3D view against `sgsst render`, of its wipe and depth order, and of a lost GPU context."""
+"""Tests of the page's 3D view: comparison with `sgsst render`, wipe, depth order, and loss of the GPU context."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Visit = Callable[..., Watched]
 
 
 def base_of(watched: Watched) -> str:
-    """Return the address of the page's modules."""
+    """Return the base URL of the page's modules."""
     source: str = watched.page.locator("script[type=module]").get_attribute("src")
     return source.rsplit("/", 1)[0]
 
@@ -85,7 +85,7 @@ def test_packed_scenes_are_shown(
 
 
 def splat_bytes(scene: Scene) -> bytes:
-    """Return a scene as .splat, for which the project has no writer."""
+    """Encode a scene in the .splat format, for which the project has no writer."""
     rows = splat_rows(np.zeros(len(scene) * SPLAT_BYTES, np.uint8))
     rows.flags.writeable = True
     quats = scene.quats / scene.quats.norm(dim=1, keepdim=True)
@@ -108,7 +108,7 @@ def test_old_spz_is_shown(visit: Visit, tmp_path: Path, version: int) -> None:
 
 
 def old_spz(scene: Scene, version: int) -> bytes:
-    """Return a scene as SPZ of version 1 or 2, without spherical harmonics; y is up."""
+    """Encode a scene as SPZ of version 1 or 2, without spherical harmonics, with y pointing up."""
     flip = np.array([1, -1, -1])
     means = scene.means.double().numpy() * flip
     fixed = np.rint(means * 2**12).astype("<i4")

@@ -1,4 +1,4 @@
-"""Server that speaks S3 (moto's), and a proxy that injects faults."""
+"""S3 server for tests (moto's), and a proxy that injects faults."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NOT_IMPLEMENTED = b"<?xml version='1.0'?><Error><Code>NotImplemented</Code><Mes
 
 @contextmanager
 def s3_server() -> Iterator[str]:
-    """Run a server without buckets and yield its URL."""
+    """Run a server without buckets, and yield its URL."""
     server_module = pytest.importorskip("moto.server", reason="moto's server is not installed: see the extra [dev]")
     pytest.importorskip("s3fs", reason="s3fs is not installed: see the extra [s3]")
     server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
@@ -37,7 +37,7 @@ def s3_server() -> Iterator[str]:
 
 
 def environment_of(endpoint: str) -> dict[str, str]:
-    """Return the environment variables with the address and credentials for S3 clients."""
+    """Return the environment variables with the server's address and credentials for S3 clients."""
     return {
         "AWS_ENDPOINT_URL": endpoint,
         "AWS_ACCESS_KEY_ID": "key",
@@ -47,7 +47,7 @@ def environment_of(endpoint: str) -> dict[str, str]:
 
 
 class FaultyS3:
-    """Proxy that forwards requests to a server, except those that it should fail.
+    """Proxy that forwards requests to an S3 server, except for those that should fail.
 
     Attributes:
         url: URL of the proxy.
@@ -79,12 +79,12 @@ class FaultyS3:
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def fail(self, fault: Fault, times: int, which: Callable[[str, str], bool] = lambda method, path: True) -> None:
-        """Fail the next requests selected by method and path, this many times."""
+        """Inject a fault into the next `times` requests for which `which(method, path)` is true."""
         with self._lock:
             self._faults = [(fault, which)] * times
 
     def heal(self) -> None:
-        """Stop failing requests."""
+        """Forward all requests from now on."""
         with self._lock:
             self._faults = []
 

@@ -1,4 +1,4 @@
-"""Results in a local folder and in a store that only handles whole objects, like S3."""
+"""Tests of storing results in a local folder, and in an object store like S3, which only writes whole objects."""
 
 from __future__ import annotations
 

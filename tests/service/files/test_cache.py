@@ -1,4 +1,4 @@
-"""A host's cache of stored files: fetched once, verified, bounded in size, shared by processes."""
+"""Tests of a host's cache of stored files: they are fetched once, verified, limited in total size and shared."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def content(number: int, size: int = 1000) -> tuple[bytes, str]:
 
 
 class Source:
-    """Source of a file that counts fetches."""
+    """Source of a file, with a counter of fetches."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.fetched = data, 0
@@ -163,7 +163,7 @@ def test_half_files_go_by_how_long_they_have_lain(
 
 
 def _use(folder: str, number: int) -> None:
-    """Repeatedly link, read and release five files in a cache that holds two."""
+    """Repeatedly link, read and release five files in a cache that has space for two."""
     cache = FileCache(Path(folder) / "cache", 2500)
     for turn in range(40):
         data, sha256 = content((number + turn) % 5)

@@ -1,4 +1,4 @@
-"""Uploads whose API was killed between the last byte and the row that records it."""
+"""Tests of uploads whose API process was killed after writing the last byte, but before updating the database."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def append(service: Service, where: str, offset: int, content: bytes, checksum: 
 
 
 def begin(service: Service, path: Path) -> str:
-    """Create an upload with all bytes but the last one and return its path."""
+    """Create an upload with all bytes except the last one, and return its URL path."""
     content = path.read_bytes()
     headers = {**TUS, "Upload-Length": str(len(content))}
     where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
@@ -41,7 +41,7 @@ def begin(service: Service, path: Path) -> str:
 
 
 def die_at_the_end(service: Service, path: Path, where: str, *, linked: bool) -> None:
-    """Reproduce the state of disk and store after the last byte; with `linked`, after the blob's link too."""
+    """Reproduce the state after the last byte was written; if `linked`, after the blob was created too."""
     service.stop(signal.SIGKILL)
     settings = ServiceSettings(data=service.data, min_free_bytes=0)
     store = open_store(settings)

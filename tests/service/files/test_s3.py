@@ -1,4 +1,4 @@
-"""Results in an S3-compatible bucket, with moto's server over HTTP."""
+"""Tests of results in an S3-compatible bucket, with moto's server over HTTP."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def endpoint() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def environment(endpoint: str) -> Iterator[dict[str, str]]:
-    """Provide the environment of S3 clients, and a bucket named `results`."""
+    """Create a bucket named `results`, and set and yield the environment variables of S3 clients."""
     values = environment_of(endpoint)
     with pytest.MonkeyPatch.context() as patch:
         for name, value in values.items():
@@ -97,7 +97,7 @@ def test_files_that_no_row_refers_to_are_swept(artifacts: Artifacts, tmp_path: P
 def test_another_process_sees_what_was_put_since_it_looked(
     artifacts: Artifacts, environment: dict[str, str], prefix: str, tmp_path: Path
 ) -> None:
-    """fsspec caches listings of folders, but new files of other processes must be found."""
+    """fsspec caches folder listings, but files that other processes have just added must be found."""
     source = write(tmp_path, 10)
     first = artifacts.put("job_1", 1, "plan.json", source)
     artifacts.sweep("job_1", 9, {first.location})
@@ -116,7 +116,7 @@ def test_a_bucket_that_is_not_there_is_not_ready(artifacts: Artifacts) -> None:
 
 @contextmanager
 def dispatcher(data: Path, environment: dict[str, str]) -> Iterator[None]:
-    """Run a dispatcher with its own data folder."""
+    """Run a dispatcher with a separate data folder."""
     command = [sys.executable, "-m", "service.scheduling.dispatcher"]
     with data.with_suffix(".log").open("ab") as log:
         process = subprocess.Popen(command, env={**environment, "SGSST_DATA": str(data)}, stdout=log, stderr=log)

@@ -1,4 +1,4 @@
-"""Inputs in an S3-compatible store, used by several processes while the store fails."""
+"""Tests of input files in an S3-compatible store that fails while several processes use it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def server() -> Iterator[str]:
 
 @dataclass
 class Fleet:
-    """Hosts that share a database and a file store with injected faults."""
+    """Several hosts that share a database and a file store with injected faults."""
 
     folder: Path
     store: Store
@@ -46,11 +46,11 @@ class Fleet:
         return StoredBlobs(settings, self.store.inputs, Artifacts(self.url).objects)
 
     def names(self) -> list[str]:
-        """Return the names of all objects in the store."""
+        """Return the names of all objects in the file store."""
         return sorted(Artifacts(self.url).objects.below(""))
 
     def take(self, host: StoredBlobs, data: bytes) -> str:
-        """Receive a file."""
+        """Store a file through a host."""
         receiver = Receiver(host.incoming / os.urandom(4).hex(), len(data), lambda size: None)
         receiver.write(data)
         receiver.close()
@@ -64,7 +64,7 @@ class Fleet:
         return self.store.inputs.create_upload("me", length, "scene.ply", "", HOUR)
 
     def again(self, upload: UploadRow) -> UploadRow:
-        """Return the current row of an upload."""
+        """Return the current database row of an upload."""
         return self.store.inputs.upload(upload.id, "me")
 
     def append(self, host: StoredBlobs, upload: UploadRow, *blocks: bytes) -> None:

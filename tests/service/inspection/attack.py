@@ -1,4 +1,4 @@
-"""Code of an attacker who has taken over a reader, sent as a scene in source form; its signals are harmless."""
+"""Code of an attacker who controls a reader process. Tests send it as the content of a scene; it does no real harm."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ATTACH, IO_URING_SETUP = 16, 425
 
 
 def outcome(attempt: Callable[[], Any]) -> str:
-    """Return "done", or the name of the error that the kernel returned."""
+    """Return "done" if the attempt succeeds, otherwise the name of the error that the kernel returned."""
     try:
         attempt()
         return "done"
@@ -58,7 +58,11 @@ def fill(descriptor: int) -> None:
 
 
 def attack(target: dict[str, Any]) -> dict[str, Any]:
-    """Try everything; `target` has data, blob, outside (a folder), port, api (process id) and own (this scene)."""
+    """Try all attacks and return their outcomes.
+
+    Args:
+        target: Paths `data`, `blob`, `outside` (a folder) and `own` (this scene), a `port`, and the process id `api`.
+    """
     data, outside, own, api, parent = target["data"], target["outside"], target["own"], target["api"], os.getppid()
     files = {
         "read own scene": lambda: read(own),

@@ -1,6 +1,8 @@
-"""Inspecting process whose reader runs the code in a scene: `python compromised.py [landlock] [seccomp]`.
+"""Compromised inspecting process, whose reader executes the scene's content as code.
 
-The named features are treated as missing from the kernel.
+    python compromised.py [landlock] [seccomp]
+
+It behaves as if the kernel did not support the named features.
 """
 
 from __future__ import annotations

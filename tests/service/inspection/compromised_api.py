@@ -1,4 +1,4 @@
-"""API whose readers run the code in a scene."""
+"""API process whose compromised readers execute a scene's content as code."""
 
 from __future__ import annotations
 

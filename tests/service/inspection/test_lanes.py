@@ -1,4 +1,4 @@
-"""Turns of owners: nobody waits for more than one request of another owner."""
+"""Tests of fair queuing of inspections: an owner waits for at most one request of each other owner."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.inspection.lanes import MAX_WAITING, Lanes
 
 
 class Work:
-    """Requests that end on demand; `order` is the order of their turns."""
+    """Requests that the test ends; `order` lists them in the order in which they started."""
 
     def __init__(self, lanes: Lanes[str]) -> None:
         self.lanes = lanes
@@ -21,7 +21,7 @@ class Work:
         self.at_work: dict[str, asyncio.Event] = {}
 
     async def ask(self, name: str) -> None:
-        """Take a turn for the owner named by the first letter."""
+        """Send a request of the owner whose name is the first letter of `name`."""
         async with self.lanes.turn(name[0]):
             self.order.append(name)
             self.at_work[name] = asyncio.Event()
@@ -29,13 +29,13 @@ class Work:
             del self.at_work[name]
 
     async def end(self, name: str) -> None:
-        """End a request and let waiting ones start."""
+        """End a request, and let waiting ones start."""
         self.at_work[name].set()
         await settle()
 
 
 async def settle() -> None:
-    """Let every task run until it waits."""
+    """Let all tasks run until they wait."""
     for _ in range(10):
         await asyncio.sleep(0)
 

@@ -1,4 +1,4 @@
-"""Limits of inspection grow with the files: a valid scene is not refused for its size."""
+"""Tests that limits of inspection grow with the file size, so that a large valid scene is not refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.small_scenes import wall, write_files
 
 
 def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, Any]:
-    """Return the findings of validation with these limits in the settings."""
+    """Inspect files with these limits in the settings, and return the findings."""
     settings = ServiceSettings(data=folder / "data", **limits)
     digests = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
     inputs = [
@@ -55,7 +55,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
 
 
 def large(path: Path, side: int) -> Path:
-    """Write a scene of side squared Gaussians with all harmonics."""
+    """Write a scene of side * side Gaussians with SH of degree 3."""
     write_scene(path, wall(side, side, sh_degree=3))
     return path
 

@@ -1,4 +1,4 @@
-"""Compromised reader: its attacks fail, and other users' files are still checked."""
+"""Tests of the sandbox around readers: attacks by a compromised reader fail, and other users' files still pass."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
 
 @pytest.fixture
 def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
-    """Provide the target of an attack; its listener on loopback would accept a connection."""
+    """Yield the description of an attack's targets, among them a listening socket on loopback."""
     for name in ("PGPASSWORD", "AWS_SECRET_ACCESS_KEY", "RAY_AUTH_TOKEN"):
         monkeypatch.setenv(name, "secret")
     outside = tmp_path / "outside"
@@ -60,7 +60,7 @@ def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str
 def attacked(
     monkeypatch: pytest.MonkeyPatch, folder: Path, files: dict[str, Path], target: dict[str, Any], *lacking: str
 ) -> dict[str, Any]:
-    """Return the report of an attack about itself."""
+    """Run the attack in a reader, and return the outcomes that it reports."""
     monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED), *lacking))
     code = f"# attack\n{source.getsource(attack)}\ntold = attack({target!r})\n".encode()
     scene = folder / "attack" / "scene.ply"
@@ -166,7 +166,7 @@ def test_what_the_kernel_lacks_is_logged_at_start(
 
 
 def verdict(program: bytes, architecture: int, number: int, argument: int = 0) -> int:
-    """Return the filter's verdict on a system call, interpreting classic BPF as the kernel does."""
+    """Interpret a classic BPF filter as the kernel does, and return its verdict on a system call."""
     call = {0: number, 4: architecture, 16: argument}
     code = list(struct.iter_unpack("=HBBI", program))
     at = value = 0

@@ -1,4 +1,4 @@
-"""Tasks of a dispatcher besides running jobs: heartbeats, housekeeping, and taking over from dead dispatchers."""
+"""Tests of a dispatcher's other tasks: heartbeats, housekeeping, and taking over jobs of dead dispatchers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def store(settings: ServiceSettings) -> Iterator[Store]:
 
 @contextmanager
 def at_work(settings: ServiceSettings, store: Store) -> Iterator[Dispatcher]:
-    """Run a dispatcher in a thread."""
+    """Run a dispatcher in a thread within the block."""
     dispatcher = Dispatcher(settings, store, Machine(("0", "1"), 2, 10**10))
     thread = threading.Thread(target=dispatcher.run)
     thread.start()
@@ -72,7 +72,7 @@ def test_it_is_known_while_it_is_at_work(settings: ServiceSettings, store: Store
 
 
 def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Store, folder: Path) -> RunningAttempt:
-    """Return an attempt that has not been started."""
+    """Return an attempt that has not started."""
     blobs = BlobFolder(settings.folder, store.inputs, 0)
     artifacts = Artifacts(settings.artifacts_url)
     return RunningAttempt(held, grant, folder, store, blobs, artifacts, settings, cluster=False)

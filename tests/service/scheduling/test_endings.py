@@ -1,4 +1,4 @@
-"""Decision about how an attempt ended, without a process."""
+"""Tests of the decision how an attempt ended, without running a process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Health of a container's process, and what processes wait for when they start."""
+"""Tests of container health checks, and of the dependencies that processes wait for at startup."""
 
 from __future__ import annotations
 

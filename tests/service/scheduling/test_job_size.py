@@ -1,4 +1,4 @@
-"""Number of GPUs that a job is worth by its record, and agreement with the forecast that the estimate comes from."""
+"""Tests of the number of GPUs that a job should get by its estimated size, and of the estimate against the forecast."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SIGKILL at bad moments: jobs are neither lost nor published twice, and give the result of an undisturbed run."""
+"""Tests of SIGKILL at critical moments: jobs are neither lost nor published twice, and results stay the same."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> I
 
 @pytest.fixture(scope="module")
 def expected(files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the result of one undisturbed rank on the same files and settings."""
+    """Return the result of an undisturbed run on one rank with the same files and settings."""
     return undisturbed(files, PARAMETERS, tmp_path_factory.mktemp("cli"))
 
 
@@ -52,7 +52,7 @@ def submit(service: Service, files: dict[str, Path], key: str, **parameters: Any
 
 
 def look(service: Service, job_id: str) -> dict[str, Any]:
-    """Return the job, waiting while the API is down."""
+    """Return the job's status, waiting while the API is down."""
 
     def ask() -> httpx.Response | None:
         try:
@@ -67,7 +67,7 @@ def look(service: Service, job_id: str) -> dict[str, Any]:
 
 
 def ended(service: Service, job_id: str) -> dict[str, Any]:
-    """Wait for the job's end and return it; it must succeed."""
+    """Wait until the job has ended, and return its status; fail if it has not succeeded."""
 
     def there() -> dict[str, Any] | None:
         found = look(service, job_id)
@@ -79,7 +79,7 @@ def ended(service: Service, job_id: str) -> dict[str, Any]:
 
 
 def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
-    """Wait for a step of an attempt, or for the job's end."""
+    """Wait until an attempt has reached a step, or until the job has ended."""
 
     def there() -> bool:
         found = look(service, job_id)
@@ -92,7 +92,7 @@ def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
 
 
 def check_published_once(service: Service, job_id: str) -> bytes:
-    """Return the result, which must be announced once, end the job once, and be stored once."""
+    """Return the job's result; fail unless it was announced, ended the job and was stored exactly once."""
     stream = httpx.get(f"{service.url}/v1/jobs/{job_id}/events", timeout=60).text
     blocks = [dict(line.split(": ", 1) for line in block.splitlines()) for block in stream.split("\n\n") if block]
     told = [(block["event"], json.loads(block["data"])) for block in blocks if "data" in block]

@@ -1,4 +1,4 @@
-"""Sharing of a machine by jobs, with the real store and dispatcher on simulated machines."""
+"""Tests of how jobs share a machine's GPUs, with the real database and dispatcher on simulated machines."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def machine(gpus: int, **more: Any) -> Machine:
 
 
 class Queue:
-    """Store with jobs, and a dispatcher that decides what to start; nothing is run."""
+    """Database with jobs, and a dispatcher that decides which jobs to start, but does not run them."""
 
     def __init__(self, folder: Path, gpus: int, parallel_jobs: int | None = None) -> None:
         self.now = 1_000_000.0
@@ -59,7 +59,7 @@ class Queue:
         ]
 
     def start(self) -> list[str]:
-        """Start the jobs that fit, as the dispatcher does; return ids in the order of their start."""
+        """Start the jobs that fit, as the dispatcher does; return their ids in order."""
         started = []
         while (found := self.dispatcher.next_job(self.holdings())) is not None:
             lease, grant = found
@@ -75,7 +75,7 @@ class Queue:
 
 
 def kept_for(queue: Queue) -> list[str]:
-    """Return the jobs that capacity is reserved for."""
+    """Return the jobs that GPUs are reserved for."""
     with queue.store.database.reading() as session:
         return list(session.scalars(select(ReservationRow.job_id)))
 

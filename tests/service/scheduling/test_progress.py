@@ -1,4 +1,4 @@
-"""Progress messages of an attempt's process, and the dispatcher's record of them."""
+"""Tests of progress messages that an attempt's process sends, and of the records that the dispatcher makes of them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from worker.description import Prepared
 
 @pytest.fixture
 def channel(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
-    """Return the stream that receives messages for the dispatcher."""
+    """Return the stream that receives the attempt's messages to the dispatcher."""
     written = io.StringIO()
     monkeypatch.setattr(attempt_process, "_channel", written)
     return written
 
 
 def records(channel: io.StringIO) -> list[dict[str, Any]]:
-    """Return the records of the messages for the job's second attempt."""
+    """Return the dispatcher's records of the messages, for a job in its second attempt."""
     return [progress_record(json.loads(line), 2) for line in channel.getvalue().splitlines()]
 
 

@@ -1,4 +1,4 @@
-"""Publication of an attempt's files, with a real store and a real folder of results but no process."""
+"""Tests of publishing an attempt's files, with a real database and result folder, but without running a process."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def publisher(lease: Lease, folder: Path, store: Store, settings: ServiceSetting
 
 
 def told(store: Store, lease: Lease) -> list[str]:
-    """Return the names of files announced to watchers, in order."""
+    """Return the names of the files that were announced to watchers, in order."""
     return [event.data["name"] for event in store.jobs.events(lease.job_id, 0) if event.kind == "artifact"]
 
 

@@ -1,4 +1,4 @@
-"""Stray files of jobs."""
+"""Tests of deleting stray files of jobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Webhooks: signed, retried, sent to checked addresses only, and no receiver can delay the messages of others."""
+"""Tests of webhooks: signatures, retries, validation of addresses, and isolation of receivers from slow ones."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ Start = Callable[..., Receiver]
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Provide a function that starts receivers, which end with the test."""
+    """Yield a function that starts receivers, which are stopped after the test."""
     started: list[Receiver] = []
 
     def start(*arguments: Any, **named: Any) -> Receiver:
@@ -134,7 +134,7 @@ def _deliver(store: Store, folder: Path, **values: Any) -> None:
 
 
 def _end_job(store: Store, url: str, owner: str = "local") -> str:
-    """End a job whose webhook is `url`, bypassing the check at submission."""
+    """Create and end a job with the webhook `url`, bypassing the validation at submission."""
     store.inputs.add_blob("a" * 64, "aa/b", 1)
     inputs = [{"role": "scene", "name": "s", "sha256": "a" * 64, "size": 1}]
     job, _ = store.jobs.create(NewJob(owner, "wall", 0, {}, inputs, url), limit=1000)
@@ -143,7 +143,7 @@ def _end_job(store: Store, url: str, owner: str = "local") -> str:
 
 
 def _tries(store: Store) -> list[int]:
-    """Return the attempts of each message that is neither delivered nor given up."""
+    """Return the number of attempts of each pending message."""
     with store.database.reading() as session:
         return list(session.scalars(select(DeliveryRow.tries)))
 
@@ -194,7 +194,7 @@ UNUSABLE = ["http://127.0.0.1:99999/", "http://[::1", "http://℀.com/", "http:/
 
 
 def test_bad_rows_stop_no_other_message(tmp_path: Path, store: Store, receiver: Receiver) -> None:
-    """A version without checks may have stored such rows; the last message is the newest."""
+    """An older version without validation may have stored such rows. The newest message must still be sent."""
     for url in UNUSABLE[:4]:
         _end_job(store, url)
     _end_job(store, receiver.url)
@@ -281,7 +281,7 @@ def test_a_receiver_that_drips_is_cut_off(
 def test_the_deadline_includes_lookup_and_tls(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A name that is never found, and a server that accepts connections and stays silent."""
+    """The receivers are a host name whose lookup hangs, and a server that accepts connections, but never responds."""
     release, found = threading.Event(), socket.getaddrinfo
 
     def slow(host: Any, *arguments: Any, **named: Any) -> Any:
@@ -405,7 +405,7 @@ def test_what_counts_as_public(address: str) -> None:
 def test_the_checked_address_is_the_one_that_is_called(
     tmp_path: Path, store: Store, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the second lookup on, the name leads elsewhere; there is no second lookup."""
+    """A second DNS lookup would return another address, so there must not be one."""
     looked_up, found = [], socket.getaddrinfo
 
     def resolve(host: Any, *arguments: Any, **named: Any) -> Any:
@@ -437,7 +437,7 @@ def test_certificates_are_verified_for_the_name(
 
 
 def _certificate(folder: Path, name: str) -> Path:
-    """Write a self-signed certificate for a name, with its key."""
+    """Write a self-signed certificate for a host name, with its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.UTC)

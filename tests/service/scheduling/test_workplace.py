@@ -1,4 +1,4 @@
-"""Folder of a rank on a machine that shares only the file store with others."""
+"""Tests of a rank's working folder on a machine that shares only the file store with others."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def _open_and_wait(job: StoreWorkplace, ready: Any) -> None:
 
 @pytest.mark.parametrize("alone", [True, False])
 def test_what_a_killed_rank_leaves_is_removed(job: StoreWorkplace, tmp_path: Path, alone: bool) -> None:
-    """The helper process removes it; if that is killed too, the next rank on this machine does."""
+    """The helper process removes the folder; if it is killed too, the next rank on this machine does."""
     spawned = multiprocessing.get_context("spawn")
     ready = spawned.Event()
     process = spawned.Process(target=_open_and_wait, args=(job, ready))

@@ -1,4 +1,4 @@
-"""One wrong clock beside a right one: nothing is deleted, and no lease of a live dispatcher is taken."""
+"""Tests of a host with a wrong clock: no file is deleted, and no lease of a live dispatcher is taken over."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def leased(store: Store, dispatcher: str) -> Lease:
 
 
 def heartbeats(store: Store) -> dict[str, float]:
-    """Return the newest heartbeat of each dispatcher, plausible or not."""
+    """Return the newest heartbeat of each dispatcher, including implausible ones."""
     with store.database.reading() as session:
         return {row.name: row.seen_at for row in session.scalars(select(DispatcherRow))}
 
 
 @contextmanager
 def healthy(store: Store, held: Lease) -> Iterator[list[object]]:
-    """Renew a lease and send heartbeats like a dispatcher with the right clock; yield the statuses of the lease."""
+    """Renew a lease and send heartbeats, like a dispatcher with a correct clock; yield the list of lease statuses."""
     stop, found = threading.Event(), list[object]()
 
     def work() -> None:
@@ -91,7 +91,7 @@ def healthy(store: Store, held: Lease) -> Iterator[list[object]]:
 
 @contextmanager
 def wrong_dispatcher(settings: ServiceSettings, seconds: float) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the dispatcher's own process with a clock that is wrong by `seconds`."""
+    """Run a real dispatcher process whose clock is wrong by `seconds`."""
     environment = {
         **os.environ,
         **SETTINGS,
@@ -169,7 +169,7 @@ def test_a_dispatcher_two_minutes_ahead_takes_no_healthy_lease(settings: Service
 
 @contextmanager
 def store_with_clock(settings: ServiceSettings, wrong_by: float) -> Iterator[tuple[Store, ClockWatch, Clock]]:
-    """Open the same database with a clock that is wrong by `wrong_by`, and the clock watch of a dispatcher there."""
+    """Open the database with a clock that is wrong by `wrong_by` seconds, and yield it with a clock watch."""
     store, monotonic = open_store(settings, lambda: time.time() + wrong_by), Clock()
     try:
         yield store, ClockWatch(store, LEASE, monotonic), monotonic
@@ -220,7 +220,7 @@ def test_what_a_clock_ahead_has_written_waits_for_nothing(settings: ServiceSetti
 
 
 def test_what_is_due_is_deleted_after_some_hours_of_work_and_not_at_once(settings: ServiceSettings) -> None:
-    """A machine that was off for 40 days cannot be told from a clock that is ahead."""
+    """A machine that was off for 40 days cannot be distinguished from one whose clock is ahead."""
     clock = Clock()
     store = open_store(settings, clock)
     store.inputs.add_blob(SHA, "aa/blob", 3)

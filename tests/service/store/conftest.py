@@ -1,4 +1,4 @@
-"""Fixtures of the store on SQLite and on PostgreSQL."""
+"""Fixtures for tests of the store on SQLite and on PostgreSQL."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def postgres() -> Iterator[str]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> str | None:
-    """Return the URL of an empty database; None for SQLite's default path."""
+    """Return the URL of an empty PostgreSQL database, or None for SQLite at its default path."""
     return None if request.param == "sqlite" else fresh_database(request.getfixturevalue("postgres"))
 
 

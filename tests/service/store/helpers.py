@@ -1,4 +1,4 @@
-"""Helpers of the store's tests: a simulated clock, and jobs."""
+"""Helpers for tests of the store: a simulated clock, and jobs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RETENTION = 100.0
 
 
 class Clock:
-    """Clock that stands still until it is set."""
+    """Simulated clock, which only advances when it is set."""
 
     def __init__(self) -> None:
         self.now = 1_000_000.0
@@ -25,7 +25,7 @@ class Clock:
 
 
 def store_settings(folder: Path, database: str | None) -> ServiceSettings:
-    """Return settings with the durations above."""
+    """Return settings with the durations that this module defines."""
     return ServiceSettings(
         data=folder,
         database=database,

@@ -1,4 +1,4 @@
-"""Migrations only add, so processes of the previous version keep working and can start while a new one takes over."""
+"""Tests that migrations only add to the schema, so that processes of the previous version still work and start."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VERSIONS = sorted(path.name[:4] for path in (MIGRATIONS / "versions").glob("[0-9
 
 
 def columns(engine: Engine) -> dict[tuple[str, str], Any]:
-    """Return the columns of all tables by table and name."""
+    """Return the columns of all tables by table and column name."""
     found = inspect(engine)
     return {(table, each["name"]): each for table in found.get_table_names() for each in found.get_columns(table)}
 

@@ -1,4 +1,4 @@
-"""The next job of a long queue equals that of a plain sort of all jobs, without reading them all."""
+"""Tests that the query for the next job gives the same result as sorting all jobs, without reading all of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.service.store.helpers import ATTEMPTS, LEASE, Clock, lease, queue
 
 
 def sorted_queue(jobs: list[JobRow], served: dict[str, int], now: float) -> JobRow | None:
-    """Return the first job by the reference order: a plain sort of all jobs that may start."""
+    """Return the next job by the reference algorithm, which sorts all jobs that may start."""
     ready = [job for job in jobs if job.status == JobStatus.QUEUED and job.not_before <= now]
     lost = [job for job in jobs if job.lease_expires_at is not None and job.lease_expires_at < now]
     ready += [job for job in lost if job.failures + 1 < ATTEMPTS]  # the others end when they are examined

@@ -1,4 +1,4 @@
-"""Quotas of keys: usage is counted exactly, requests beyond a limit are refused, and usage is released."""
+"""Tests of API key quotas: usage is counted exactly, requests beyond a limit are refused, and usage is released."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_retry_is_refused_once_the_gpu_seconds_are_used_up(store: Store, clock: 
 
 
 def at_once(work: Callable[[], object], times: int) -> int:
-    """Call `work` in `times` threads at the same moment; return the number of calls that were not refused."""
+    """Call `work` concurrently in `times` threads; return the number of calls that were not refused."""
     ready, passed, broken = threading.Barrier(times), [], []
 
     def one() -> None:
@@ -161,7 +161,7 @@ def at_once(work: Callable[[], object], times: int) -> int:
 
 
 def test_no_limit_is_passed_by_requests_at_once(store: Store) -> None:
-    """On PostgreSQL, transactions do not see each other's rows: without a lock, all of these would pass."""
+    """On PostgreSQL, transactions do not see each other's rows, so without a lock, all requests would be accepted."""
     bytes_of_two = Quotas(stored_bytes=10)
     assert at_once(lambda: store.jobs.create(new_job("a"), limit=5), 30) == 5
     assert at_once(lambda: submit(store, Quotas(jobs_a_day=5), "b"), 30) == 5

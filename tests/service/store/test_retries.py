@@ -1,4 +1,4 @@
-"""Decision about a job after an attempt, without a store."""
+"""Tests of the decision whether a job is retried after an attempt, without a database."""
 
 from __future__ import annotations
 

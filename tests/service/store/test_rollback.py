@@ -1,4 +1,4 @@
-"""SQLite database whose write-ahead log is lost: files that it no longer knows are kept."""
+"""Tests of an SQLite database that has lost its write-ahead log: files that it no longer refers to are kept."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import ROOT
 
-#: Service that accepts a job, creates a file, and dies.
+#: Program that accepts a job, creates a file, and dies.
 _WORK = """
 import os, sys
 from pathlib import Path
@@ -60,7 +60,7 @@ def files_of(settings: ServiceSettings) -> set[bytes]:
 
 
 def collect(settings: ServiceSettings) -> bool:
-    """Open the database, collect files that it does not know, and return whether it was rolled back."""
+    """Open the database, delete unreferenced files, and return whether a rollback was detected."""
     store = open_store(settings)
     BlobFolder(settings.folder, store.inputs, 0).collect()
     strays.remove_strays(store, Artifacts(settings.artifacts_url))

@@ -1,4 +1,4 @@
-"""Table of states: every combination of state and transition, compared with what the service promises."""
+"""Tests of the table of job states: each combination of state and transition, compared with the documented behavior."""
 
 from __future__ import annotations
 

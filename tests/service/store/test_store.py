@@ -1,4 +1,4 @@
-"""The store compared with a model, on SQLite and PostgreSQL, with a simulated clock."""
+"""Tests of the store on SQLite and PostgreSQL with a simulated clock, including a comparison with a model."""
 
 from __future__ import annotations
 
@@ -217,7 +217,7 @@ def test_an_outage_is_waited_out_however_long_it_takes(store: Store, clock: Cloc
 
 
 def fail_at(store: Store, clock: Clock, saved: int | None, *, lost: bool = False) -> bool:
-    """Run an attempt that saves a step and fails; return whether the job will be retried."""
+    """Run an attempt that saves a checkpoint and fails; return whether the job will be retried."""
     clock.now += 1000
     held = lease(store)
     if saved is not None:
@@ -367,7 +367,7 @@ def test_old_progress_is_forgotten_but_no_status(store: Store) -> None:
 
 
 def step_of(job: Lease, step: int, seconds: float, **more: Any) -> dict[str, Any]:
-    """Return progress as the dispatcher reports it."""
+    """Return a progress record as a dispatcher reports it."""
     known = {"stage": "sos", "total": 10_000, "fraction": 0.5, "eta_s": 1.0, "scales": [1.0, None]}
     return {**known, "step": step, "seconds": seconds, "loss": 1e6 / step, "attempt": job.job.attempt, **more}
 
@@ -512,7 +512,7 @@ def test_revoked_keys_are_unknown(store: Store) -> None:
 
 
 class StoreMachine(RuleBasedStateMachine):
-    """Random operations of users and dispatchers; the model tracks each job's status and who may write to it."""
+    """Random operations of users and dispatchers, with a model of each job's status and current lease holder."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -558,7 +558,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.status[found.job_id] = "starting"
 
     def _see_settled(self) -> None:
-        """Account for jobs that may have ended because their leases had expired."""
+        """Update the model for jobs that may have ended because their leases had expired."""
         for job_id, (held, until) in list(self.held.items()):
             status = self.store.jobs.get(job_id, None).status
             if until < self.clock.now and status in ("failed", "canceled"):

@@ -1,4 +1,4 @@
-"""Tests of the comparison of variants with the same time budget by one loss."""
+"""Tests of the benchmark that compares variants with equal time budgets by the same loss."""
 
 from __future__ import annotations
 

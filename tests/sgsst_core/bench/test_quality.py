@@ -1,4 +1,4 @@
-"""Tests of the comparison of variants by a network that none of them optimizes."""
+"""Tests of the benchmark that compares variants by a network that is not part of any loss."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def quality(tiny_weights: BackboneWeights, vgg16_weights: object) -> Quality:
-    """Compare three variants; AlexNet comes with VGG16's weights."""
+    """Compare three variants. AlexNet's weights are installed together with VGG16's."""
     variants = choose_variants(["standard", "one-scale", "tf32"])
     views = cameras(3, 96, 72)
     return compare_quality(wall(), views, style(), variants, 1.0, weights=tiny_weights, coarsest_side=36)

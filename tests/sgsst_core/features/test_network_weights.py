@@ -33,7 +33,7 @@ TORCHVISION_VGG16 = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
 
 
 def random_vgg(name: str, seed: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return random convolutions (He initialization) of a network for ImageNet-normalized RGB."""
+    """Return random convolutions (He initialization) of a network that expects ImageNet-normalized RGB."""
     generator = torch.Generator().manual_seed(seed)
     layers = {}
     for layer, (width, channels) in sources.convolution_shapes(name).items():
@@ -50,10 +50,10 @@ def torchvision_state(layers: dict[str, tuple[Tensor, Tensor]], positions: list[
 
 
 def caffe_state(layers: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-    """Return the same network as stored in `vgg_conv.pth`, for input B, G, R of 0 to 255 minus Caffe's mean.
+    """Convert a network to the convention of `vgg_conv.pth`: BGR input from 0 to 255 minus Caffe's mean.
 
-    (x - mean)/std * kappa = (255 x - caffe) * a + b with a = kappa / (255 std): a goes into conv1_1's weights, b into
-    its bias. The bias is only exact away from zero padding, hence `features` without padding.
+    (x - mean)/std * kappa = (255 x - caffe) * a + b with a = kappa / (255 std). The factor a is folded into conv1_1's
+    weights, and b into its bias. Zero padding would make the bias inexact, so use `features` without padding.
     """
     std, mean = torch.tensor(sources.IMAGENET_STD).double(), torch.tensor(sources.IMAGENET_MEAN).double()
     caffe = torch.tensor(sources.CAFFE_MEAN).double()
@@ -70,7 +70,7 @@ def caffe_state(layers: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
 
 
 def features(weights: BackboneWeights, rgb: Tensor, padding: int = 1) -> list[Tensor]:
-    """Return the outputs of every ReLU in float64."""
+    """Return the outputs of all ReLUs, computed in float64."""
     x = (rgb.double() * weights.input_scale + weights.input_shift).permute(2, 0, 1)[None]
     outputs, block = [], "1"
     for layer, (weight, bias) in weights.convolutions.items():
@@ -83,7 +83,7 @@ def features(weights: BackboneWeights, rgb: Tensor, padding: int = 1) -> list[Te
 
 @pytest.fixture(scope="module")
 def vgg19_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a cache folder with random VGG19 weights, installed from a torchvision state dict. Read-only."""
+    """Return a cache folder with random VGG19 weights, installed from a torchvision state dict; don't change it."""
     folder = tmp_path_factory.mktemp("cache")
     file = folder / "torchvision.pth"
     torch.save(torchvision_state(random_vgg("vgg19"), TORCHVISION_VGG19), file)
@@ -93,7 +93,7 @@ def vgg19_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def vgg16_folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
-    """Return a copy of the real VGG16 that a test may damage."""
+    """Return a cache folder with a copy of the real VGG16 weights, which a test may damage."""
     shutil.copy(cache_folder() / "vgg16.safetensors", tmp_path)
     return tmp_path
 
@@ -279,7 +279,7 @@ def test_wrong_state_dicts_are_refused(tmp_path: Path) -> None:
 
 
 class _RunsCode:
-    """Object that creates a file when it is unpickled without restrictions."""
+    """Object that creates a file when it is unpickled, unless the unpickler refuses it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -1,4 +1,4 @@
-"""Tests that the compiled pool and its backward pass are bit-identical to PyTorch's operations."""
+"""Tests that compiled max pooling and its backward pass are bit-identical to PyTorch's operations."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ SIZES = [(12, 10), (13, 11), (2, 2), (3, 2), (1, 5)]
 
 
 def relu_output(height: int, width: int, dtype: torch.dtype, *, levels: int = 0) -> Tensor:
-    """Return a ReLU output [1, 24, h, w], channels last.
+    """Return a synthetic ReLU output [1, 24, h, w] with memory format channels_last.
 
-    With few levels, most windows have ties, and some are all 0.
+    If `levels` is not 0, values are multiplied by it and rounded to integers. If it is small, most pooling windows
+    have ties, and some are all zero.
     """
     values = torch.randn((1, height, width, 24), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     if levels:
@@ -54,7 +55,7 @@ def test_negative_zeros_and_infinities_are_compared_as_numbers(dtype: torch.dtyp
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_not_a_number_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
-    """NaN of either sign, as processors make them, must not be hidden by the pool."""
+    """NaN of either sign must propagate through max pooling."""
     source = relu_output(2, 2, dtype)
     source[0, 5, 1, 0] = torch.copysign(torch.tensor(torch.nan, dtype=dtype), torch.tensor(sign, dtype=dtype))
     assert bool(torch.signbit(source[0, 5, 1, 0])) == (sign < 0)

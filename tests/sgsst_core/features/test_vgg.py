@@ -1,4 +1,4 @@
-"""Tests of the feature network's passes: memory layout, kept activations, and flags on a GPU."""
+"""Tests of the feature network's passes: memory format, cached activations, and PyTorch's flags on a GPU."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def picture() -> Tensor:
 
 
 def add(layer: str, features: Tensor, gradient: Tensor) -> None:
-    """Add the gradient of the mean square of all reported features, up to a factor."""
+    """Add the gradient of the mean square of a layer's features, up to a factor."""
     gradient += features / features.numel()
 
 
@@ -37,7 +37,7 @@ def pixel_gradient(network: FeatureNetwork) -> Tensor:
 
 
 class Watched(FeatureNetwork):
-    """Network that records the flags and layouts its convolutions see."""
+    """Network that records PyTorch's flags and the memory formats during its convolutions."""
 
     def note(self, *tensors: Tensor) -> None:
         self.flags.add((CUDNN.conv.fp32_precision, CUDNN.benchmark))
@@ -177,7 +177,7 @@ def in_planes(*arguments: Any) -> Tensor:
 
 @contextmanager
 def operator_on_cpu(does: Callable[..., Tensor]) -> Iterator[list[int]]:
-    """Emulate cuDNN's operator on the CPU. Yields a list with one entry per call."""
+    """Replace cuDNN's operator by `does` on the CPU, and yield a list that gets one entry per call."""
     calls: list[int] = []
 
     def counted(*arguments: Any) -> Tensor:
@@ -193,7 +193,7 @@ def operator_on_cpu(does: Callable[..., Tensor]) -> Iterator[list[int]]:
 
 
 def fuse(network: FeatureNetwork) -> set[bool]:
-    """Fuse the convolutions that pass a trial, as a network on a GPU does when it is constructed."""
+    """Fuse the convolutions that pass a trial, as the constructor of a network on a GPU does."""
     steps = [step for step in network._steps if isinstance(step, vgg._Convolution)]
     for step in steps:
         step.fused = vgg._can_fuse(step)
@@ -233,7 +233,7 @@ def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, mon
 
 
 class Launches(TorchDispatchMode):
-    """Counter of operations that compute something, unlike views and uninitialized memory."""
+    """Counter of operations, except for those that only create a view or allocate memory."""
 
     def __init__(self) -> None:
         super().__init__()

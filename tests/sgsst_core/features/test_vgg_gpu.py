@@ -27,7 +27,7 @@ def add(layer: str, features: Tensor, gradient: Tensor) -> None:
 
 
 def difference(weights: BackboneWeights, dtype: torch.dtype = torch.float32, *, tf32: bool = False) -> Difference:
-    """Compare the pixel gradient with that of float64 on the CPU."""
+    """Compare the image gradient with that of a float64 network on the CPU."""
     use_whole_float32()
     image = picture(*SIZE)
     exact = FeatureNetwork(weights, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Installed weights: every flipped bit is found, and files of the package are held by digests in the code."""
+"""Tests of weight files: each flipped bit is detected, and files of the package match digests in the code."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from sgsst_core.features.weight_files import (
 
 @pytest.fixture
 def folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
-    """A copy of the small file of the package that a test may damage."""
+    """Return a folder with a copy of the package's small weight file, which a test may damage."""
     shutil.copy(cache_folder() / "lpips_vgg16.safetensors", tmp_path)
     return tmp_path
 
 
 def flip(path: Path, position: int, bit: int = 0) -> None:
-    """Flip one bit of a file, with the times of the file as they were."""
+    """Flip one bit of a file without changing its times."""
     status = path.stat()
     content = bytearray(path.read_bytes())
     content[position] ^= 1 << bit
@@ -66,7 +66,7 @@ def test_every_flipped_bit_is_found(folder: Path) -> None:
 
 
 def test_weights_that_only_claim_to_be_the_package_s_are_refused(folder: Path) -> None:
-    """Damaged before their digest was recorded, so that the file agrees with itself."""
+    """The file was damaged before its own digest was computed, so only the digest in the code detects it."""
     path = folder / "lpips_vgg16.safetensors"
     tensors = safetensors.torch.load_file(path)
     tensors["linear3.weight"][7] += 1

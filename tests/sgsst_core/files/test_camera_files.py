@@ -1,4 +1,4 @@
-"""Tests that all formats of camera files give the same cameras, and that errors name what is wrong."""
+"""Tests that all formats of camera files give the same cameras, and that error messages name the problem."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WIDTH, HEIGHT = 640, 480
 
 
 def views(count: int = 3) -> list[Camera]:
-    """Return cameras in general position, with focal length 500 and a centered principal point."""
+    """Return cameras with arbitrary poses, focal length 500 and a centered principal point."""
     generator = torch.Generator().manual_seed(3)
     positions = torch.randn(count, 3, generator=generator, dtype=torch.float64) * 4
     up = torch.tensor([0.1, -1.0, 0.2], dtype=torch.float64)
@@ -68,7 +68,7 @@ def nerfstudio(cameras: list[Camera]) -> dict[str, Any]:
 
 
 def colmap(folder: Path, cameras: list[Camera], *, text: bool, model: str = "PINHOLE") -> Path:
-    """Write a sparse model without pycolmap, following COLMAP's "Output Format" page."""
+    """Write a sparse COLMAP model without pycolmap, following the page "Output Format" of COLMAP's documentation."""
     folder.mkdir(parents=True)
     number, values = {
         "SIMPLE_PINHOLE": (0, [500.0, WIDTH / 2, HEIGHT / 2]),
@@ -327,7 +327,7 @@ def test_names_with_spaces_and_windows_line_ends(tmp_path: Path) -> None:
 
 
 def change(content: Any, key: str, value: Any) -> Any:
-    """Replace or remove one value of the second camera in the content of an INRIA or nerfstudio file."""
+    """Replace or remove a value of the second camera in the content of an INRIA or nerfstudio camera file."""
     entry = (content if isinstance(content, list) else content["frames"])[1]
     if value is None:
         del entry[key]

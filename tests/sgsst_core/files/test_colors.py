@@ -1,4 +1,4 @@
-"""Tests of the error bound of colors stored alone as float16."""
+"""Tests of the error bound of files that store only colors, as float16."""
 
 from __future__ import annotations
 

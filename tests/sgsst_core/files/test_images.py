@@ -1,4 +1,4 @@
-"""Tests that images of every common kind become float32 RGB, and that broken ones give one clear error."""
+"""Tests that all common kinds of images are converted to float32 RGB, and that broken files give a clear error."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_of_an_animation_the_first_frame_is_read(tmp_path: Path) -> None:
 
 
 def png_header(width: int, height: int) -> bytes:
-    """Return a PNG that declares any size and contains no data."""
+    """Return a PNG whose header declares this size, without pixel data."""
     size = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = [(b"IHDR", size), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -172,7 +172,7 @@ def test_truncated_images_are_refused(tmp_path: Path, name: str) -> None:
 
 
 def with_scans(path: Path, count: int) -> Path:
-    """A progressive JPEG whose last scan is repeated."""
+    """Write a progressive JPEG whose last scan is repeated."""
     file = io.BytesIO()
     Image.new("L", (64, 64), 128).save(file, "JPEG", progressive=True)
     data = file.getvalue()

@@ -1,4 +1,4 @@
-"""Tests of compressed PLY, SPZ and .splat: against gsply for the first two, and against hand-made values.
+"""Tests of reading compressed PLY, SPZ and .splat, against gsply (except .splat) and values computed by hand.
 
 Files with false headers and damaged content must be refused.
 """
@@ -62,7 +62,7 @@ def gsply_of(scene: Scene) -> gsply.GSData:
 
 
 def turned(scene: Scene) -> Scene:
-    """Return the same Gaussians in SPZ's axes. SH coefficients are fitted to give the same colors."""
+    """Return the same Gaussians in SPZ's coordinate system, with SH coefficients fitted to give the same colors."""
     turn = torch.diag(TURN.double())
     directions = torch.nn.functional.normalize(
         torch.randn(200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1
@@ -79,7 +79,7 @@ def turned(scene: Scene) -> Scene:
 
 
 def assert_close(found: Scene, expected: Scene, *, opacities: float = 1.1e-3, others: float = 3e-6) -> None:
-    """Assert equality up to rounding, up to the sign of rotations, and with finite opacities."""
+    """Assert that scenes are equal up to rounding and the sign of quaternions, and that opacities are finite."""
     for field in fields(Scene):
         first, second = getattr(found, field.name).double(), getattr(expected, field.name).double()
         tolerance = others

@@ -1,4 +1,4 @@
-"""Tests of 3DGS PLY files: read by plyfile and by a second reader in this file, and written with only f_dc changed."""
+"""Tests of 3DGS PLY files: reading, compared with a second reader in this module, and writing with new f_dc."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ Rows = list[dict[str, Any]]
 
 @dataclass
 class File:
-    """PLY file to write: elements as (name, properties as (type, name), rows); list types read "list uchar int"."""
+    """PLY file to write. Elements are tuples (name, properties, rows); properties are pairs (type, name).
+
+    Types of list properties are written as in PLY headers, such as "list uchar int".
+    """
 
     form: str
     elements: list[tuple[str, list[tuple[str, str]], Rows]]
@@ -63,7 +66,7 @@ class File:
 
 
 def second_reader(data: bytes) -> tuple[list[bytes], dict[str, Rows]]:
-    """Read header lines and elements of any PLY without plyfile or numpy, as simply as possible."""
+    """Read header lines and elements of any PLY by a simple reference implementation without plyfile or numpy."""
     newline = b"\r\n" if data.startswith(b"ply\r\n") else b"\n"
     head, _, body = data.partition(newline + b"end_header" + newline)
     lines = head.split(newline)
@@ -104,7 +107,7 @@ def f32(value: float) -> float:
 
 
 def simple(count: int = 3, degree: int = 0, form: str = "binary_little_endian", **changes: Any) -> File:
-    """Return a plain file with `count` Gaussians; `changes` replace values by name."""
+    """Return a plain 3DGS file with `count` Gaussians; `changes` replace the values of properties by name."""
     names = BASE + [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
     rows = [{name: f32(row + 0.01 * i) for i, name in enumerate(names)} | changes for row in range(count)]
     return File(form, [("vertex", [("float", name) for name in names], rows)])
@@ -118,7 +121,7 @@ def save(folder: Path, file: File | bytes) -> Path:
 
 @st.composite
 def files(draw: st.DrawFn) -> File:
-    """Draw any 3DGS PLY: degree, format, order, types, extra properties and elements, comments of any bytes."""
+    """Draw a valid 3DGS PLY with random degree, format, order, types, extra properties, elements and comments."""
     form = draw(st.sampled_from(["ascii", "binary_little_endian", "binary_big_endian"]))
     degree = draw(st.integers(0, 3))
     names = BASE + [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]

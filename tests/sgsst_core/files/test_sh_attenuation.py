@@ -1,4 +1,4 @@
-"""Tests that attenuated SH coefficients are the same float32 numbers in memory, read from a file, and written."""
+"""Tests that attenuated SH coefficients are bit-identical in memory, read on demand from a file, and written."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def written(folder: Path, degree: int = 3) -> Path:
 
 
 def in_another_form(path: Path, form: str) -> Path:
-    """Write the same scene as ASCII, big-endian, with doubles, or with a property among the coefficients."""
+    """Write the same scene as ASCII, as big-endian, with doubles, or with another property between the coefficients."""
     vertices = PlyData.read(path)["vertex"].data
     kinds = [(name, "<f8" if form == "doubles" and "rest" in name else "<f4") for name in vertices.dtype.names]
     if form == "mixed up":

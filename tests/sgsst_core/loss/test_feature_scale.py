@@ -26,7 +26,7 @@ LAYERS = (*STYLE_LAYERS, CONTENT_LAYER)
 
 @pytest.fixture
 def trained_anew(tiny_weights: BackboneWeights) -> BackboneWeights:
-    """Return a network whose input normalization differs from the original network's."""
+    """Return a network with another input normalization than the original network."""
     return replace(tiny_weights, input_scale=torch.tensor([250.0, 255.0, 260.0]))
 
 

@@ -1,4 +1,4 @@
-"""Tests of Triton kernels for statistics and style loss against float64, on a GPU or in the interpreter."""
+"""Tests of the Triton kernels for statistics and style loss against float64, on a GPU or in Triton's interpreter."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WEIGHTS = (terms.GRAM_WEIGHT, terms.MEAN_WEIGHT, terms.STD_WEIGHT)
 
 
 def features(height: int, width: int, channels: int, seed: int, mean: float = 0.0) -> Tensor:
-    """Return the inner part of a larger feature map, as a tile owns it, float32, with dependent channels."""
+    """Return a non-contiguous crop of a float32 feature map with correlated channels, like a tile without its halo."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn((height + 3, width + 2, channels), generator=generator)
     mixed = (x @ torch.randn((channels, channels), generator=generator) / channels**0.5).relu() + mean
@@ -28,7 +28,7 @@ def features(height: int, width: int, channels: int, seed: int, mean: float = 0.
 
 
 def position_weights(height: int, width: int) -> Tensor:
-    """Return weights in 0 to 1 with rows of 0, as beside a silhouette."""
+    """Return weights from 0 to 1, some of whose rows are all 0, as outside of an object's silhouette."""
     weights = torch.rand((height + 2, width), generator=torch.Generator().manual_seed(7))
     weights[:5] = 0
     return weights.to(DEVICE)[2:]
@@ -44,7 +44,7 @@ def on_cpu(statistics: LayerStatistics) -> LayerStatistics:
 
 
 def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tuple[Tensor, Tensor]:
-    """Return terms [4] and gradient [h, w, c]; the gradient is added, and its surroundings stay unchanged."""
+    """Return terms [4] and gradient [h, w, c]. Check that the gradient is added, and only within the crop."""
     found, *maps = fused_style_loss(
         fused_statistics(x, weights), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23
     )

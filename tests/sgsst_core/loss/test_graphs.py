@@ -1,4 +1,4 @@
-"""Tests that the loss from captured graphs is bit-identical to the loss kernel by kernel, on a simulated GPU."""
+"""Tests on a simulated GPU that the loss by captured CUDA graphs is bit-identical to the eager loss."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def counts() -> Iterator[Counts]:
 
 @pytest.fixture
 def without_triton(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Use PyTorch's kernels only, which need no interpreter."""
+    """Disable Triton's kernels, so that the slow interpreter is not needed."""
     leave_out_kernels(monkeypatch)
 
 

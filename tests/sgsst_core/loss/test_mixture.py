@@ -1,4 +1,4 @@
-"""Tests of several style images as one style."""
+"""Tests of mixing several style images into one style."""
 
 import pytest
 import torch

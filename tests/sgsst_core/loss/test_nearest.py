@@ -1,4 +1,4 @@
-"""Tests of nearest-neighbor feature matching against its definition, and where angles do not exist."""
+"""Tests of nearest-neighbor feature matching against its definition, including zero vectors, which have no angle."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def loss_of(
 
 
 def setting(height: int, width: int, *, covered: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Return image, style, content and coverage."""
+    """Return image, style, content and coverage (None unless `covered`) for a view of this size."""
     coverage = None
     if covered:
         coverage = (picture(height, width, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
@@ -55,7 +55,7 @@ def gradient_of(result: SosResult) -> Tensor:
 
 
 def features(positions: tuple[int, int], channels: tuple[int, ...], seed: int) -> dict[str, Tensor]:
-    """Return nonnegative float64 features, like a ReLU's output, without zero vectors."""
+    """Return nonnegative float64 features by layer, like a ReLU's output, without zero vectors."""
     generator = torch.Generator().manual_seed(seed)
     return {
         f"relu3_{place}": torch.randn((*positions, count), generator=generator, dtype=torch.float64).relu() + 0.01

@@ -1,4 +1,4 @@
-"""Tests of the loss of several regions, each with its own style."""
+"""Tests of the loss of several regions with different styles."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ SIZE = (112, 150)
 
 
 def shares(size, count):
-    """Return maps of some regions, which add up to 1 with another background; the first ones have hard borders."""
+    """Return coverage maps of `count` regions, which add up to 1 with the background; the first have hard borders."""
     raw = torch.stack([picture(*size, seed=10 + number)[:, :, 0] ** 4 for number in range(count + 1)])
     raw[0, :, size[1] // 2 :] = 0
     raw[1, : size[0] // 2] = 0

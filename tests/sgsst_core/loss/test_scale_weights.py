@@ -1,4 +1,4 @@
-"""Tests of scale weights: the weighted loss follows its definition, and scales of weight 0 are not computed."""
+"""Tests of scale weights: the weighted loss matches its definition, and scales with weight 0 are not computed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def evaluate(
     tile_size: int | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> tuple[SosResult, list[tuple[int, int]]]:
-    """Return the loss of a view on three scales, and the sizes of all images that went through the network."""
+    """Return the loss of a view at three scales, and the sizes of all images that the network processed."""
     image, content, painting = (picture(*SIZE, seed=seed).to(dtype) for seed in (1, 2, 3))
     coverage = (picture(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1).to(dtype)
     network = FeatureNetwork(weights, dtype=dtype)

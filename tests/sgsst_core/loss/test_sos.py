@@ -1,4 +1,4 @@
-"""Tests of the SOS gradient for any partition against the untiled autograd reference."""
+"""Tests of the SOS gradient with various partitions into tiles, against the untiled autograd reference."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ FLOAT32_TOLERANCE = 1e-5
 
 
 def setting(size, *, covered=False):
-    """Return (image, style, content, coverage) for views of a size, float64."""
+    """Return float64 image, style, content and coverage (None unless `covered`) for a view of this size."""
     image, content = picture(*size, seed=1), picture(*size, seed=2)
     style = resize_area(picture(600, 500, seed=3) ** 2, style_size((600, 500), size))
     coverage = None
@@ -57,7 +57,7 @@ def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, gray
 
 
 def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny_weights):
-    """The pixel loss is that of means and deviations of 0-256 values, times the squared factor."""
+    """The pixel loss compares means and standard deviations of values from 0 to 256, times the squared factor."""
     weights = comparing_pixels(tiny_weights, 3.0)
     network = FeatureNetwork(weights, (PIXELS, "relu1_1"))
     loss = SosLoss(network, content_weight=0)
@@ -117,7 +117,7 @@ def test_float32_does_not_depend_on_the_partition(tiny_weights, size, tile_sizes
 
 
 class DecisionsOf(FeatureNetwork):
-    """Float64 network that back-propagates through the ReLU masks and pool positions of a float32 network."""
+    """Float64 network whose backward pass uses the ReLU masks and max pooling positions of a float32 network."""
 
     def __init__(self, weights, other: FeatureNetwork):
         super().__init__(weights, dtype=torch.float64)
@@ -154,7 +154,7 @@ def test_float32_differs_from_float64_by_flips_and_little_else(vgg16_weights):
 
 @pytest.mark.parametrize("held", [0, 1.5])
 def test_memory_budget_changes_no_result(tiny_weights, held):
-    """Recomputed forward passes give the same gradient, for no kept tile and for some."""
+    """Gradients with recomputed forward passes are the same, whether no tile or some tiles are cached."""
     network = FeatureNetwork(tiny_weights)
     case = setting((200, 330))
     whole = evaluate(network, case, None, memory=1 << 34)

@@ -26,7 +26,7 @@ def make_features(height, width, channels, seed, dtype=torch.float64):
 
 
 def autograd_style(x, target, weights):
-    """Return the style loss from its definition, and its gradient by autograd."""
+    """Return the style loss by its definition, and its gradient by autograd."""
     x = x.double().clone().requires_grad_()
     loss = style_loss_reference(x, target, weights)
     return loss.item(), torch.autograd.grad(loss, x)[0]

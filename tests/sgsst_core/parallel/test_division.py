@@ -1,4 +1,4 @@
-"""Tests of the division of work among ranks: complete, without overlap, and as even as 16-pixel edges allow."""
+"""Tests of the division of work among ranks: complete, without overlap, and as even as multiples of 16 px allow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of sets of Gaussians, stored as one bit each."""
+"""Tests of sets of Gaussians, which are stored as bit masks."""
 
 from __future__ import annotations
 

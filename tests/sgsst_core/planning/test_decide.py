@@ -1,4 +1,4 @@
-"""Tests of every decision on synthetic probes, without rendering or timing anything."""
+"""Tests of each decision of the planner on synthetic probes, without rendering or timing anything."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ GIGABYTE = 10**9
 
 
 def probe(**changes: Any) -> Probe:
-    """Return a probe of four views filled by six Gaussians, on a CPU with 10 GB; `changes` replace any fields."""
+    """Return a probe of a CPU with 10 GB, and of four views that six Gaussians fill; `changes` replace fields."""
     weights = torch.tensor([0.0, 0.5, 1.0, 2.0, 4.0, 8.0], dtype=torch.float64)
     parts: dict[str, Any] = {
         "scene": SceneFacts(6, 3, 3, 3),

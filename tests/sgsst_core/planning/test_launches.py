@@ -1,4 +1,4 @@
-"""Tests of the measurement of kernel launches, on a simulated GPU."""
+"""Tests of measuring the cost of kernel launches, on a simulated GPU."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SIZE = 32, 48
 
 @pytest.fixture
 def counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counts]:
-    """Use PyTorch's kernels only, which need no interpreter."""
+    """Yield the counters of a simulated GPU, with Triton's kernels disabled, so that no interpreter is needed."""
     with pretend_cuda() as found:
         leave_out_kernels(monkeypatch)
         yield found

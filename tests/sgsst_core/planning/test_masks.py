@@ -1,4 +1,4 @@
-"""Tests of the selection of Gaussians by masks of some views."""
+"""Tests of selecting Gaussians by image masks of some views."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Tests of the measurements in a plan: how they are thinned out and what the plan says about them."""
+"""Tests of planned quality measurements: how many of them a plan leaves out, and how it explains that."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_nothing_is_measured_without_a_share() -> None:
 
 
 def test_a_job_is_its_steps_its_first_visits_and_measuring() -> None:
-    """All four views are visited in either phase.
+    """All four views are visited in each phase.
 
     The first visits compute cached weights and use the survey's intersections.
     """

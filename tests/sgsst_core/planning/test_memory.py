@@ -45,7 +45,7 @@ def test_tile_intersections_of_held_out_views_take_what_the_jobs_leave() -> None
 
 
 def test_views_that_no_step_comes_to_take_nothing() -> None:
-    """A single step visits one of four views, which needs a quarter of the content and of the colors."""
+    """A single step visits one of four views, so it needs a quarter of the memory for content and for colors."""
     every, one = expected(LARGE, keep=("unseen",)), expected(LARGE, steps_sos=1, keep=("unseen",))
     without = [expected(LARGE, steps_sos=steps, keep=("unseen", "content")) for steps in (40, 1)]
     colors = 6 * 12 * VIEWS * 3 // 4

@@ -1,4 +1,4 @@
-"""Tests of automatic orbits: rings show more of the surface, requests are obeyed, and the plan mentions everything."""
+"""Tests of automatic orbits: rings show more of the surface, requests are followed, and plans list all decisions."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def elevations(scene: Scene, made: Orbit) -> list[float]:
 
 
 def told(scene: Scene, made: Orbit) -> dict[str, Decision]:
-    """Return the decisions of the plan by item."""
+    """Return the plan's decisions about an orbit by item."""
     cameras = [resized(camera, 64) for camera in made.cameras]
     survey = survey_views(scene, cameras, make_rasterizer("cpu", scene))
     return {decision.item: decision for decision in orbit_decisions(made, cameras, survey)}
 
 
 def table() -> Scene:
-    """Return a wide flat object on a ground, best seen from above."""
+    """Return a wide flat object on the ground, which is best seen from above."""
     return joined(ground(4.0), scene_of(box((-0.5, -0.5, -0.5), (0.5, 0.0, 0.5))))
 
 

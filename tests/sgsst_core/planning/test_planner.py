@@ -1,4 +1,4 @@
-"""Tests that what a plan leaves out changes no result, and that the plan gives the reason."""
+"""Tests that components that a plan leaves out do not change results, and that the plan states the reasons."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.small_scenes import ball, cameras, wall
 
 
 def behind(scene: Scene, count: int = 10) -> Scene:
-    """Return the scene with its last Gaussians moved behind the cameras, where no view sees them."""
+    """Return the scene with its last `count` Gaussians moved behind the cameras, where no view sees them."""
     moved = scene.means.clone()
     moved[-count:, 2] *= -1
     return replace(scene, means=moved)
@@ -121,7 +121,7 @@ def test_similar_views_are_left_out_only_when_asked(tiny_weights: BackboneWeight
 
 
 def test_distinct_views_by_their_shift() -> None:
-    """Views 0.3 apart of a wall at distance 3, with a focal length of one width, are shifted by 0.1 of the width."""
+    """Cameras 0.3 apart, at distance 3 from a wall, with a focal length of one image width: a shift by 0.1 widths."""
     scene, views = wall(), cameras(3)
     turned = [replace(camera, world_to_camera=camera.world_to_camera.clone()) for camera in views]
     for camera, x in zip(turned, (-0.3, 0.0, 0.3), strict=True):

@@ -1,4 +1,4 @@
-"""Tests of the gain and the cost of lower precisions."""
+"""Tests of measuring speedup and gradient error of lower precisions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def error_of(network: FeatureNetwork, weights: BackboneWeights, side: int = 384)
 def test_ten_bits_have_an_error_of_a_thousandth_but_for_flips(vgg16_weights: BackboneWeights) -> None:
     """Most of the error of a lower precision comes from flipped ReLU and max-pool decisions.
 
-    Their number is proportional to the rounding error, and their error to its square root.
+    The number of flips is proportional to the rounding error, so the gradient error is proportional to its square root.
     """
     flipping = error_of(RoundedToTf32(vgg16_weights), vgg16_weights)
     deciding = error_of(RoundedToTf32(vgg16_weights, decisions=FeatureNetwork(vgg16_weights)), vgg16_weights)
@@ -80,7 +80,7 @@ def test_tf32_needs_every_rank_to_have_it(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.parametrize(("least", "runs"), [(0.0, [1, 1]), (1.0, [1, 1]), (5.0, [1, 1, 2, 4, 8])])
 def test_repetitions_take_long_enough(least: float, runs: list[int]) -> None:
-    """Each run takes a second, and the first one ten, because it prepares."""
+    """Each simulated run takes a second; the first one takes ten seconds, because it prepares."""
     made: list[int] = []
 
     def run(times: int) -> float:

@@ -1,4 +1,4 @@
-"""Tests of the probe: what it measures, on what, and what it passes on."""
+"""Tests of the planner's probe: its measurements, the views it uses, and the data that a job reuses."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_matching_features_is_measured_apart(tiny_weights: BackboneWeights) -> N
 
 
 def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: BackboneWeights) -> None:
-    """Images are large on a GPU, as far as their activations fit the memory.
+    """On a GPU, images are as large as the memory for their activations allows.
 
     `measure_rate` also limits them to the size of the views.
     """
@@ -93,7 +93,7 @@ def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: B
 
 
 def test_the_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first run only prepares; two runs with gradient and two without follow."""
+    """The first run is a warm-up; two runs with gradient and two without follow."""
     taken = iter([1.0, 5.0, 3.0, 4.0, 2.0])
 
     class Clock(Timer):
@@ -158,7 +158,7 @@ def test_an_earlier_survey_takes_the_place_of_a_look(tiny_weights: BackboneWeigh
 
 @pytest.mark.parametrize("kept", ["none", "float32"])
 def test_what_was_built_for_the_whole_scene_is_handed_on(tiny_weights: BackboneWeights, kept: str) -> None:
-    """These are the network and the views' intersections, unless left-out Gaussians change the indices in them."""
+    """The probe passes on the network, and the tile intersections unless pruning changes their Gaussian indices."""
     for scene, handed_on in ((ball(), True), (wall(), False)):
         settings = make_settings(cached_weights=kept)
         plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)

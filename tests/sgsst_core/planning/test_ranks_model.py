@@ -1,4 +1,4 @@
-"""Tests of the planner's model of several ranks."""
+"""Tests of the planner's performance model of several ranks."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_many_ranks_are_looked_at_in_steps() -> None:
 
 
 def test_what_does_not_fit_the_memory_goes_forward_twice() -> None:
-    """Two ranks of one machine have half of its memory each, and keep all scales at once."""
+    """Two ranks on one machine have half of its memory each, and cache the activations of all scales."""
     pixels = 1.25 * 720 * 1280
     roomy = replace(work(), forward=1e-6, held=2 * pixels, working=0.1, sharing=2)
     tight = replace(roomy, held=pixels)

@@ -1,4 +1,4 @@
-"""Tests of splitting in a plan: projected sizes, disagreement by definition, and the budget."""
+"""Tests of planning to split Gaussians: projected sizes, disagreement measure, and budget."""
 
 from __future__ import annotations
 

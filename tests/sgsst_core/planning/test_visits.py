@@ -1,4 +1,4 @@
-"""Tests of the cost of visiting views: once for cached data, at every visit for the rest."""
+"""Tests of the predicted cost of visiting views: cached data cost time once, other data at every visit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.sgsst_core.planning.test_decide import GIGABYTE, probe
 
 #: Intersections take 5 s and fit the cache; colors take 0.5 s.
 LARGE = RasterCost(2.0, first_seconds=5.0, intersection_bytes=10**8, colors_seconds=0.5)
-#: Of four views, the intersections of one fit a quarter of 10 GB.
+#: Sizes with which a quarter of 10 GB has space for the intersections of one of four views.
 HUGE = replace(LARGE, intersection_bytes=10 * GIGABYTE // 4)
 
 
@@ -49,7 +49,7 @@ def test_views_that_are_kept_whole_leave_a_part_of_the_room() -> None:
 
 
 def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
-    """Intersections are then cached in the remaining memory, and every view is rendered from them."""
+    """Tile intersections are cached in the memory that is not used for weights, and used to render each view."""
     found = {size: plan_of(replace(LARGE, bytes=8 * size, half_bytes=4 * size)) for size in (GIGABYTE, 3 * GIGABYTE)}
     predictions = [plan.prediction for plan in found.values()]
     assert all(plan.cached_weights == "half" for plan in found.values())

@@ -1,4 +1,4 @@
-"""Tests of multi-view consistency on planes, whose warp and occlusion are known, and on a real scene."""
+"""Tests of multi-view consistency on planes, for which warp and occlusion are known exactly, and on a real scene."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def lpips(vgg16_weights: object) -> Lpips:
 
 
 def plane(half_width: float, half_height: float, depth: float, color: Tensor | None = None) -> Scene:
-    """Return opaque flat Gaussians on a rectangle around the z axis, in a smooth pattern or one color [3].
+    """Return opaque flat Gaussians on a rectangle around the z axis, with a smooth pattern or one color [3].
 
-    Gaussians overlap, and the nearer hides the farther one. A pixel therefore shows the pattern from up to two
-    deviations beside it, toward the side of the plane that is nearer to the camera.
+    Gaussians overlap, and nearer ones hide farther ones. A pixel therefore shows the pattern at a position that is
+    shifted by up to two standard deviations toward the side of the plane that is nearer to the camera.
     """
     x = torch.arange(-half_width, half_width + SPACING / 2, SPACING)
     y = torch.arange(-half_height, half_height + SPACING / 2, SPACING)
@@ -67,12 +67,12 @@ def camera(position: tuple[float, float, float], target: tuple[float, float, flo
 
 
 def ring(count: int) -> list[Camera]:
-    """Return cameras on an arc in front of a plane, all nearer to the same side of it."""
+    """Return cameras on an arc in front of a plane, all of them nearer to the same side of it."""
     return [camera((0.12 * i + 0.3, 0.04 * i + 0.1, 0.02 * i)) for i in range(count)]
 
 
 def renders(scene: Scene, cameras: list[Camera], rasterizer: Rasterizer):
-    """Return a function that renders the scene in its own colors."""
+    """Return a function that renders views of the scene in its own colors."""
 
     def image(index: int) -> Tensor:
         rest = rest_colors(scene.sh_rest, scene.means, cameras[index])
@@ -87,9 +87,9 @@ def measure(scene: Scene, cameras: list[Camera], gap: int = 1, lpips: Lpips | No
 
 
 def homography(camera: Camera, other: Camera) -> Tensor:
-    """Return the mapping [3, 3] from the pixels of one view to another's by the plane z = DEPTH.
+    """Return the homography [3, 3] from one view's pixels to another's, induced by the plane z = DEPTH.
 
-    Hartley and Zisserman, result 13.1.
+    See Hartley and Zisserman, result 13.1.
     """
 
     def intrinsics(c: Camera) -> Tensor:

@@ -1,4 +1,4 @@
-"""Tests of the comparison of approximations with exact gradients."""
+"""Tests of comparing approximate gradients with exact ones."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights
 
 
 def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeights) -> None:
-    """After some steps it has the same value as before them, and the colors of the steps are unchanged."""
+    """The error has the same value as if it was measured before the first step, and colors are not affected."""
     stylizer = make(tiny_weights, cached_weights="half")
     reference = Float32Reference(stylizer)
     first = reference.gradient_error()
@@ -86,7 +86,7 @@ def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: Backb
 
 
 def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -> None:
-    """The plan is made by hand. TF32 is emulated, because it is float32 on a CPU."""
+    """The plan is constructed by hand, and TF32 is emulated, because a CPU would use float32."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12, warm_start=False)
     plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)
     plan = replace(plan, precision="tf32")
@@ -102,7 +102,7 @@ def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -
 
 
 def test_bfloat16_has_an_error_between_rounding_and_nonsense(tiny_weights: BackboneWeights) -> None:
-    """The plan is made by hand, so that the precision does not depend on the processor."""
+    """The plan is constructed by hand, so that the precision does not depend on the processor."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12)
     plan, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
     plan = replace(plan, precision="bfloat16")

@@ -1,4 +1,4 @@
-"""Tests of `sgsst check` on scenes, views and styles that are each extreme in one respect."""
+"""Tests of `sgsst check` on scenes, views and styles, each with one extreme property."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def seen_by(folder: Path, scene: Scene, views: list[Camera]) -> dict[str, Findin
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_survey_takes_the_place_of_another_look(tmp_path: Path, turned: bool) -> None:
-    """The findings have the same words; a camera that is turned away sees nothing."""
+    """Findings have the same text as without an existing survey. One camera looks away and sees nothing."""
     file, views = stored(tmp_path, wall()), cameras()
     if turned:
         away = views[0].world_to_camera.clone()
@@ -100,7 +100,7 @@ def test_extreme_gaussians_are_counted_and_the_worst_is_named(
 
 
 def test_a_scene_is_looked_at_in_parts_of_any_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Findings do not depend on the slices, and the first of equal values is named."""
+    """Findings do not depend on the slice size; among equal values, the first one is reported."""
     scene = wall(sh_degree=1)
     for column, values in (("quats", (1e-20, 1e20)), ("scales", (200.0, 5.0, -1e6)), ("sh_dc", (-1e4, 1e4))):
         for place, value in enumerate(values):

@@ -1,4 +1,4 @@
-"""Tests of the judge of a result: against plain float64 formulas, and on scenes with a known outcome."""
+"""Tests of the judge of a result, against plain float64 formulas and on scenes with known outcomes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def alex(vgg16_weights: object) -> Lpips:
-    """Load AlexNet in float32; its weights come with VGG16's."""
+    """Load LPIPS with AlexNet in float32. Its weights are installed together with VGG16's."""
     return Lpips()
 
 
@@ -46,7 +46,7 @@ def judged(judge: Judge, sh_dc: Tensor) -> Judgment:
 
 
 def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple[list[float], float, float, float]:
-    """Compute style on black and on white, color distance, content and features of a view, in plain loops."""
+    """Compute a view's style distances on black and on white, color, content and feature distance, in plain loops."""
     lpips = Lpips(dtype=torch.float64)
     rasterizer = ReferenceRasterizer(scene)
     rest = reference_rest_colors(held(scene.sh_rest), scene.means, camera, scene.sh_degree).double()
@@ -129,7 +129,7 @@ def test_large_views_are_judged_at_one_size(alex: Lpips) -> None:
 
 @pytest.mark.parametrize("picture", [torch.full((1, 1, 3), 0.5), torch.zeros(40, 40, 3), torch.ones(5, 900, 3)])
 def test_extreme_styles_give_finite_figures(alex: Lpips, picture: Tensor) -> None:
-    """Styles are a single pixel, black without variance, and a line."""
+    """The styles are a single pixel, a black image without variance, and a line."""
     scene = ball()
     found = judged(judge_of(alex, scene, cameras(1), picture), torch.full_like(scene.sh_dc, -50.0))
     assert all(np.isfinite(value) for value in vars(found).values())

@@ -1,4 +1,4 @@
-"""Tests of how much of a job is measured: the plan's amount, less for slow views, and the same after resuming."""
+"""Tests of the number of quality measurements in a job: as planned, fewer for slow views, the same after resuming."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def make(
 
 
 def measured(stylizer: Stylizer) -> list[int]:
-    """Run a job to its end. Returns the steps after which it was measured."""
+    """Run a job to its end, and return the steps after which quality was measured."""
     measure = Measurements(stylizer)
     run(stylizer, Callbacks(measure=measure))
     measure.at_the_end()
@@ -67,7 +67,7 @@ def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: Ba
 
 
 def test_what_the_first_view_takes_thins_the_rest_out(tiny_weights: BackboneWeights) -> None:
-    """No time is allowed, but the start has been measured by then, and the end always is."""
+    """No time is allowed for measurements, so only the start, which is already measured, and the end are measured."""
     stylizer = make(tiny_weights, EXPENSIVE)
     assert measured(stylizer) == [0, 16]
     assert stylizer.measured[0]["level"] == NOTHING - 1
@@ -89,7 +89,7 @@ def test_what_nothing_pays_for_is_not_measured(tiny_weights: BackboneWeights) ->
 
 
 def test_the_first_step_does_not_wait_for_the_start(tiny_weights: BackboneWeights) -> None:
-    """It is measured after the first step from the unstylized colors, with the same result as before it."""
+    """The initial quality is measured after the first step from the initial colors, with the same result as before."""
     before, late = make(tiny_weights), make(tiny_weights)
     Measurements(before)(before)
     measure = Measurements(late)
@@ -132,7 +132,7 @@ def test_nothing_is_measured_without_a_share_and_colors_are_the_same(tiny_weight
 
 
 def test_a_resumed_job_is_measured_as_it_was(tiny_weights: BackboneWeights) -> None:
-    """A new plan or other prices do not change what was decided at the first moment."""
+    """A new plan or other measured costs do not change the number of measurements that was decided initially."""
     for prediction, steps in ((LONG, [0, 1, 2, 4, 8, 16]), (EXPENSIVE, [0, 16])):
         stopped = make(tiny_weights, prediction)
         measure = Measurements(stopped)

@@ -1,4 +1,4 @@
-"""Tests of novel views: their positions, and the measurements on them."""
+"""Tests of novel views: their camera poses, and quality measurements on them."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ AXIS = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
 
 
 def rotation(angle: float, axis: Tensor = AXIS) -> Tensor:
-    """Return the rotation [3, 3] by Rodrigues' formula."""
+    """Return the matrix [3, 3] of the rotation by an angle about an axis, by Rodrigues' formula."""
     x, y, z = (axis / axis.norm()).tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
 def posed(turned: Tensor, center: tuple[float, float, float] | Tensor, name: str = "a", width: int = 60) -> Camera:
-    """Return a camera with a rotation (world to camera) at a center."""
+    """Return a camera with a world-to-camera rotation `turned` and a center."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = turned
     pose[:3, 3] = -turned @ torch.as_tensor(center, dtype=torch.float64)
@@ -52,7 +52,7 @@ def posed(turned: Tensor, center: tuple[float, float, float] | Tensor, name: str
 
 
 def held_out_cameras(views: list[Camera], covered: Sequence[int]) -> list[Camera]:
-    """Return a camera between each two neighbors among the views with some indices."""
+    """Return a camera between each pair of neighbors among the views with the indices `covered`."""
     return [between(*pair) for pair in neighbors([views[index] for index in covered])]
 
 
@@ -66,7 +66,7 @@ def angle_between(first: Camera, second: Camera) -> float:
 
 
 def ring(count: int, radius: float = 3.0) -> list[Camera]:
-    """Return cameras around the origin that look at it."""
+    """Return cameras on a circle around the origin that look at it."""
     origin, up = torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
     angles = [2 * math.pi * i / count for i in range(count)]
     return [
@@ -195,7 +195,7 @@ COARSEST = 40
 def novel_views(
     scene: Scene, views: list[Camera], network: FeatureNetwork, coarsest: int = COARSEST_SHORTER_SIDE, **options
 ) -> NovelViews:
-    """Make the novel views of a job whose views are all covered and have the same size."""
+    """Return the novel views of a job whose views all show the scene and have the same size."""
     loss = SosLoss(network, coarsest=coarsest)
     rasterizer = make_rasterizer("cpu", scene, background=(0.2, 0.3, 0.4))
     targets = {}
@@ -211,7 +211,7 @@ def novel_views(
 
 
 def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | None) -> dict[int, float]:
-    """Compute the sum over layers of w_G mean((G - G_v)^2) by scale, in float64."""
+    """Compute for each scale the sum over layers of w_G mean((G - G_v)^2), in float64."""
 
     def gram(features: Tensor, position: Tensor | None) -> Tensor:
         flat = features.reshape(-1, features.shape[-1])

@@ -1,16 +1,16 @@
-"""Comparison of two rasterizers that may decide differently at pixels very close to a cutoff.
+"""Comparison of two rasterizers that tolerates different decisions at pixels very close to a cutoff.
 
-A contribution is skipped below ALPHA_MIN, and a pixel ends at TRANSMITTANCE_MIN. If a value is within rounding error of
-such a cutoff, one rasterizer may keep what the other skips: a jump of up to a few gray levels that is not an error.
-These jumps are counted; everywhere else the tolerance applies.
+Rasterizers skip contributions below ALPHA_MIN, and stop blending a pixel at TRANSMITTANCE_MIN. If a value is within
+rounding error of such a cutoff, one rasterizer may keep a contribution that the other one skips. The difference of up
+to a few gray levels is not an error, and such pixels are only counted. The tolerance applies to all other pixels.
 """
 
 from __future__ import annotations
 
 from torch import Tensor
 
-#: Largest jump: a contribution just above ALPHA_MIN, or a Gaussian that crosses a transmittance of up to 1e-2, times a
-#: color up to 2.
+#: Largest difference at a cutoff: a contribution just above ALPHA_MIN, or one of a Gaussian at a transmittance of up to
+#: 1e-2, times a color of up to 2.
 LARGEST_STEP = 2e-2
 
 
@@ -22,9 +22,10 @@ def assert_close_outside_band(
     tolerance: float,
     largest_share: float = 1e-3,
 ) -> int:
-    """Assert equality within `tolerance` where `band` is False, and within LARGEST_STEP where it is True.
+    """Assert equality within `tolerance` where `band` is False, and within `LARGEST_STEP` where it is True.
 
-    Also asserts that at most `largest_share` of all pixels jump. Returns the number of those that do.
+    Also assert that within the band, at most the fraction `largest_share` of all pixels exceeds the tolerance. Return
+    the number of these pixels.
     """
     assert actual.shape == expected.shape, f"shapes {tuple(actual.shape)} and {tuple(expected.shape)}"
     difference = (actual.double() - expected.double()).abs()

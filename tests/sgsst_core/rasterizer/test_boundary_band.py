@@ -1,4 +1,4 @@
-"""Tests of the comparison of rasterizers: it detects errors and tolerates jumps at cutoffs."""
+"""Tests of `boundary_band`: it detects errors and tolerates differences at cutoffs."""
 
 from __future__ import annotations
 

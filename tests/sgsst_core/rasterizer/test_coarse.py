@@ -1,4 +1,4 @@
-"""Tests of `coarse` against the float64 reference with box average, including edge cases."""
+"""Tests of the rasterizer `coarse` against the float64 reference followed by a box average, including edge cases."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, single, turned_pose
 
-#: Relative distance from a cutoff within which float32 may decide otherwise.
+#: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 SCALES = [1, 2, 3, 4, 5]
 BACKGROUND = (1.0, 0.25, 0.5)
 
-#: Sizes with no side a multiple of 16, except for the last, which is divisible by the squares of all tested scales.
+#: Sizes whose sides are no multiples of 16, except for the last, which is divisible by the squares of all scales.
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "cloud": lambda: (cloud(), camera()),
     "turned": lambda: (cloud(600, seed=1), camera(73, 39, pose=turned_pose())),
@@ -47,7 +47,7 @@ def coarse_pixels(view: Camera, scale: int, seed: int = 6) -> Tensor:
 
 
 def upscaled(gradient: Tensor, view: Camera, scale: int) -> Tensor:
-    """Return D^T of a coarse gradient, [H, W, 3], in its dtype."""
+    """Return the gradient [H, W, 3] of the full-size view, by the adjoint of the box average."""
     whole = torch.zeros(view.height, view.width, 3, dtype=gradient.dtype)
     add_upscaled_(whole, gradient, scale)
     return whole
@@ -87,7 +87,7 @@ def test_gradient_is_the_transpose(scale: int) -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_what_fills_no_square_does_not_count(scale: int) -> None:
-    """The Gaussian covers only the last pixel of the last row. It belongs to no square, so nothing is cached for it."""
+    """The Gaussian covers only the last pixel of the last row, which no coarse pixel includes, so nothing is cached."""
     side = 1 << scale
     view = camera(3 * side + 1, 2 * side + 1)
     corner = ((view.width - 0.5 - view.cx) / view.fx, (view.height - 0.5 - view.cy) / view.fy, 1.0)

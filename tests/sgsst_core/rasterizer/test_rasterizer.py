@@ -1,4 +1,4 @@
-"""Tests of `cpu` and `cached` against `reference`, and of `reference` against a loop over pixels, with edge cases."""
+"""Tests of the rasterizers `cpu` and `cached` against `reference`, and of `reference` against a loop over pixels."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from tests.sgsst_core.splat_scenes import (
     turned_pose,
 )
 
-#: Relative distance from a cutoff within which float32 may decide otherwise.
+#: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 FAST = ["cpu", "cached"]
 BLACK = (0.0, 0.0, 0.0)
@@ -68,7 +68,7 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 
 
 def _needles() -> Scene:
-    """Return needles a million times longer than wide, at all angles, some far longer than the view."""
+    """Return Gaussians at all angles that are a million times longer than wide; some extend far beyond the view."""
     scene = cloud(200, seed=9)
     long = torch.linspace(-3, 7, 200)[:, None]
     return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
@@ -103,9 +103,9 @@ def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera
 def assert_agree(
     names: list[str], scene: Scene, view: Camera, background: tuple[float, float, float], rows: Rows | None = None
 ) -> int:
-    """Assert that images agree within 1e-4 and gradients within 1e-5, except where a cutoff flips.
+    """Assert that images agree within 1e-4 and gradients within 1e-5, except at pixels very close to a cutoff.
 
-    Returns the largest number of flipped pixels.
+    Return the largest number of differing pixels close to a cutoff.
     """
     rows = (0, view.height) if rows is None else rows
     colors, pixels = colors_of(scene), pixels_like(view)[rows[0] : rows[1]]
@@ -407,7 +407,7 @@ def test_too_many_intersections_are_an_error_with_figures() -> None:
 
 
 def test_kernels_run_where_no_folder_can_be_written(tmp_path: Path) -> None:
-    """Machine code is then kept in memory only; Numba itself would raise an exception at import."""
+    """If no folder is writable, machine code is kept in memory only; Numba itself would raise an error at import."""
     package = Path(__file__).resolve().parents[3]
     code = (
         "import numba.core.caching as c\n"
@@ -428,7 +428,7 @@ def test_kernels_run_where_no_folder_can_be_written(tmp_path: Path) -> None:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Run PyTorch on one thread.
+    """Run PyTorch on one thread within the test.
 
     The reference makes thousands of small operations, for which waking threads costs more than the work.
     """

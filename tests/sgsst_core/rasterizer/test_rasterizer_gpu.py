@@ -1,4 +1,4 @@
-"""Tests of gsplat's kernels against the reference with the same clamp, and of the errors without gsplat or GPU."""
+"""Tests of the rasterizer `gsplat` against the reference with the same alpha limit, and of errors if it can't run."""
 
 from __future__ import annotations
 

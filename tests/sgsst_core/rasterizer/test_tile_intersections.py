@@ -64,7 +64,7 @@ def test_values_are_in_order_of_depth(threads: None) -> None:
 
 
 def listed_in_turn(scene: Scene, view: Camera) -> list[list[int]]:
-    """Return the ranks in each raster tile, from the intersections of one Gaussian at a time."""
+    """Return the depth-order indices in each raster tile, from intersections of one Gaussian at a time."""
     gaussians = project(scene, view).gaussians
     tiles: list[list[int]] = [[] for _ in range(-(-view.width // 16) * -(-view.height // 16))]
     for rank, gaussian in enumerate(gaussians):
@@ -75,7 +75,7 @@ def listed_in_turn(scene: Scene, view: Camera) -> list[list[int]]:
 
 
 def check_slots(isects: TileIntersections) -> None:
-    """Check that every pair has a slot, and that those of a Gaussian are adjacent and ordered by tile."""
+    """Check that each pair has a slot, and that the slots of a Gaussian are adjacent and ordered by tile."""
     order = np.argsort(isects.slots, kind="stable")
     assert np.array_equal(isects.slots[order], np.arange(len(isects.slots)))
     assert np.array_equal(

@@ -1,4 +1,4 @@
-"""Tests that trials of rasterizers, which compile their kernels, run in one process per machine at a time."""
+"""Tests that trials of rasterizers, which compile kernels, run in only one process of a machine at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPAWN = multiprocessing.get_context("spawn")
 
 
 def build(folder: Path) -> None:
-    """Fail if another process builds at the same time, like a compiler that cleans up first."""
+    """Simulate a compiler that fails if another process builds in the same folder at the same time."""
     mark = folder / "building"
     mark.touch(exist_ok=False)
     time.sleep(0.05)

@@ -1,7 +1,7 @@
-"""Tests of `triton` against `reference` and the intersections of `cpu`, on a GPU or in Triton's interpreter.
+"""Tests of the rasterizer `triton` on a GPU or in Triton's interpreter, against `reference` and `cpu`.
 
-The interpreter runs the kernels' own source on CPU tensors. `benchmarks.triton_targets` checks that they compile for
-real targets; it needs no GPU either.
+The interpreter executes the kernels' source on CPU tensors. `benchmarks.triton_targets` checks that the kernels compile
+for real targets, and needs no GPU either.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ ROOT = Path(__file__).resolve().parents[3]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
 BACKGROUND = (1.0, 0.25, 0.5)
-#: Relative distance from a cutoff within which float32 may decide otherwise.
+#: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 
 
 def needles() -> Scene:
-    """Return needles a million times longer than wide, at all angles, some far longer than the view."""
+    """Return Gaussians at all angles that are a million times longer than wide; some extend far beyond the view."""
     scene = cloud(60, seed=9)
     long = torch.linspace(-3, 7, 60)[:, None]
     return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
 
 
 def opaque() -> Scene:
-    """Return Gaussians that end every pixel after a few of them.
+    """Return nearly opaque Gaussians, a few of which terminate the blending of each pixel.
 
-    Backward passes that divide by 1 - alpha fail on them.
+    A backward pass that divides by 1 - alpha would fail for them.
     """
     return replace(cloud(300, seed=2, log_scale=-1.5), opacities=torch.full((300,), 7.0))
 
 
 def far_away() -> tuple[Scene, Camera]:
-    """Return a scene and a camera a million units from the origin, where float32 positions are 1/16 apart."""
+    """Return a scene and a camera a million units from the origin, where float32 has a resolution of 1/16."""
     scene, view = cloud(150, seed=12), camera(40, 33)
     offset = torch.tensor([1e6, -2e6, 1.5e6])
     means = scene.means.double().round(decimals=0) + offset.double()

@@ -1,4 +1,4 @@
-"""Tests of cached weights on GPUs against `reference` and `triton`, on a GPU or in Triton's interpreter."""
+"""Tests of cached blend weights on a GPU or in Triton's interpreter, against `reference` and `triton`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ pytest.importorskip("triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.usefixtures("one_thread"), *([pytest.mark.gpu] if DEVICE == "cuda" else [])]
 BACKGROUND = (1.0, 0.25, 0.5)
-#: Relative distance from a cutoff within which float32 may decide otherwise.
+#: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 #: Relative errors of images and gradients. Weights in half precision are off by at most 2^-11 each.
 ERRORS: dict[Precision, float] = {"float32": 5e-6, "half": 2**-11}
@@ -172,7 +172,7 @@ def test_a_piece_holds_a_weight_and_every_slot_is_filled_once() -> None:
 
 @contextmanager
 def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Yield the names of the calls that would wait for a device."""
+    """Yield a list that collects the names of calls that would synchronize with a GPU."""
     found: list[str] = []
 
     def noted(name: str) -> Callable[..., Any]:

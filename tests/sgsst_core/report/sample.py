@@ -1,4 +1,4 @@
-"""Sample report with the structure of `build_report`, made without a job."""
+"""Sample report with the structure that `build_report` gives, created without running a job."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sgsst_core.loss.terms import TERMS
 
 
 def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, Any]:
-    """Return a report of version 2 with a value in every field and the given number of steps."""
+    """Return a report of format version 2 with all fields set and the given number of steps."""
     history = [_record(step, "coarse" if step <= coarse else "sos", scales) for step in range(1, coarse + sos + 1)]
     seconds = history[-1]["seconds"] if history else 0.0
     before = {str(scale): _terms(1e6 / 4**scale) for scale in range(scales)}

@@ -28,9 +28,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def finished(tiny_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evaluation]:
-    """Run seven steps on six views of a ball, one of which sees nothing.
+    """Run a job of seven steps on six views of a ball, one of which sees nothing.
 
-    Returns the job, and the loss before and after.
+    Return the job, and the loss evaluations before and after.
     """
     views = [*cameras(3), blind_camera(), *cameras(2)]
     plain: dict[str, Any] = {

@@ -35,7 +35,7 @@ HOSTILE = '"><script>alert(\'x\')</script><b onclick="y">&amp; {{ 7 * 7 }} $x^2$
 
 
 class Page(HTMLParser):
-    """Elements and text of a page; parsing fails if tags do not nest."""
+    """Parsed HTML page: its elements and text. Parsing fails if tags are not properly nested."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -110,12 +110,12 @@ def parsed(report: dict[str, Any], sheet: bytes | None = None) -> Page:
 
 
 def parsed_without_figures(report: dict[str, Any]) -> Page:
-    """Parse a page without figures, which take most of the time."""
+    """Return the parsed page of a report without charts, which would take most of the time."""
     return parsed({**report, "history": []})
 
 
 def losses_alone(coarse: int = 6, sos: int = 12) -> dict[str, Any]:
-    """Return a report whose only figures are those of the loss."""
+    """Return a report whose only data for charts are losses."""
     report = sample_report(coarse, sos)
     for record in report["history"]:
         del record["memory_bytes"]
@@ -432,7 +432,7 @@ def test_views_of_one_reach_alone_leave_both_panels_their_room(missing: str) -> 
 
 
 def panel_borders(svg: str) -> list[tuple[float, float]]:
-    """Return the left and right ends of each panel's x axis, in points."""
+    """Return the left and right end of each panel's x axis, in points."""
     paths = [attributes["d"] or "" for tag, attributes in Page(svg).elements if tag == "path"]
     lines = [re.fullmatch(r"M ([\d.]+) ([\d.]+) L ([\d.]+) ([\d.]+)", path) for path in paths]
     axes = [line for line in lines if line and line[2] == line[4]]

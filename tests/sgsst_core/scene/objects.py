@@ -1,4 +1,4 @@
-"""Synthetic objects and rooms for cameras to orbit, with y pointing down as in captures."""
+"""Synthetic scenes for tests of orbits, with y pointing down as in captured scenes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UP = (0.0, -1.0, 0.0)
 
 
 def scene_of(means: Tensor, size: float | Tensor = 0.02, opacities: Tensor | None = None) -> Scene:
-    """Return Gaussians with standard deviations `size` (a number, or [N, 3])."""
+    """Return Gaussians at `means` with standard deviations `size` (a number, or [N, 3])."""
     n = len(means)
     sizes = torch.full((n, 3), float(size)) if not isinstance(size, Tensor) else size
     return Scene(
@@ -35,7 +35,7 @@ def joined(*scenes: Scene) -> Scene:
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float], count: int = 1500, seed: int = 0) -> Tensor:
-    """Return points [count, 3] on the faces of a box, in proportion to their areas."""
+    """Return points [count, 3] that are uniformly distributed over the faces of a box."""
     generator = torch.Generator().manual_seed(seed)
     corner = torch.tensor(low, dtype=torch.float32)
     sides = torch.tensor(high, dtype=torch.float32) - corner
@@ -54,7 +54,7 @@ def ball(center: tuple[float, float, float], radius: float, count: int = 800, se
 
 
 def figure() -> Scene:
-    """Return a standing figure with feet apart, 1.8 tall, in the middle of the floor at y = 0."""
+    """Return a standing human figure of height 1.8, with feet apart, on the floor y = 0 at the origin."""
     parts = [
         box((-0.30, -0.08, -0.12), (-0.12, 0.0, 0.16), 400, 1),  # feet
         box((0.12, -0.08, -0.12), (0.30, 0.0, 0.16), 400, 2),
@@ -67,7 +67,7 @@ def figure() -> Scene:
 
 
 def ground(width: float = 2.0, count: int = 3000) -> Scene:
-    """Return a flat rough patch below y = 0."""
+    """Return a flat, rough patch of ground below y = 0."""
     generator = torch.Generator().manual_seed(9)
     points = (torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([width, 0.01, width])
     return scene_of(points, torch.tensor([0.03, 0.005, 0.03]).repeat(count, 1))

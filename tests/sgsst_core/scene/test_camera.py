@@ -20,7 +20,7 @@ def camera(width: int = 990, height: int = 742, name: str = "a") -> Camera:
 
 
 def project(view: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return pixels [P, 2] and depths [P] of points [P, 3]."""
+    """Return pixel positions [P, 2] and depths [P] of points [P, 3]."""
     local = points.double() @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
     lens = torch.tensor([[view.fx, view.fy], [view.cx, view.cy]], dtype=torch.float64)
     return local[:, :2] / local[:, 2:] * lens[0] + lens[1], local[:, 2]

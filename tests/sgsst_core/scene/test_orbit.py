@@ -1,6 +1,6 @@
-"""Tests of rings of cameras around a subject.
+"""Tests of camera rings around a subject.
 
-The subject is whole in every frame and fills it, and rings follow the scene's pose and scale.
+Each view shows the whole subject, which fills it. Rings are invariant to the scene's pose and scale.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TURN = Rotation.from_euler("xyz", [40, 65, -130], degrees=True)
 
 
 def project(view: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return positions [P, 2] in the image, each 0 to 1, and depths [P] of points [P, 3]."""
+    """Return image positions [P, 2] as fractions of width and height, and depths [P], of points [P, 3]."""
     local = points.double() @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
     lens = torch.tensor([[view.fx, view.fy], [view.cx, view.cy]], dtype=torch.float64)
     size = torch.tensor([view.width, view.height], dtype=torch.float64)

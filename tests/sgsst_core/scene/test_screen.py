@@ -1,4 +1,4 @@
-"""Tests of the clamping of colors to what screens can show."""
+"""Tests of clamping colors to the range of screens."""
 
 from __future__ import annotations
 

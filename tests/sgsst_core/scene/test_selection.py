@@ -1,4 +1,4 @@
-"""Tests of the selection of Gaussians by position or property."""
+"""Tests of selecting Gaussians by position or property."""
 
 import pytest
 import torch

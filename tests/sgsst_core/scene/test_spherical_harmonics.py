@@ -1,4 +1,4 @@
-"""Tests of spherical harmonics: the basis by its definition, the clamp and its gradient, worlds far from the origin."""
+"""Tests of spherical harmonics: the basis functions, the clamp and its gradient, and scenes far from the origin."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 
 
 def sphere(polar: int = 64, around: int = 128) -> tuple[Tensor, Tensor]:
-    """Return directions and weights of a product quadrature that is exact for these polynomials."""
+    """Return directions and weights of a quadrature on the sphere that is exact for products of basis functions."""
     step = 2 * math.pi / around
     x, w = torch.from_numpy(_gauss(polar)[0]), torch.from_numpy(_gauss(polar)[1])
     angle = torch.arange(around, dtype=torch.float64) * step
@@ -119,14 +119,14 @@ def far_from_the_origin() -> tuple[Scene, Camera]:
 
 
 def at_the_center() -> tuple[Scene, Camera]:
-    """Return Gaussians at the camera's center, and so near to it or far from it that squares underflow or overflow."""
+    """Return Gaussians at the camera's center, and at distances whose squares underflow or overflow."""
     scene = cloud(5, degree=3)
     means = torch.tensor([[0.0, 0, 0], [1e-38, 0, 0], [1e38, 1e38, 0], [0, 1e-45, -1e-45], [0, 0, -2.0]])
     return replace(scene, means=means), camera()
 
 
 def huge_coefficients() -> tuple[Scene, Camera]:
-    """Return Gaussians with huge coefficients, some of which cancel."""
+    """Return Gaussians with huge SH coefficients, some of which cancel each other."""
     scene = cloud(300, degree=3)
     sizes = torch.logspace(0, 36, 300)[:, None, None]
     return replace(scene, sh_rest=held(scene.sh_rest) * sizes), camera(pose=turned_pose())

@@ -1,4 +1,4 @@
-"""Tests of splitting Gaussians: moments are preserved, values stay finite, and nothing else changes."""
+"""Tests of splitting Gaussians: moments are preserved, values stay finite, and other Gaussians do not change."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def covariances(scene: Scene) -> Tensor:
 
 
 def mixtures(children: Scene, parents: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return mean [N, 3] and covariance [N, 3, 3] of each parent's children, weighted by opacity, in float64."""
+    """Return opacity-weighted mean [N, 3] and covariance [N, 3, 3] of each parent's children, in float64."""
     opacity = torch.sigmoid(children.opacities.double())
     share = opacity / torch.zeros(count, dtype=torch.float64).index_add(0, parents, opacity)[parents]
     mean = torch.zeros(count, 3, dtype=torch.float64).index_add(0, parents, share[:, None] * children.means.double())

@@ -1,4 +1,4 @@
-"""Tests of SH coefficients left in the scene's file: bit-identical to those in memory, and never from another file."""
+"""Tests of SH coefficients that are read on demand: bit-identical to those in memory, and never from another file."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make blocks so small that small scenes have many, some of which end within the scene."""
+    """Reduce the block size, so that small scenes have many blocks, including incomplete ones."""
     monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
     monkeypatch.setattr(ply, "READ_BYTES", 3000)
     monkeypatch.setattr(ply, "BLOCK_ROWS", 17)
 
 
 def both(path: Path, *, drop: bool = False) -> tuple[Scene, Scene]:
-    """Return a file's scene with its coefficients in the file, and in memory."""
+    """Read a scene file twice: with SH coefficients left in the file, and with SH coefficients in memory."""
     stored = read_scene(path, drop_invalid=drop, held_bytes=0).scene
     plain = read_scene(path, drop_invalid=drop).scene
     assert isinstance(stored.sh_rest, StoredHarmonics)
@@ -52,7 +52,7 @@ def written(folder: Path, count: int = 100, degree: int = 3) -> Path:
 
 
 def rewritten(path: Path, comment: bytes, extra: tuple[str, ...], position: int, elements: bytes) -> None:
-    """Write another file of the same scene, with a longer header, extra properties or an element in front."""
+    """Write another file of the same scene, with a comment, extra properties or additional leading elements."""
     raw = path.read_bytes()
     head, _, body = raw.partition(b"end_header\n")
     old = np.frombuffer(body, [(line.split()[-1].decode(), "<f4") for line in head.splitlines() if b"property" in line])

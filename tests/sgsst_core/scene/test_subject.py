@@ -1,4 +1,4 @@
-"""Tests of the subject of a scene: outliers, needles and background do not count, and all of the object does."""
+"""Tests of detecting a scene's subject: the whole object, without outliers, needles and background."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the up direction: from the ground, from the base of a standing object, or else from convention."""
+"""Tests of estimating the up direction: from the ground, from the base of a standing object, or by convention."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def found(scene: Scene) -> Up:
 
 
 def degrees(up: Up, turn: Rotation) -> float:
-    """Return the angle between the estimated and the true up direction."""
+    """Return the angle in degrees between the estimated and the true up direction."""
     expected = torch.from_numpy(turn.apply(UP))
     return math.degrees(math.acos(min(1.0, float(up.direction @ expected))))
 
 
 def lamp() -> Scene:
-    """Return a ball on a thin pole over a narrow ground; the ground, not the longest axis, defines up."""
+    """Return a ball on a thin pole above a small ground. The ground defines the up direction, not the longest axis."""
     pole = box((-0.03, -1.0, -0.03), (0.03, 0.0, 0.03), 400)
     return joined(ground(), scene_of(torch.cat([pole, ball((0, -1.2, 0), 0.3, 900)])))
 

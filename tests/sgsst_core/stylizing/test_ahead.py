@@ -1,4 +1,4 @@
-"""Tests of photos that are read in advance, on a simulated GPU that must not wait for them."""
+"""Tests of reading photos in advance, on a simulated GPU that must not wait for them."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ STUCK = 60.0
 
 
 class Photos:
-    """Photos in files, with a record of which are read in which thread.
+    """Photo files, with a record of which photo was read in which thread.
 
     Args:
-        folder: Folder that they are written to.
+        folder: Folder that the photos are written to.
         broken: Index of a photo whose file is truncated.
         side: Side of the photos when read.
 
     Attributes:
-        asked: Indices in the order in which they were read.
-        here: Those of them that were read in the thread that made this object.
+        asked: Indices of the read photos, in order.
+        here: Indices of photos that were read in the thread that constructed this object.
     """
 
     def __init__(self, folder: Path, broken: int | None = None, side: int = SIDE) -> None:
@@ -76,7 +76,7 @@ class Photos:
         return load_photo(self._paths[index], self._cameras[index])
 
     def wait_for(self, count: int) -> None:
-        """Wait until `count` photos have been read."""
+        """Wait until `count` photos have been read in total."""
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.asked) >= count, STUCK), f"{self.asked} were read"
 
@@ -88,7 +88,7 @@ def counts() -> Iterator[Counts]:
 
 
 def make(weights: BackboneWeights, photos: Photos, **values: Any) -> Stylizer:
-    """Make a job with two scales in each step; content features are not cached unless `keep` is overridden."""
+    """Make a job with two scales per step. Content features are not cached unless `values` overrides `keep`."""
     options = {"steps_coarse": 0, "steps_sos": STEPS, "coarsest_side": 16, "position_weights": "off", "seed": SEED}
     settings = make_settings("paper", **{**options, "keep": ("content",), **values})
     views = cameras(VIEWS, SIDE, SIDE)
@@ -96,7 +96,7 @@ def make(weights: BackboneWeights, photos: Photos, **values: Any) -> Stylizer:
 
 
 def drawn() -> list[int]:
-    """Return the order of views in two rounds."""
+    """Return the indices of views in the order of the first two rounds."""
     generator = torch.Generator().manual_seed(SEED)
     return [int(i) for _ in range(2) for i in torch.randperm(VIEWS, generator=generator).flip(0)]
 

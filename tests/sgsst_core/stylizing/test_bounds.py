@@ -1,4 +1,4 @@
-"""Tests of whole jobs with colors kept within what screens can show."""
+"""Tests of whole jobs whose colors are clamped to the range of screens."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def make(weights: BackboneWeights, scene: Scene, regions: Regions | None = None,
 
 
 def bright_wall() -> Scene:
-    """Return a wall that extends beyond the views, with many colors that no screen can show."""
+    """Return a wall that extends beyond the views and has many colors outside of the range of screens."""
     scene = wall(60, 40, sh_degree=1)
     scene.sh_dc.mul_(2)
     return scene
@@ -102,7 +102,7 @@ def test_what_is_not_left_out_is_bounded_alike(tiny_weights: BackboneWeights) ->
 
 
 def adam(start: Tensor, gradients: list[Tensor], rate: float) -> Tensor:
-    """Run projected Adam (Kingma and Ba 2015, algorithm 1) in float64, by its definition."""
+    """Run Adam (Kingma and Ba 2015, algorithm 1) with a projection after each step, by its definition in float64."""
     colors, first, second = start.double(), torch.zeros(start.shape).double(), torch.zeros(start.shape).double()
     for step, gradient in enumerate(gradients, start=1):
         first = 0.9 * first + 0.1 * gradient.double()

@@ -1,4 +1,4 @@
-"""Tests that the choice of cached views, and so a job's result, depends on the steps alone if not all weights fit."""
+"""Tests of jobs whose blend weights do not all fit in memory: the choice of cached views is deterministic."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
-    """Make a job with memory for the blend weights of about half the views."""
+    """Make a job with enough memory for the blend weights of about half the views."""
     scene = wall()
     cached = CachedRasterizer(scene, precision="float32" if form == "float32" else "half")
     size = sum(cached.operator_bytes(camera) for camera in VIEWS) // 2

@@ -79,7 +79,7 @@ def kept(state: StylizerState) -> Checkpoint:
 
 
 def assert_same(expected: object, found: object) -> None:
-    """Assert equality field by field, with bit-identical tensors."""
+    """Assert that all fields of two objects are equal, and that tensors are bit-identical."""
     assert type(expected) is type(found)
     for name in type(expected).__dataclass_fields__:  # type: ignore[attr-defined]
         one, other = getattr(expected, name), getattr(found, name)
@@ -138,7 +138,7 @@ def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Che
 
 
 def with_terms(kept: Checkpoint, **terms: float) -> Checkpoint:
-    """Return a checkpoint whose single step has these loss terms."""
+    """Return a copy of a checkpoint whose history has a single step with these loss terms."""
     record = replace(kept.state.history[0], terms={0: LossTerms(**terms)})
     return replace(kept, state=replace(kept.state, history=[record]))
 

@@ -1,4 +1,4 @@
-"""Tests of color transport: against a plain version without sampling, and on degenerate distributions."""
+"""Tests of color transport against a plain version without sampling, and on degenerate distributions."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def weights(count: int, seed: int) -> Tensor:
 
 
 def plain(moved: Array, weight: Array, wanted: Array) -> Array:
-    """Transport all colors without sampling and without knots.
+    """Transport all colors by a reference implementation without sampling and interpolation.
 
-    Along each axis, a value is replaced by the target at the same cumulative weight.
+    Along each direction, a value is replaced by the target value at the same cumulative weight.
     """
     moved = moved.copy()
     for axes in (turn.numpy() for turn in _turns()):
@@ -45,7 +45,7 @@ def plain(moved: Array, weight: Array, wanted: Array) -> Array:
 
 
 def distance(first: Tensor, second: Tensor) -> float:
-    """Return the mean distance of the distributions' quantiles along many directions."""
+    """Return the mean distance between the quantiles of two color distributions along many directions."""
     directions = torch.randn(50, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     shares = torch.linspace(0, 1, 300, dtype=torch.float64)
     parts = [

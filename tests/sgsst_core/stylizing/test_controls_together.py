@@ -1,4 +1,4 @@
-"""Tests of controls that affect each other: regions of a refined scene, several styles in luminance, all at once."""
+"""Tests of combined controls: regions of a refined scene, several styles in luminance, and all controls at once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def halves() -> Regions:
-    """Return regions of the wall: left frozen, right with a style of its own, and the background between them."""
+    """Return regions of the wall: the left is frozen, the right has its own style, and the rest is background."""
     across = large_wall().means[:, 0]
     labels = torch.zeros(len(across), dtype=torch.uint8)
     labels[across < -0.5], labels[across > 0.5] = 1, 2

@@ -1,4 +1,4 @@
-"""Tests that steps with graphs of the loss are bit-identical on a simulated GPU, and need few launches."""
+"""Tests on a simulated GPU that steps with CUDA graphs of the loss are bit-identical, and need few launches."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def make(
     training_background: PlannedBackground = "background",
     **values: Any,
 ) -> Stylizer:
-    """Make a job of two views on two scales, with three steps in each phase by default."""
+    """Make a job with two views and two scales, and by default three steps per phase."""
     scene, views = ball(40) if scan else wall(10, 8), cameras(2, 48, 32)
     settings = make_settings(**{"coarsest_side": 16, "steps_coarse": 3, "steps_sos": 3, **values})
     survey = survey_views(scene, views, make_rasterizer("cpu", scene))

@@ -1,4 +1,4 @@
-"""Tests of the color transfer after the last step, for losses without statistics that would preserve the colors."""
+"""Tests of the color transfer after the last step, which is for losses without statistics that constrain colors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def settings_of(**values: Any) -> Settings:
 
 
 def in_bfloat16(weights: BackboneWeights) -> Stylizer:
-    """Make a job in bfloat16, planned by hand so that the precision does not depend on the processor."""
+    """Make a job in bfloat16 with a fixed plan, so that the precision does not depend on the processor."""
     scene, settings = wall(60, 40), settings_of()
     plan, _ = make_plan(scene, cameras(), settings, weights=weights)
     return Stylizer(replace(plan, precision="bfloat16"), scene, cameras(), style(), settings, weights=weights)

@@ -1,4 +1,4 @@
-"""Tests of whole jobs that change colors in luminance alone."""
+"""Tests of whole jobs that change only the luminance of colors."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def make(weights: BackboneWeights, scene: Scene, steps: int = 4, **values: Any) 
 
 
 def chroma_off(found: torch.Tensor, scene: Scene) -> float:
-    """Return the largest difference between the changes of a Gaussian's channels."""
+    """Return the largest difference between the changes of two color channels of a Gaussian."""
     change = found.double() - scene.sh_dc.double()
     size = torch.maximum(found.abs(), scene.sh_dc.abs()).amax(1, keepdim=True).clamp_min(1).double()
     return float(((change - change.mean(1, keepdim=True)).abs() / size).max())

@@ -1,4 +1,4 @@
-"""Tests that Adam's steps are bit-identical to PyTorch's, and that they load no unneeded modules."""
+"""Tests that the project's Adam is bit-identical to PyTorch's, and that it imports no unneeded modules."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STEPS = 6
 
 
 def gradients() -> list[Tensor]:
-    """Return gradients of very different sizes, 0 for Gaussians that a view does not show."""
+    """Return gradients of very different magnitudes, including zeros as for Gaussians outside of a view."""
     generator = torch.Generator().manual_seed(1)
     sizes = 10.0 ** torch.linspace(-18, 18, 90)[:, None]
     found = [torch.randn((90, 3), generator=generator) * sizes for _ in range(STEPS)]

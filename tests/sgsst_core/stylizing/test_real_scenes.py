@@ -1,4 +1,4 @@
-"""Tests of the whole method on real scenes: the loss falls on every scale, and on novel views."""
+"""Tests of the whole method on real scenes: the loss decreases at each scale, and on novel views."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Tests of refining a scene of large Gaussians: images stay, results repeat, and small Gaussians are not split."""
+"""Tests of refining a scene of large Gaussians: images hardly change, and only large Gaussians are split."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def large_wall() -> Scene:
-    """Return the wall of small Gaussians behind a dozen large faint ones and a needle."""
+    """Return the wall of small Gaussians, with a dozen large faint Gaussians and a needle in front of it."""
     behind = wall()
     before = wall(4, 3, 0)
     before = replace(
@@ -158,7 +158,7 @@ def test_footprints_and_pictures_are_those_of_the_fast_rasterizer() -> None:
 
 
 def on_a_rank(collectives: object, factor: float) -> Refinement | None:
-    """Refine the wall; the test of ranks runs this in other processes."""
+    """Refine the wall on one of several ranks, each of which runs this function in its own process."""
     weights = make_tiny_weights()
     return refine(
         large_wall(),

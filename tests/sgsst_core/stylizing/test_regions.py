@@ -1,4 +1,4 @@
-"""Tests of regions in the optimizer: which are frozen, which change, and toward which style."""
+"""Tests of jobs with regions: frozen regions do not change, and others approach their own styles."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def other_style() -> Tensor:
 
 
 def halves(scene: Scene, left: Region | None = None, right: Region | None = None) -> Regions:
-    """Return regions left and right of x = 0; the left one is the background."""
+    """Return the regions left and right of x = 0, of which the left one is the background."""
     labels = (scene.means[:, 0] >= 0).to(torch.uint8)
     return Regions((left or Region("rest"), right or Region("right", style=StyleMixture.of(other_style()))), labels)
 
@@ -140,7 +140,7 @@ def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
 
 
 def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights) -> None:
-    """It does not approach the other's; a flat dark and a flat bright image tell them apart."""
+    """A region does not approach another region's style; the styles are a uniform dark and a uniform bright image."""
     scene = wall()
     dark, bright = torch.full((40, 40, 3), 0.1), torch.full((40, 40, 3), 0.9)
     regions = halves(scene, right=Region("right", style=StyleMixture.of(bright)))

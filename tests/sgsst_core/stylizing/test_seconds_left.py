@@ -1,4 +1,4 @@
-"""Tests of the remaining time on simulated histories with known seconds."""
+"""Tests of the predicted remaining time, on simulated jobs whose steps take known times."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Told:
 def session(
     phases: list[ExpectedPhase], expected: list[ExpectedPhase], start: int = 0, views_per_step: int = 1, seed: int = 0
 ) -> list[Told]:
-    """Simulate the steps of a job from `start` on, in rounds of all views.
+    """Simulate the steps of a job from step `start` on, in rounds over all views.
 
-    Data of first visits are recomputed after `start`, as after resuming.
+    Each view's cached data are computed at its first visit after `start`, as after resuming.
     """
     chance = random.Random(seed)
     pace = SecondsLeft(expected, range(VIEWS), views_per_step)
@@ -59,7 +59,7 @@ def session(
 @pytest.mark.parametrize("start", [0, 7, 30, 40])
 @pytest.mark.parametrize("views_per_step", [1, 3])
 def test_where_steps_take_what_was_expected_nothing_is_off(start: int, views_per_step: int) -> None:
-    """The prediction is exact in both phases, also after resuming in the middle of either."""
+    """The prediction is exact in both phases, also after resuming in the middle of a phase."""
     told = session([COARSE, SOS], [COARSE, SOS], start, views_per_step)
     assert len(told) == 90 - start
     for entry in told:

@@ -1,4 +1,4 @@
-"""Tests that jobs with SH attenuation write the same colors that they optimize."""
+"""Tests that jobs with SH attenuation write exactly the colors that they have optimized."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def picture(height: int = 40, width: int = 60) -> torch.Tensor:
 
 
 def ramp(height: int, width: int, slope_y: float, slope_x: float) -> torch.Tensor:
-    """Return a linear ramp with 0.5 in the middle."""
+    """Return an image with a linear gradient and the value 0.5 at its center."""
     y = torch.arange(height) - (height - 1) / 2
     x = torch.arange(width) - (width - 1) / 2
     return (0.5 + slope_y * y[:, None] + slope_x * x).unsqueeze(2).expand(-1, -1, 3).contiguous()

@@ -1,4 +1,4 @@
-"""Tests of the optimizer loop, on scenes so small that a step is quick."""
+"""Tests of the optimization loop, on tiny scenes."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
 def test_tile_intersections_of_the_survey_are_not_built_again(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, cached_weights: str
 ) -> None:
-    """They are reduced to the Gaussians in view, and bit-identical to recomputed intersections."""
+    """The job reduces the plan's intersections to rendered Gaussians, bit-identical to recomputed intersections."""
     built: list[int] = []
 
     def build(scene: Scene, camera: Camera, **options: Any) -> TileIntersections:
@@ -109,7 +109,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, sc
 
 
 def test_phase_1_at_its_own_scale_has_the_same_gradient(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    """With little memory, phase 1 caches only the weights of the coarsest scale, which must change nothing else."""
+    """With little memory, phase 1 caches only the weights of the coarsest scale; results stay the same."""
     options: dict[str, Any] = {"steps_coarse": 20, "steps_sos": 2, "coarsest_side": 24, "memory_limit": 400_000}
     views = [resized(camera, 100) for camera in cameras(2)]
     lean = Stylizer.planned(scene, views, style(), make_settings(**options), weights=tiny_weights)
@@ -370,7 +370,7 @@ def test_stylize_leaves_the_scene_as_it_is(tiny_weights: BackboneWeights, scene:
 
 
 class ClockEvent:
-    """Event in a device's stream; the device finishes all work immediately."""
+    """Simulated event in the stream of a device that finishes all work immediately."""
 
     def record(self) -> None:
         self.at = time.perf_counter()
@@ -386,7 +386,7 @@ class ClockEvent:
 
 
 def test_a_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    """Parts are complete when the step is, as with a GPU's events."""
+    """The seconds of all parts are known when the step has finished, as with a GPU's events."""
     clock, events = (make(tiny_weights, scene) for _ in range(2))
     events.timer = events.loss.timer = Timer(event=ClockEvent)
     for _ in range(6):  # the last step is on all scales

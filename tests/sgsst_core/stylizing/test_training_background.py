@@ -1,4 +1,4 @@
-"""Tests of the training background of an object: it is determined by seed, step and view, and changes nothing else."""
+"""Tests of training backgrounds of object scans: seed, step and view determine them, and they affect nothing else."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Co
 def test_a_steps_gradient_is_that_of_a_job_with_this_background(
     tiny_weights: BackboneWeights, scales: list[int], kept: Literal["kept", "uncached"]
 ) -> None:
-    """This includes the content, whether or not its images are cached."""
+    """The content also gets the step's background, whether or not its images are cached."""
     keep = () if kept == "kept" else ("content",)
     drawn = make(tiny_weights, ball(), training_background="random", background=(0.1, 0.1, 0.5), keep=keep)
     fixed = make(tiny_weights, ball(), training_background="background", background=COLOR)

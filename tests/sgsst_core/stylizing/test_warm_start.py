@@ -1,4 +1,4 @@
-"""Tests of the warm start: the style's color distribution, or its mean and covariance alone."""
+"""Tests of initializing colors from the style's color distribution, or from its mean and covariance alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Start = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute weighted mean and covariance in plain loops."""
+    """Compute weighted mean and covariance of colors in plain loops."""
     share = weights / weights.sum()
     mean = (colors * share[:, None]).sum(0)
     covariance = torch.zeros(3, 3, dtype=torch.float64)

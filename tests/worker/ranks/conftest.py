@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def joined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Run a Ray cluster of one node that is configured with two GPUs, which do not exist, and 10 GB of memory."""
+    """Run a Ray cluster of one node that pretends to have two GPUs and 10 GB of memory."""
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
     monkeypatch.setenv("RAY_AUTH_TOKEN", cluster._SECRET)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")

@@ -42,9 +42,9 @@ class Fault:
 
     Attributes:
         rank: Rank at which the fault occurs.
-        place: Function during which it occurs.
-        call: Number of the call of that function, counted from 1.
-        what: Signal that is sent to the rank, or "full" for a full disk.
+        place: Name of the function during which the fault occurs.
+        call: Index of the function call during which the fault occurs, counted from 1.
+        what: Name of the signal that is sent to the rank, or "full" for a full disk.
         delay: Seconds from the start of the call to the signal.
     """
 
@@ -87,7 +87,7 @@ class Fault:
 
 
 class FaultyRank(RankProcess):
-    """Rank with the fault that is stored beside the job's output."""
+    """Rank that injects the fault that is stored beside the job's output."""
 
     def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
         if _file(task.request).exists():
@@ -109,7 +109,7 @@ def forget(request: StylizeRequest) -> None:
 
 
 def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
-    """Return a request with tiny views that uses all ranks, and write its inputs."""
+    """Write the inputs of a job with tiny views that uses all ranks, and return its request."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True, exist_ok=True)
     ply, cameras, style = write_files(inputs, wall())
@@ -164,7 +164,7 @@ def _places() -> dict[str, tuple[Any, str]]:
 
 
 class _full_disk:  # noqa: N801 (reads as the state that it makes)
-    """Simulation of a full disk: within the block, this process can write files of a few kilobytes only."""
+    """Simulation of a full disk: within the block, this process can only write files of a few kilobytes."""
 
     def __enter__(self) -> None:
         self._before = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -1,4 +1,4 @@
-"""Runner of functions on several gloo ranks: real processes of one thread each, which tests reuse."""
+"""Runner of functions on several gloo ranks, which are single-threaded processes that are reused by all tests."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def on_ranks(
     device: str = "cpu",
     host: str = "127.0.0.1",
 ) -> list[Any]:
-    """Run function(collectives, *arguments) on `size` ranks, and return the result of each. The first error is raised.
+    """Run function(collectives, *arguments) on `size` ranks, and return all results. Raise the first error of a rank.
 
-    The function and its arguments must be picklable. Exchanges time out after `timeout` seconds. With the device "cuda"
-    each rank has a simulated GPU. Rank 0 listens on the address `host`.
+    The function and its arguments must be picklable. Collective operations time out after `timeout` seconds. With the
+    device "cuda", each rank has a simulated GPU. Rank 0 listens on the address `host`.
     """
     address = f"{host}:{free_port()}"
     futures = [_pool().submit(_run, rank, size, address, timeout, device, function, arguments) for rank in range(size)]

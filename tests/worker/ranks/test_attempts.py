@@ -1,4 +1,4 @@
-"""Tests of jobs whose ranks are killed, suspended, disconnected or canceled: results equal an undisturbed run."""
+"""Tests that jobs with killed, suspended or disconnected ranks give the same results as an undisturbed run."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Heard:
 def run(
     request: StylizeRequest, cluster: Cluster, heard: Heard | None = None, fault: Fault | None = None, workers: int = 2
 ) -> RanksResult:
-    """Run a job on ranks, optionally with a fault. A checkpoint is written after almost every step."""
+    """Run a job on ranks, optionally with a fault, with a checkpoint after almost every step."""
     if fault is not None:
         fault.write(request)
     options = WorkerOptions(
@@ -107,7 +107,7 @@ def loss_of(ended: RanksResult) -> float:
 
 @pytest.fixture(scope="module")
 def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> tuple[float, bytes]:
-    """Return the loss and the file of a run on two ranks without a fault."""
+    """Return the final loss and the result file of a run on two ranks without a fault."""
     request = small_request(tmp_path_factory.mktemp("undisturbed"), STEPS)
     heard = Heard()
     ended = run(request, cluster, heard)

@@ -1,4 +1,4 @@
-"""Tests that controls for artists give the same result on several ranks as on one."""
+"""Tests that jobs with artistic controls give the same result on several ranks as on one rank."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that gradient, loss and run of several ranks equal those of one rank for any division of the work."""
+"""Tests that gradients, losses and whole jobs on several ranks equal those on one rank, for any division of work."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def gradient(
     style_loss: StyleLossName = "sos",
     regions: Regions | None = None,
 ) -> tuple[Tensor, float, list[bool]]:
-    """Compute color gradient [N, 3] and SOS loss of one view at two or three scales.
+    """Return the color gradient [N, 3] and the SOS loss of one view at two or three scales.
 
-    Also return which of this rank's tiles have cached activations.
+    Also return for each of this rank's tiles whether its activations are cached.
     """
     weights = comparing_pixels(tiny_weights())
     network = FeatureNetwork(weights, layers_of(style_loss, weights, content=True), dtype)

@@ -1,4 +1,4 @@
-"""Tests of the failure policy without processes: errors of the job, losses, and the number of attempts."""
+"""Tests of the decision whether a failed attempt is repeated, without running processes."""
 
 from __future__ import annotations
 

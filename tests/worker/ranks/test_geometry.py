@@ -1,4 +1,4 @@
-"""Tests that a scene is read once per machine, shared without leaks, and refused if memory is too small."""
+"""Tests that ranks read a scene once per machine, share it without leaks, and refuse it if memory is too small."""
 
 from __future__ import annotations
 
@@ -36,7 +36,12 @@ def digest(scene: Scene) -> str:
 
 
 def shared(collectives: Collectives, path: Path, drop: bool) -> tuple[str, bool, int, int, int]:
-    """Return a rank's digest of the scene, whether it read it, dropped rows, mappings, and leaked memory files."""
+    """Share a scene file among ranks, and return what this rank sees.
+
+    Returns:
+        Digest of the scene, whether this rank has read the file, and the numbers of dropped rows, mappings, and leaked
+        shared memory files.
+    """
     file, reader = read_shared_scene(path, collectives, drop_invalid=drop)
     maps = Path("/proc/self/maps").read_text().count("memfd:sgsst-scene")
     file.scene.sh_dc[0] += 1.0  # must not be visible to other ranks
@@ -90,7 +95,7 @@ def test_the_room_that_a_packed_scene_needs_is_that_of_its_floats(tmp_path: Path
 
 
 def shared_colors(collectives: Collectives, path: Path, drop: bool) -> tuple[bool, Tensor, Tensor]:
-    """Return whether SH coefficients stay in the file on this rank, the coefficients, and the colors of a view."""
+    """Return whether this rank leaves SH coefficients in the file, the coefficients, and the colors in a view."""
     with patch.object(ply, "HELD_BYTES", 0):
         scene = read_shared_scene(path, collectives, drop_invalid=drop)[0].scene
     stored = isinstance(scene.sh_rest, StoredHarmonics)
@@ -113,7 +118,7 @@ def test_harmonics_in_the_file_are_read_there_by_every_rank(tmp_path: Path, drop
 
 
 def refused(collectives: Collectives, path: Path) -> str:
-    """Return the error message of a rank."""
+    """Return the error message of a rank that refuses the scene."""
     with pytest.raises(SceneError) as caught:
         read_shared_scene(path, collectives)
     return str(caught.value)

@@ -1,4 +1,4 @@
-"""Tests that ranks end immediately and release their resources if the plan does not use them."""
+"""Tests that ranks that the plan does not use end immediately and release their resources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that the relay passes on each event of rank 0 once in any attempt, and tracks the progress of the job."""
+"""Tests that the relay forwards each event of rank 0 exactly once per attempt, and tracks the job's progress."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Told:
         self.relay.begin_attempt()
 
     def after(self, *statuses: RankStatus) -> list[tuple[str, object]]:
-        """Return the new events after these answers of rank 0."""
+        """Pass these status responses of rank 0 to the relay, and return the resulting events."""
         known = len(self.events)
         for status in statuses:
             self.relay.pass_on(status)

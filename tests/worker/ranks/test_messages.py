@@ -88,7 +88,7 @@ def test_what_no_message_can_hold_is_refused(value: Any) -> None:
 
 
 def message(value: Any) -> Tensor:
-    """Encode any JSON as a message."""
+    """Encode any JSON-serializable value as a message."""
     text = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
     return torch.frombuffer(bytearray(save({"json": text})), dtype=torch.uint8)
 

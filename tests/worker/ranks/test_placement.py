@@ -1,4 +1,4 @@
-"""Tests of the resources that ranks request from Ray: GPUs with host memory, or cores alone."""
+"""Tests of the resources that ranks request from Ray: a GPU and host memory, or only CPU cores."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_without_gpus_cores_alone_are_asked_for() -> None:
 
 @contextmanager
 def taken(memory: int) -> Iterator[None]:
-    """Reserve memory of the cluster, as another job would."""
+    """Reserve memory of the cluster within the block, as another job would."""
     from ray.util import placement_group, remove_placement_group
 
     group = placement_group([{"memory": memory}])

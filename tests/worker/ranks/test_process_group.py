@@ -64,7 +64,7 @@ def test_rows_are_gathered_and_scattered(ranks: int, covered: tuple[int, int]) -
 
 
 def features(rank: int) -> Tensor:
-    """Return features with a mean of 1e4 standard deviations, a constant channel, and a channel of zeros."""
+    """Return features whose means are 1e4 standard deviations, with one constant and one zero channel."""
     values = torch.randn(11 + 3 * rank, 7, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(rank))
     values[..., 1] += 1e4
     values[..., 2] = 3.7
@@ -200,7 +200,7 @@ def test_one_rank_has_nobody_to_tell() -> None:
 
 
 def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
-    """Return whether rank 1 waits for rank 0, which is three seconds late, with a timeout of one second."""
+    """Return whether rank 1, with a timeout of one second, waits for rank 0, which is three seconds late."""
     collectives.all_gather(None)
     if expected is not None:
         collectives.set_timeout_for(expected)

@@ -1,4 +1,4 @@
-"""Tests of the state that a rank sets before it starts: threads, GPU, precision of matrix products."""
+"""Tests of process-wide settings that a rank makes at startup: threads, GPU, precision of matrix products."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_gpu_has_its_number_before_it_is_made_the_current_one(monkeypatch: pyt
 
 
 def test_an_error_of_the_store_is_one_of_an_exchange() -> None:
-    """Such an error occurs if a rank is lost while the others form their group."""
+    """Such an error occurs if a rank is lost while the other ranks form their process group."""
     assert _failure(dist.DistStoreError("wait timeout")).echo
     assert not _failure(RuntimeError("wait timeout")).echo
 

@@ -1,4 +1,4 @@
-"""Tests on GPUs: NCCL ranks against one rank, and one GPU against the CPU."""
+"""Tests on GPUs: several ranks with NCCL against one rank, and one GPU against the CPU."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("vgg16_weights")]
 
 
 def gradient(collectives: Collectives, name: str) -> Tensor:
-    """Compute the color gradient [N, 3] of one view at two scales, as a step does on this machine's devices."""
+    """Compute the color gradient [N, 3] of one view at two scales, on the devices that a job would use."""
     scene = wall(sh_degree=1) if name == "wall" else ball()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=120, keep=("ranks",))
     stylizer = Stylizer.planned(
@@ -37,7 +37,7 @@ def gradient(collectives: Collectives, name: str) -> Tensor:
 
 @pytest.fixture
 def exact_convolutions() -> Any:
-    """Disable TensorFloat-32, which rounds to ten bits and would not allow comparisons at 1e-5."""
+    """Disable TF32, which rounds to ten bits and is too inaccurate for comparisons at 1e-5."""
     before = torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
     torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     yield
@@ -66,7 +66,7 @@ def test_nccl_ranks_give_the_gradient_of_one(name: str, tmp_path: Path, exact_co
 
 
 def merge_beside_other_work(rank: int, size: int, address: str, folder: str) -> None:
-    """Merge statistics of three scales at once, while the caller's stream reuses the memory that it may reuse."""
+    """Merge statistics of three scales concurrently, while the main stream reuses freed memory."""
     with process_group(rank, size, address, device=f"cuda:{rank}", timeout=timedelta(seconds=60)) as collectives:
         waiting = []
         for turn in range(3):

@@ -1,4 +1,4 @@
-"""Tests of ranks with a simulated CUDA device each, over gloo: result and waits of their steps."""
+"""Tests of ranks with simulated CUDA devices, over gloo: results and host synchronizations of their steps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEPS = 4
 
 
 def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int], str]:
-    """Run a few steps of one view at two scales; return colors, losses, waits, and device with rasterizer."""
+    """Run a few steps of one view at two scales; return colors, losses, synchronizations, and device and rasterizer."""
     settings = make_settings(steps_coarse=0, steps_sos=STEPS, coarsest_side=16, keep=("ranks",), rebalance=False)
     stylizer = Stylizer.planned(
         ball(60), cameras(1, 48, 32), style(), settings, weights=tiny_weights(), collectives=collectives
@@ -39,7 +39,7 @@ def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int],
 
 @pytest.mark.slow
 def test_two_ranks_make_the_steps_of_one_and_wait_once_in_each() -> None:
-    """Exchanges are not counted as waits for the device, since the communication library waits for other ranks."""
+    """Communication is not counted as host synchronization, because the library waits for other ranks anyway."""
     expected, losses, _, _ = run_steps(ALONE)
     first, second = on_ranks(2, run_steps, device="cuda")
     assert first[2][2:] == second[2][2:] == [1] * (STEPS - 2)
@@ -51,7 +51,7 @@ def test_two_ranks_make_the_steps_of_one_and_wait_once_in_each() -> None:
 
 
 def merge_three(collectives: Collectives) -> list[tuple[Tensor, Tensor]]:
-    """Merge statistics of three scales at once on the stream of exchanges."""
+    """Merge statistics of three scales concurrently on the communication stream."""
     own = torch.randn(9 + collectives.rank, 7, 16, generator=torch.Generator().manual_seed(collectives.rank))
     part = layer_statistics(own.to("cuda"))
     numbers = torch.ones(1, dtype=torch.float64, device="cuda")

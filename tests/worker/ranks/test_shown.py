@@ -1,4 +1,4 @@
-"""Tests of the gradient sum over ranks, which exchange only values of Gaussians in the view, and of the sent bytes."""
+"""Tests of the gradient sum over ranks, which only exchange gradients of Gaussians that the view shows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WIDTH, HEIGHT = 128, 96
 
 
 def make_views(collectives: Collectives, scene: Scene, camera: Camera, memory: int = 1 << 30) -> Views:
-    """Return views, which cache nothing if the memory is 0."""
+    """Return views with this memory budget for caches; they cache nothing if it is 0."""
     loss = SosLoss(FeatureNetwork(tiny_weights(), (*STYLE_LAYERS, CONTENT_LAYER)), collectives=collectives)
     rasterizer = make_rasterizer("cpu", scene)
     return Views(scene, [camera], rasterizer, loss, covered=[0], weighted=False, memory=memory, collectives=collectives)
@@ -43,7 +43,7 @@ def pixels(camera: Camera, seed: int) -> Tensor:
 
 
 def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[str, Any]:
-    """Return color gradients [N, 3] of two visits, with all values exchanged and with those of shown Gaussians only."""
+    """Return color gradients [N, 3] of two visits, with exchanges of all values and of shown Gaussians' values only."""
     found: dict[str, Any] = {}
     for name, memory in (("whole", 0), ("shown", 1 << 30)):
         views = make_views(collectives, scene, camera, memory)
@@ -94,7 +94,7 @@ def test_what_the_view_shows_gives_the_bits_of_the_whole_gradient(scene: Scene, 
 
 
 def test_a_band_that_shows_nothing_is_one() -> None:
-    """Check the assumption of the second case above."""
+    """Check the assumption of the second test case above."""
     scene, camera = upper(wall()), cameras(1, WIDTH, HEIGHT)[0]
     first, second = divide_rows(HEIGHT, 2)
     rasterizer = make_rasterizer("cpu", scene)

@@ -1,4 +1,4 @@
-"""Tests of the sockets of a job on several ranks: other machines cannot reach those of a job on one machine."""
+"""Tests of the sockets of ranks: if all ranks are on one machine, other machines cannot reach them."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ def _is_loopback(address: str) -> bool:
 
 
 def own_sockets(collectives: Collectives) -> list[str]:
-    """Return the addresses that a rank listens on while it is in its group."""
+    """Return the addresses that a rank listens on while it is a member of a process group."""
     collectives.all_gather(None)
     return listening(psutil.Process())
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2"])
 def test_ranks_listen_on_the_address_of_their_job_alone(host: str) -> None:
-    """Here 127.0.0.2 stands for the address of a cluster's interface."""
+    """In this test, 127.0.0.2 represents the address of a cluster's network interface."""
     first, second = on_ranks(2, own_sockets, host=host)
     assert host in first, "the ranks' store"
     assert {"127.0.0.1", host} >= {*first, *second}
@@ -83,7 +83,7 @@ class Evil:
 
 
 def send_raw(data: bytes, *, broadcast: bool) -> None:
-    """Send bytes in place of a message: their number, then the bytes, padded to the longest message."""
+    """Send raw bytes in place of a message: their number, then the bytes, padded to the longest message's length."""
     size, message = torch.tensor([len(data)]), torch.frombuffer(bytearray(data), dtype=torch.uint8)
     if broadcast:
         dist.broadcast(size, 0)
@@ -97,7 +97,7 @@ def send_raw(data: bytes, *, broadcast: bool) -> None:
 
 
 def receive(collectives: Collectives, path: Path, broadcast: bool) -> str:
-    """Return the error message of the rank that receives a pickle from the other one."""
+    """Send a pickle from one rank to the other, and return the error message of the receiver."""
     if collectives.rank == (0 if broadcast else 1):
         send_raw(pickle.dumps(Evil(path)), broadcast=broadcast)
         return ""

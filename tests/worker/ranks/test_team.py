@@ -1,4 +1,4 @@
-"""Tests of the team of ranks without a scene: participation, agreement and speeds."""
+"""Tests of the coordination of ranks, without a scene: participation, agreement of colors, and speeds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def plan(ranks: int) -> Plan:
 
 
 def drift(collectives: Collectives) -> list[str]:
-    """Check equal colors, then different colors twice, and return the error message."""
+    """Run the drift check on equal colors, then on different ones, and return its error message in a list."""
     team = Team(plan(2), make_settings(), collectives)
     colors, other = torch.zeros(3, 3), torch.full((3, 3), 1e-6 * collectives.rank)
     team.check_drift(DRIFT_STEPS, colors)
