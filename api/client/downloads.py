@@ -34,7 +34,7 @@ class Download:
         self._digest, self._hashed = hashlib.sha256(), 0
 
     def headers(self) -> dict[str, str]:
-        """Return the headers of the request, which resume the partial file."""
+        """Return Range headers that resume the partial file; empty without one."""
         self._done = self._part.stat().st_size if self._part.exists() else 0
         if not self._done or not self._stamp.exists():
             return {}

@@ -345,7 +345,7 @@ def progress_seconds(elapsed: float) -> float:
 
 
 def progress_record(message: Message, attempt: int) -> dict[str, Any]:
-    """Convert a message to the progress in a job's record; in the stage `planning`, one step is one view."""
+    """Convert a message to the progress entry of a job's record; in the stage `planning`, a step is a view."""
     step, total = message.get("step", 0), message.get("total", 0)
     return {
         "stage": message.get("stage", "coarse" if message["kind"] == "progress" else "starting"),

@@ -346,7 +346,7 @@ class Inputs:
 
 
 def hand_over(session: Session, receipt: str) -> None:
-    """Delete a receipt whose blobs are now held by a job of the same transaction."""
+    """Delete a receipt whose blobs are now held by a job created in this transaction."""
     session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{receipt}"))
     session.execute(delete(UploadRow).where(UploadRow.id == receipt))
 

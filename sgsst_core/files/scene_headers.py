@@ -249,7 +249,7 @@ def _spz_4(path: Path, head: bytes, size: int) -> SceneHeader:
 def _spz_header(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, tuple[int, ...]]:
     """Parse the header fields that all versions share.
 
-    Returns version, number of Gaussians, SH degree, fractional bits, and decompressed bytes of all sections.
+    Returns version, number of Gaussians, SH degree, fractional bits, and the decompressed size of each section.
     """
     if len(head) < 16:
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")

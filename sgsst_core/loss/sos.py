@@ -304,8 +304,8 @@ class SosLoss:
     def style_targets(self, style: Tensor | StyleMixture, view_size: Size) -> dict[int, ScaleTarget]:
         """Compute the style targets of all scales with a positive weight.
 
-        If a style image is so small that a layer has no cell at some scale, the layer is not compared at that scale. In
-        a mixture, the layer's target is computed from the images that have cells.
+        If a style image is so small that a layer's feature map is empty at some scale, the layer is not compared at
+        that scale. In a mixture, the layer's target is computed from the images with a feature map.
 
         Args:
             style: Image [H, W, 3] in 0..1, or a mixture of images.

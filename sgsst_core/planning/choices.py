@@ -84,7 +84,7 @@ def rendered_gaussians(optimized: Tensor, settings: Settings) -> Tensor:
 
 
 def pruned_gaussians(survey: Survey, seen: Tensor) -> Tensor:
-    """Return the mask [N] bool of Gaussians that a view shows but that are not rendered (not in `seen`)."""
+    """Return the mask [N] bool of pruned Gaussians: visible in a view, but excluded from rendering."""
     return ~seen & (survey.total_blend_weights > 0)
 
 

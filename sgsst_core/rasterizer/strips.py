@@ -28,9 +28,9 @@ class CountedStrips:
     """Sizes of a band's weights, counted before the weights are stored. Counting takes about as long as one render.
 
     Attributes:
-        items: [strips], items per strip.
-        pieces: [4 strips], pieces of 32 weights per block.
-        slot_items: [E], items of every pair of Gaussian and raster tile.
+        items: [strips], number of items in each strip.
+        pieces: [4 * strips], number of 32-weight pieces in each block.
+        slot_items: [E], number of items of each pair of Gaussian and raster tile.
     """
 
     def __init__(self, rasterizer: CpuRasterizer, camera: Camera, band: Rows) -> None:

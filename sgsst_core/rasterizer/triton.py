@@ -246,8 +246,8 @@ def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: 
     Args:
         gradient: [N, 3] float32.
         slots: [E, 3] float32; the slots of one Gaussian are contiguous.
-        first_slots: [V + 1] integers, first slot of each rank.
-        gaussians: [V] integers, row of `gradient` of each rank.
+        first_slots: [V + 1] integers, first slot of each visible Gaussian, in depth order.
+        gaussians: [V] integers, row of `gradient` of each visible Gaussian, in depth order.
     """
     from sgsst_core.rasterizer import triton_kernels as kernels
 

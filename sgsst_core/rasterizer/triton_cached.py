@@ -25,7 +25,7 @@ class CountedPieces:
 
     Attributes:
         pieces: P, number of pieces.
-        slot_pieces: [E] int32, pieces of every pair of Gaussian and raster tile.
+        slot_pieces: [E] int32, number of pieces of each pair of Gaussian and raster tile.
         block_pieces: [16 tiles] int32, pieces of every block in the band's tiles.
         masks: [E] int32, bit mask of the blocks of its tile in which each pair has weights.
         ends: [tiles] int64, entry of each tile after which all of its pixels are finished.

@@ -106,7 +106,7 @@ class ViewCache(Generic[L]):
             return self._before.take(camera) if self._before else None
 
     def limit(self, max_bytes: int) -> None:
-        """Set the memory budget, and remove the most recent entries that exceed it."""
+        """Set the memory budget, and evict the most recent entries until the rest fits."""
         with self._lock:
             self._max_bytes = max_bytes
             self._let_go(max_bytes)

@@ -1,4 +1,4 @@
-"""Colors of charts, contact sheets and pages, for light paper and dark screens."""
+"""Colors of charts, contact sheets and pages, for light and dark themes."""
 
 from __future__ import annotations
 

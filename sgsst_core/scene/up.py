@@ -63,7 +63,10 @@ class Up:
 
 
 def find_up(subject: Subject) -> Up:
-    """Find up from the ground, else from the subject's long axis and its wider end, else by convention (-y)."""
+    """Estimate the up direction.
+
+    It follows from the ground plane, else from the subject's long axis and its wider end, else from convention (-y).
+    """
     axes = _principal_axes(subject)
     ground = _ground(subject, [*axes.T, *torch.eye(3, dtype=torch.float64)])
     if ground is not None:

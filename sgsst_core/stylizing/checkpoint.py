@@ -226,10 +226,15 @@ def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
 
 
 def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
-    """Read a checkpoint of the job with this fingerprint; with `run`, only one written by that program run.
+    """Read a checkpoint of the job with this fingerprint.
+
+    Args:
+        path: File of the checkpoint.
+        job: Fingerprint of the job.
+        run: Program run that must have written it; None for any run.
 
     Raises:
-        CheckpointError: If the file is missing, corrupt, or from another job.
+        CheckpointError: If the file is missing or corrupt, or belongs to another job or run.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint to resume from. Start again without --resume.")

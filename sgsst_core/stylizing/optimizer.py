@@ -103,7 +103,7 @@ class ColorOptimizer:
 
     @torch.no_grad()
     def _constrain(self, largest: Tensor) -> None:
-        """Project colors to their constraints: range and chroma.
+        """Project colors onto their constraints: range and chroma.
 
         Frozen colors do not change. If the step was skipped, no color changes.
         """

@@ -111,7 +111,7 @@ class SecondsLeft:
             step: Number of steps completed in all sessions.
             queue: Remaining views of this round, next one first.
             measuring: Remaining seconds of measurements.
-            limit: Maximum remaining seconds of steps; None for no limit.
+            limit: Upper bound on the remaining step time in seconds; None for no bound.
         """
         seconds, start = 0.0, 0
         for phase in self._phases:
