@@ -1,6 +1,7 @@
 """Results in compressed formats, created on the first request and stored beside the PLY.
 
-`service.inspection.process` creates them in a child process with resource limits, so the API process never reads a scene.
+`service.inspection.process` creates them in a child process with resource limits, so that the API process
+never reads a scene.
 """
 
 from __future__ import annotations

@@ -100,7 +100,15 @@ def _of_sh_attenuation(probe: Probe, attenuation: float) -> Decision:
 
 
 def of_views(probe: Probe, plan: Plan, settings: Settings, work: Work, content_bytes: int) -> list[Decision]:
-    """Return the decisions about views and their pixels. `content_bytes` is the memory saved by dropping similar views."""
+    """Return the decisions about views and their pixels.
+
+    Args:
+        probe: Measurements of the job.
+        plan: Plan that the decisions describe.
+        settings: Settings of the job.
+        work: Work of one step.
+        content_bytes: Memory saved by dropping similar views.
+    """
     decisions = []
     total = len(probe.sizes)
     blind = total - len(plan.survey.covered)
