@@ -65,7 +65,7 @@ def test_ray_gives_no_gpus_on_a_machine_whose_memory_is_taken() -> None:
             fewer = reserve(2, 2 * GB)
             assert (len(fewer.groups), fewer.gpus) == (1, 1)
             fewer.release()
-        with taken(4 * GB), pytest.raises(NoRoomError, match=r"takes a core, a GPU and 7\.0 GB of memory"):
+        with taken(4 * GB), pytest.raises(NoRoomError, match=r"needs a core, a GPU and 7\.0 GB of memory"):
             reserve(2, 2 * GB)
         again = reserve(2, 2 * GB)
         assert len(again.groups) == 2, "what was waited for in vain is not asked for any more"
