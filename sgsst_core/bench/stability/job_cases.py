@@ -175,8 +175,8 @@ _SITUATIONS: dict[str, Callable[[], Situation]] = {
     "opacity 0 and 1": lambda: _job(lambda: _opacities(-80.0, 80.0, 0.0)),
     "opacity 1 alone": lambda: _job(lambda: _opacities(90.0)),
     "hardly any opacity": lambda: _job(lambda: _opacities(-5.4)),
-    "surround in the object's color": lambda: _scan(training_background="palette"),
-    "surround of random colors, style of one": lambda: _scan(training_background="random"),
+    "background in the object's color": lambda: _scan(training_background="palette"),
+    "random background colors, style of one color": lambda: _scan(training_background="random"),
     "scan of one color, warm start": lambda: _scan(warm_start=True, training_background="background"),
     "scan of one color, warm start in luminance": lambda: _scan(
         warm_start=True, training_background="palette", preserve_colors="luminance"

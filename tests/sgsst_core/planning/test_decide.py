@@ -129,7 +129,7 @@ def test_blind_and_similar_views_are_left_out() -> None:
     ("share", "wanted", "weighted"),
     [(0.3, "auto", True), (0.001, "auto", False), (0.3, "off", False), (0.0, "on", True)],
 )
-def test_position_weights_are_for_views_with_an_empty_surround(share: float, wanted: str, weighted: bool) -> None:
+def test_position_weights_are_for_views_with_an_empty_background(share: float, wanted: str, weighted: bool) -> None:
     plan = plan_of(probe(uncovered_share=share), position_weights=wanted)
     assert plan.weighted is weighted
     assert (line(plan, "position weights") is not None) is weighted
@@ -164,7 +164,7 @@ def test_what_is_behind_a_scan_and_what_its_colors_begin_with(
             assert ("50.0% of the views' pixels are uncovered" in found.reason) is (setting not in values and scan)
 
 
-def test_another_surround_each_time_costs_a_pass_for_content_and_the_early_end() -> None:
+def test_drawn_background_costs_a_pass_for_content_and_the_early_end() -> None:
     """Content features are recomputed for the new background at every visit, from cached images if they fit."""
     drawn, fixed = (
         plan_of(probe(uncovered_share=0.5), training_background=kind, early_stop=True)

@@ -317,7 +317,7 @@ def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(tiny_weights: Ba
         (wall, "standard", {"position_weights": "on"}, True),
     ],
 )
-def test_position_weights_are_for_views_with_an_empty_surround(
+def test_position_weights_are_for_views_with_an_empty_background(
     tiny_weights: BackboneWeights, thing: Any, preset: PresetName, values: dict[str, Any], weighted: bool
 ) -> None:
     stylizer = make(tiny_weights, thing(), preset=preset, **values)
