@@ -70,6 +70,7 @@ def fsck(
     Exit code: 0 if nothing was found, else the sum of 4 (missing files), 8 (damaged), 16 (orphaned) and 32 (the
     database was rolled back).
     """
+    _check_database_exists(data)
     store = _open_store(data)
     from service.fsck import FileCheck
 
@@ -90,6 +91,19 @@ def fsck(
     code = sum(_FSCK_CODES[kind] for kind in set(kinds)) + (_FSCK_ROLLED_BACK if store.database.rolled_back else 0)
     store.close()
     raise typer.Exit(code)
+
+
+def _check_database_exists(data: Path | None) -> None:
+    """Raise a SettingsError if the folder has no SQLite database: opening one would create it, without findings."""
+    from sqlalchemy.engine import make_url
+
+    from sgsst_core.errors import SettingsError
+
+    if data is not None:
+        os.environ["SGSST_DATA"] = str(data.absolute())
+    url = make_url(_service_settings().database_url)
+    if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():
+        raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
 
 
 def create_key(

@@ -240,3 +240,13 @@ def test_a_lost_file_is_known_by_its_code(service: Files) -> None:
     sha256 = name.split("/")[2].partition("-")[0]
     with pytest.raises(LostFileError):
         service.blobs.objects.check(name, sha256)
+
+
+def test_a_folder_without_a_service_is_refused_and_left_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("SGSST_DATABASE", raising=False)
+    monkeypatch.setenv("SGSST_DATA", str(tmp_path / "other"))
+    assert main(["fsck"]) == 2
+    assert "no database of the service" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
