@@ -1370,7 +1370,8 @@ def test_a_body_that_nobody_reads_has_to_end(service: Service) -> None:
 def test_a_body_that_ends_late_keeps_its_connection(service: Service) -> None:
     with connect(service) as connection:
         connection.sendall(lines("POST /livez HTTP/1.1\nContent-Length: 5"))
-        assert connection.recv(65536).startswith(b"HTTP/1.1 405 ")
+        head, _ = answer_on(connection)
+        assert head.startswith(b"HTTP/1.1 405 ")
         connection.sendall(b"12345" + lines("GET /livez HTTP/1.1\nConnection: close"))
         assert closed(connection).startswith(b"HTTP/1.1 200 OK")
 
