@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.orbit.cameras import orbit
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import orbit
 
 
 def read_views(source: str, scene: Scene, count: int, resolution: int) -> list[Camera]:

@@ -22,13 +22,13 @@ from benchmarks.machine import write_result
 from benchmarks.rasterizer import timed
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.ply import read_scene
+from sgsst_core.orbit.cameras import orbit
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import scene_colors
 

@@ -29,6 +29,7 @@ from benchmarks.rasterizer import DATA, generated_scene, timed
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.orbit.cameras import orbit
 from sgsst_core.planning.pictures import soft_picture
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -36,7 +37,6 @@ from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections, intersections_of_subset
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings

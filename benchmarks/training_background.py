@@ -23,13 +23,13 @@ from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene
+from sgsst_core.orbit.cameras import orbit
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import orbit
 from sgsst_core.stylizing.evaluation import mean_loss
 
 WAYS = ("background", "background+warm", "random", "random+warm", "palette", "palette+warm")

@@ -23,8 +23,8 @@ from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.loss.mixture import StyleMixture, normalized
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
+from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.orbit import Orbit, OrbitRequest, make_orbit
 from sgsst_core.planning.survey import nothing_seen, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread

@@ -20,8 +20,8 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import common_device, rasterizer_problem
 from sgsst_core.planning.progress import ShowPlanning
+from sgsst_core.refine.split import Refinement
 from sgsst_core.report.document import Sources
-from sgsst_core.scene.split import Refinement
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
 from sgsst_core.stylizing.refining import refine

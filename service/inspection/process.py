@@ -43,8 +43,8 @@ from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
+from sgsst_core.orbit.choice import Orbit
 from sgsst_core.paintings import STARRY_NIGHT
-from sgsst_core.planning.orbit import Orbit
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
 from sgsst_core.quality.packed import measure_packed

@@ -34,8 +34,8 @@ from sgsst_core.files.scene_headers import COEFFICIENTS, Form, PackedForm, Scene
 from sgsst_core.files.sh_attenuation import ShAttenuation, check_sh_attenuation
 from sgsst_core.files.splat import read_splat
 from sgsst_core.files.spz import read_spz, write_spz
+from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.split import Refinement, piece_counts
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
 #: Number of rows per block. 64k rows of 62 floats take only 16 MB. The columns of a block are copied from the CPU

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.scene.split import Refinement, parents_of
+from sgsst_core.refine.split import Refinement, parents_of
 
 
 @dataclass(frozen=True)

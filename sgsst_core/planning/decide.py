@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from sgsst_core.budget import memory_for
+from sgsst_core.decision import Decision
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.tiling import Tiling
@@ -35,7 +36,7 @@ from sgsst_core.planning.cost import (
 )
 from sgsst_core.planning.job import of_measuring, whole_job
 from sgsst_core.planning.memory import PeakMemory
-from sgsst_core.planning.plan import Decision, Plan, Prediction
+from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.probe import SAMPLED_VIEWS, Probe
 from sgsst_core.planning.ranks_model import IterationWork, RanksChoice, choose_ranks
 from sgsst_core.planning.visits import Visits

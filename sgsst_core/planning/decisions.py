@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from sgsst_core.decision import Decision
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.nearest import MOST_VECTORS
@@ -19,7 +20,7 @@ from sgsst_core.planning.choices import (
     pruned_gaussians,
 )
 from sgsst_core.planning.cost import OPTIMIZER_BYTES, LaunchCost, RasterCost, Work
-from sgsst_core.planning.plan import Decision, Plan
+from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.ranks_model import Link, RanksChoice
 from sgsst_core.planning.visits import MAP_BYTES, MAPS_OF_A_RENDER, Made, Visits

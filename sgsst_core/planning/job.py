@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from sgsst_core.decision import Decision
 from sgsst_core.planning.choices import pruned_gaussians
 from sgsst_core.planning.cost import Work
 from sgsst_core.planning.measuring import (
@@ -17,7 +18,7 @@ from sgsst_core.planning.measuring import (
     choose_loss_views,
     novel_view_seconds,
 )
-from sgsst_core.planning.plan import Decision, Plan, Prediction
+from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.probe import Probe
 from sgsst_core.planning.visits import RENDER, Visits
 from sgsst_core.settings import Settings

@@ -7,33 +7,13 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from sgsst_core.decision import Decision
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
-from sgsst_core.scene.split import Refinement
+from sgsst_core.refine.split import Refinement
 from sgsst_core.settings import CachedWeights, PlannedBackground, Precision
 
 Device = Literal["cpu", "cuda"]
-
-
-@dataclass(frozen=True)
-class Decision:
-    """One line of a plan.
-
-    Attributes:
-        item: Subject of the decision.
-        decision: Decision as text.
-        reason: Evidence for it.
-        seconds: Estimated seconds saved per iteration; None if unknown.
-        bytes: Memory saved in bytes; None if unknown.
-        error: Possible cost in accuracy; "none" if results change only by rounding.
-    """
-
-    item: str
-    decision: str
-    reason: str
-    seconds: float | None = None
-    bytes: int | None = None
-    error: str = "none"
 
 
 @dataclass(frozen=True)

@@ -11,19 +11,19 @@ from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
+from sgsst_core.orbit.choice import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.decisions import of_regions, of_styles
-from sgsst_core.planning.orbit import Orbit, orbit_decisions
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import PlanningContext, Probe, equip, measure
 from sgsst_core.planning.progress import ShowPlanning
 from sgsst_core.planning.ranks_model import probe_link
-from sgsst_core.planning.refine import refine_decision
 from sgsst_core.planning.survey import Survey, survey_views
+from sgsst_core.refine.choice import refine_decision
+from sgsst_core.refine.split import Refinement
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.split import Refinement
 from sgsst_core.settings import Settings
 from sgsst_core.timing import Timer
 
@@ -94,7 +94,7 @@ def make_plan(
         if regions is not None and resolved is not None:
             plan = replace(plan, decisions=(*of_regions(regions, resolved, plan, fitted), *plan.decisions))
         if orbit is not None:
-            plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, survey), *plan.decisions))
+            plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, survey.uncovered), *plan.decisions))
         if refinement is not None:
             decisions = (refine_decision(refinement, settings), *plan.decisions)
             plan = replace(plan, refinement=refinement, decisions=decisions)

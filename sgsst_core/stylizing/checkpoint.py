@@ -20,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from sgsst_core.decision import Decision
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
@@ -27,11 +28,11 @@ from sgsst_core.loss.feature_scale import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EV
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.plan import Decision, Plan, Prediction
+from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
+from sgsst_core.refine.split import Refinement
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.split import Refinement
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.evaluation import Evaluation

@@ -30,13 +30,13 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
 from sgsst_core.planning.probe import PlanningContext, equip
 from sgsst_core.planning.progress import ShowPlanning, progress_of
-from sgsst_core.planning.refine import LEAST_PSNR, Footprints, candidates, choose_pieces, disagreement, most_children
 from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, most_children
+from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
-from sgsst_core.scene.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.style_picture import prepared_style
 from sgsst_core.stylizing.warm_start import with_moments
@@ -291,6 +291,19 @@ class _Refining:
     def _sum(self, values: Tensor) -> Tensor:
         """Return the sum over all ranks."""
         return self._collectives.all_reduce(values.to(self._rasterizer.device)).cpu()
+
+
+def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how much of an image gradient [H, W, 3] cancels under each Gaussian, and its total: both [N] float64.
+
+    With gradients g and blend weights w, the total is sum |g| w over pixels and channels. Only |sum g w| of it remains
+    in the gradient of the Gaussian's color. The rest cancels, because the Gaussian's pixels disagree. Computing this
+    takes two passes of the rasterizer, for |g| and g. G-Style (Kovács, Hermosilla, Raidou 2024) also splits by gradient
+    magnitudes, which it accumulates over steps.
+    """
+    whole = rasterizer.color_gradient(image_gradient.abs(), camera).double()
+    summed = rasterizer.color_gradient(image_gradient, camera).double().abs()
+    return (whole - summed).clamp_min(0).sum(dim=1).cpu(), whole.sum(dim=1).cpu()
 
 
 def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:

@@ -17,9 +17,9 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.ply import read_scene, write_packed
 from sgsst_core.files.quantized import SH_C0
 from sgsst_core.files.scene_headers import SPLAT_BYTES, splat_rows
+from sgsst_core.orbit.cameras import orbit
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import orbit
 from tests.api.page.browser import Watched, decoded, psnr, rendered, serve_files, view_script
 from tests.small_scenes import cameras, wall, write_files
 

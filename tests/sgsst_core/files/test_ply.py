@@ -20,8 +20,8 @@ from plyfile import PlyData
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files import ply
 from sgsst_core.files.ply import read_scene, write_scene, write_stylized
+from sgsst_core.refine.split import Refinement, parents_of, piece_counts
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.split import Refinement, parents_of, piece_counts
 from sgsst_core.scene.stored_harmonics import held
 
 CODES = {"char": "b", "uchar": "B", "int16": "h", "ushort": "H", "int": "i", "uint32": "I", "float": "f", "double": "d"}

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 
+from sgsst_core.decision import Decision
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
@@ -18,7 +19,7 @@ from sgsst_core.planning.choices import uncached_rasterizer
 from sgsst_core.planning.cost import OPTIMIZER_BYTES, LaunchCost, RasterCost, Rate, gaussian_bytes
 from sgsst_core.planning.decide import LEAST_PASSES, decide
 from sgsst_core.planning.memory import MEASURING_BYTES, SHAPE_BYTES
-from sgsst_core.planning.plan import Decision, Plan
+from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import Machine, NetworkFacts, Probe, SceneFacts
 from sgsst_core.planning.pruning import ImageError
 from sgsst_core.planning.ranks_model import Link

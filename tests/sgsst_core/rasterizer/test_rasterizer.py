@@ -22,6 +22,7 @@ from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene
+from sgsst_core.orbit.cameras import orbit
 from sgsst_core.rasterizer import Rows, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -31,7 +32,6 @@ from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, check_in
 from sgsst_core.rasterizer.vectors import as_float
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (

@@ -10,13 +10,14 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from sgsst_core.decision import Decision
 from sgsst_core.errors import CheckpointError, OutputError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.terms import TERMS, LossTerms
-from sgsst_core.planning.plan import Decision, Plan, Prediction
+from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
-from sgsst_core.scene.split import Refinement
+from sgsst_core.refine.split import Refinement
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing import checkpoint
 from sgsst_core.stylizing.checkpoint import (

@@ -8,8 +8,8 @@ import torch
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Region, Regions
+from sgsst_core.refine.split import parents_of, piece_counts
 from sgsst_core.scene.luminance import luminance
-from sgsst_core.scene.split import parents_of, piece_counts
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer

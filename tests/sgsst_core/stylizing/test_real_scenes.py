@@ -6,8 +6,8 @@ from sgsst_core import Stylizer, make_settings, run
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.ply import read_scene
+from sgsst_core.orbit.cameras import orbit
 from sgsst_core.scene.camera import resized, spread
-from sgsst_core.scene.orbit import orbit
 
 SIDE = 200
 

@@ -9,18 +9,19 @@ import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.difference import psnr
-from sgsst_core.planning import refine as choice
-from sgsst_core.planning.refine import LEAST_PSNR
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.refine import choice
+from sgsst_core.refine.choice import LEAST_PSNR
+from sgsst_core.refine.split import Refinement, parents_of, piece_counts
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.split import Refinement, parents_of, piece_counts
 from sgsst_core.settings import Settings, make_settings
 from sgsst_core.stylizing import refining
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.refining import refine, refined, render, spread_evenly
+from sgsst_core.stylizing.refining import disagreement, refine, refined, render, spread_evenly
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights as make_tiny_weights
+from tests.sgsst_core.splat_scenes import camera, cloud
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -54,6 +55,27 @@ def made(weights: BackboneWeights, factor: float, scene: Scene | None = None) ->
     return found
 
 
+def test_disagreement_is_what_cancels_pixel_by_pixel() -> None:
+    scene, view = cloud(60), camera(20, 14, focal=18.0)
+    generator = torch.Generator().manual_seed(0)
+    gradient = torch.randn(14, 20, 3, generator=generator, dtype=torch.float64)
+    reference = ReferenceRasterizer(scene)
+    cancels, there_is = disagreement(reference, view, gradient)
+    operator = []  # blend weights [pixels, N], pixel by pixel
+    for pixel in range(14 * 20):
+        one = torch.zeros(14 * 20, 3, dtype=torch.float64)
+        one[pixel] = 1
+        operator.append(reference.color_gradient(one.reshape(14, 20, 3), view)[:, 0])
+    weights, flat = torch.stack(operator), gradient.reshape(-1, 3)
+    whole, summed = weights.T @ flat.abs(), (weights.T @ flat).abs()
+    assert torch.allclose(there_is, whole.sum(dim=1), atol=1e-12)
+    assert torch.allclose(cancels, (whole - summed).sum(dim=1), atol=1e-12)
+    fast = disagreement(CpuRasterizer(scene), view, gradient.float())
+    assert torch.allclose(fast[0], cancels, atol=1e-4 * float(there_is.max()))
+    uniform = disagreement(reference, view, torch.full((14, 20, 3), -0.3, dtype=torch.float64))
+    assert torch.allclose(uniform[0], torch.zeros(60, dtype=torch.float64), atol=1e-12)
+
+
 @pytest.mark.parametrize("factor", [1.2, 2.0, 4.0])
 def test_large_gaussians_are_cut_within_the_budget_and_the_picture_stays(
     tiny_weights: BackboneWeights, factor: float
@@ -68,8 +90,8 @@ def test_large_gaussians_are_cut_within_the_budget_and_the_picture_stays(
     assert found.psnr >= found.lowest_psnr >= LEAST_PSNR
     cut = refined(scene, found)
     errors = []
-    for camera in cameras():  # with the slow float64 rasterizer
-        before, after = (render(each, ReferenceRasterizer(each), camera).clamp(0, 1) for each in (scene, cut))
+    for view in cameras():  # with the slow float64 rasterizer
+        before, after = (render(each, ReferenceRasterizer(each), view).clamp(0, 1) for each in (scene, cut))
         errors.append(float((after - before).square().mean()))
     assert psnr(max(errors)) == pytest.approx(found.lowest_psnr, abs=0.01)
     assert psnr(sum(errors) / len(errors)) == pytest.approx(found.psnr, abs=0.01)

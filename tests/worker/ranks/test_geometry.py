@@ -17,9 +17,9 @@ from sgsst_core.errors import SceneError, SceneTooLargeError
 from sgsst_core.files import ply
 from sgsst_core.files.ply import read_scene, write_packed, write_scene
 from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm
+from sgsst_core.orbit.cameras import orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import orbit
 from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall

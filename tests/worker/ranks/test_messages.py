@@ -14,9 +14,10 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
+from sgsst_core.decision import Decision
 from sgsst_core.errors import SceneError
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.plan import Decision, Prediction
+from sgsst_core.planning.plan import Prediction
 from sgsst_core.scene.camera import Camera
 from worker.ranks.messages import decode, encode
 from worker.request import Outputs

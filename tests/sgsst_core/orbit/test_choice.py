@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 
+from sgsst_core.decision import Decision
 from sgsst_core.files.ply import read_scene
-from sgsst_core.planning.orbit import Orbit, OrbitRequest, make_orbit, orbit_decisions
-from sgsst_core.planning.plan import Decision
+from sgsst_core.orbit.cameras import middle_of
+from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit, orbit_decisions
+from sgsst_core.orbit.subject import find_subject
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import middle_of
-from sgsst_core.scene.subject import find_subject
 from sgsst_core.settings import make_settings
-from tests.sgsst_core.scene.objects import ball, box, figure, ground, joined, scene_of
+from tests.sgsst_core.orbit.objects import ball, box, figure, ground, joined, scene_of
 
 
 def elevations(scene: Scene, made: Orbit) -> list[float]:
@@ -35,7 +35,7 @@ def told(scene: Scene, made: Orbit) -> dict[str, Decision]:
     """Return the plan's decisions about an orbit by item."""
     cameras = [resized(camera, 64) for camera in made.cameras]
     survey = survey_views(scene, cameras, make_rasterizer("cpu", scene))
-    return {decision.item: decision for decision in orbit_decisions(made, cameras, survey)}
+    return {decision.item: decision for decision in orbit_decisions(made, cameras, survey.uncovered)}
 
 
 def table() -> Scene:

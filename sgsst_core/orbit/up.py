@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from sgsst_core.scene.subject import Subject, quantile
+from sgsst_core.orbit.subject import Subject, quantile
 
 #: Up in most captures, since COLMAP's y points down.
 USUAL_UP = (0.0, -1.0, 0.0)

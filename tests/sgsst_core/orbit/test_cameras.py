@@ -15,12 +15,12 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.ply import read_scene
+from sgsst_core.orbit.cameras import RESOLUTION, middle_of, orbit, share_out
+from sgsst_core.orbit.subject import find_subject
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.orbit import RESOLUTION, middle_of, orbit, share_out
-from sgsst_core.scene.subject import find_subject
-from tests.sgsst_core.scene.objects import UP, box, figure, joined, moved, scene_of
+from tests.sgsst_core.orbit.objects import UP, box, figure, joined, moved, scene_of
 
 PIXELS = RESOLUTION**2 * 3 / 4
 TURN = Rotation.from_euler("xyz", [40, 65, -130], degrees=True)

@@ -1,4 +1,4 @@
-"""Tests of planning to split Gaussians: projected sizes, disagreement measure, and budget."""
+"""Tests of the choice of Gaussians to split: projected sizes, and budget."""
 
 from __future__ import annotations
 
@@ -8,20 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgsst_core.constants import EPS2D
-from sgsst_core.planning.refine import (
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.projection import Column, project
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.refine.choice import (
     SIZES,
     Footprints,
     axes_in_view,
     candidates,
     choose_pieces,
-    disagreement,
     most_children,
     refine_decision,
 )
-from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.projection import Column, project
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.scene.split import Refinement, piece_counts
+from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 
@@ -44,27 +43,6 @@ def test_axes_in_a_view_add_up_to_the_projected_covariance() -> None:
     assert torch.allclose(lengths.square().sum(dim=1), expected, rtol=1e-5, atol=1e-5)
     depth = (scene.means.double() @ view.world_to_camera[2, :3].double() + view.world_to_camera[2, 3])[rows[inside]]
     assert torch.allclose(reach, scene.scales[rows[inside]].double().exp().amax(dim=1) / depth)
-
-
-def test_disagreement_is_what_cancels_pixel_by_pixel() -> None:
-    scene, view = cloud(60), camera(20, 14, focal=18.0)
-    generator = torch.Generator().manual_seed(0)
-    gradient = torch.randn(14, 20, 3, generator=generator, dtype=torch.float64)
-    reference = ReferenceRasterizer(scene)
-    cancels, there_is = disagreement(reference, view, gradient)
-    operator = []  # blend weights [pixels, N], pixel by pixel
-    for pixel in range(14 * 20):
-        one = torch.zeros(14 * 20, 3, dtype=torch.float64)
-        one[pixel] = 1
-        operator.append(reference.color_gradient(one.reshape(14, 20, 3), view)[:, 0])
-    weights, flat = torch.stack(operator), gradient.reshape(-1, 3)
-    whole, summed = weights.T @ flat.abs(), (weights.T @ flat).abs()
-    assert torch.allclose(there_is, whole.sum(dim=1), atol=1e-12)
-    assert torch.allclose(cancels, (whole - summed).sum(dim=1), atol=1e-12)
-    fast = disagreement(CpuRasterizer(scene), view, gradient.float())
-    assert torch.allclose(fast[0], cancels, atol=1e-4 * float(there_is.max()))
-    uniform = disagreement(reference, view, torch.full((14, 20, 3), -0.3, dtype=torch.float64))
-    assert torch.allclose(uniform[0], torch.zeros(60, dtype=torch.float64), atol=1e-12)
 
 
 def test_footprints_are_means_over_what_views_show() -> None:

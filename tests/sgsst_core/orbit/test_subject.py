@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from sgsst_core.scene.subject import find_subject, quantile, spread_directions
-from tests.sgsst_core.scene.objects import ball, box, figure, joined, scene_of
+from sgsst_core.orbit.subject import find_subject, quantile, spread_directions
+from tests.sgsst_core.orbit.objects import ball, box, figure, joined, scene_of
 
 OBJECT = scene_of(box((-0.5, -1.5, -0.3), (0.5, 1.5, 0.3), 3000))
 

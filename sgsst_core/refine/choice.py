@@ -9,12 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.planning.plan import Decision
-from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.decision import Decision
+from sgsst_core.refine.split import MOST_PIECES, Refinement, piece_counts, pieces_to
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rotations import rotations
-from sgsst_core.scene.split import MOST_PIECES, Refinement, piece_counts, pieces_to
 from sgsst_core.settings import Settings
 
 #: Minimum PSNR of the unstylized image in dB, in each measured view.
@@ -90,19 +89,6 @@ def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Te
     lengths = torch.hypot(across, down)
     reach = deviations.amax(dim=1) / depth[:, 0]
     return lengths.nan_to_num(torch.inf), reach.nan_to_num(torch.inf)
-
-
-def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how much of an image gradient [H, W, 3] cancels under each Gaussian, and its total: both [N] float64.
-
-    With gradients g and blend weights w, the total is sum |g| w over pixels and channels. Only |sum g w| of it remains
-    in the gradient of the Gaussian's color. The rest cancels, because the Gaussian's pixels disagree. Computing this
-    takes two passes of the rasterizer, for |g| and g. G-Style (Kovács, Hermosilla, Raidou 2024) also splits by gradient
-    magnitudes, which it accumulates over steps.
-    """
-    whole = rasterizer.color_gradient(image_gradient.abs(), camera).double()
-    summed = rasterizer.color_gradient(image_gradient, camera).double().abs()
-    return (whole - summed).clamp_min(0).sum(dim=1).cpu(), whole.sum(dim=1).cpu()
 
 
 def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, there_is: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rotations import rotations
 
 #: Maximum number of pieces along one axis. Isotropic Gaussians get at most a third as many per axis, because the number
-#: of their children is limited too (`planning.refine`).
+#: of their children is limited too (`choice.most_children`).
 MOST_PIECES = 32
 #: K pieces are smaller than the parent by the factor r = _SLOPE K + _START, for which the mixture is within 3 % of the
 #: parent.

@@ -15,10 +15,8 @@ from torch import Tensor
 
 from sgsst_core.files.ply import read_scene, write_scene
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.scene import split as module
-from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.rotations import unit_rotations
-from sgsst_core.scene.split import (
+from sgsst_core.refine import split as module
+from sgsst_core.refine.split import (
     MOST_PIECES,
     can_be_split,
     mixture_error,
@@ -29,6 +27,8 @@ from sgsst_core.scene.split import (
     split,
     split_axis,
 )
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rotations import unit_rotations
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.splat_scenes import camera, cloud, single
 

@@ -10,14 +10,13 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import NEAR
-from sgsst_core.planning.plan import Decision
-from sgsst_core.planning.survey import Survey
+from sgsst_core.decision import Decision
+from sgsst_core.orbit.cameras import ELEVATION, middle_of, orbit
+from sgsst_core.orbit.subject import Subject, find_subject
+from sgsst_core.orbit.up import Up, find_up
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene, sampled
-from sgsst_core.scene.orbit import ELEVATION, middle_of, orbit
-from sgsst_core.scene.subject import Subject, find_subject
-from sgsst_core.scene.up import Up, find_up
 
 #: Elevations in degrees of rings that may be added to the first. Rings below the horizon are only for an isolated
 #: subject, without ground or background.
@@ -94,7 +93,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
     """Create the requested orbit, and choose everything that was not specified.
 
     Raises:
-        SettingsError: If an option is out of range; see `scene.orbit.orbit`.
+        SettingsError: If an option is out of range; see `cameras.orbit`.
     """
     subject = find_subject(scene)
     up = find_up(subject) if request.up is None else _asked_up(request.up)
@@ -128,13 +127,13 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
     )
 
 
-def orbit_decisions(made: Orbit, cameras: Sequence[Camera], survey: Survey) -> list[Decision]:
+def orbit_decisions(made: Orbit, cameras: Sequence[Camera], uncovered: Sequence[float] | None) -> list[Decision]:
     """Return the plan's lines about an orbit.
 
     Args:
         made: The orbit.
         cameras: Its cameras at the sizes used for stylization.
-        survey: Survey of their views.
+        uncovered: Fraction of uncovered pixels of each view; None if unknown.
     """
     decisions = [Decision("up", made.up.name, made.up.reason)]
     angles = _listed([f"{angle:g}" for angle in made.elevations])
@@ -151,8 +150,8 @@ def orbit_decisions(made: Orbit, cameras: Sequence[Camera], survey: Survey) -> l
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     shapes = f"{sizes[0][0]}x{sizes[0][1]}"
     shapes += f" to {sizes[-1][0]}x{sizes[-1][1]}, {len(sizes)} shapes" if len(sizes) > 1 else ""
-    if survey.uncovered is not None:
-        covered = [1 - share for share in survey.uncovered]
+    if uncovered is not None:
+        covered = [1 - share for share in uncovered]
         shown = f"the scene covers {sum(covered) / len(covered):.0%} of their pixels (at least {min(covered):.0%})"
         decisions.append(Decision("frames", shapes, f"fitted to the subject's shape; {shown}"))
     return decisions + _doubts(made)

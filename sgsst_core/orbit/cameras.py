@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
+from sgsst_core.orbit.subject import Subject, find_subject
+from sgsst_core.orbit.up import USUAL_UP
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.subject import Subject, find_subject
-from sgsst_core.scene.up import USUAL_UP
 
 #: Default resolution of an orbit: its views have as many pixels as 1024x768.
 RESOLUTION = 1024

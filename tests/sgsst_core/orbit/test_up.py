@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from sgsst_core.orbit.subject import find_subject
+from sgsst_core.orbit.up import Up, find_up
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.subject import find_subject
-from sgsst_core.scene.up import Up, find_up
-from tests.sgsst_core.scene.objects import UP, ball, box, figure, ground, joined, moved, scene_of
+from tests.sgsst_core.orbit.objects import UP, ball, box, figure, ground, joined, moved, scene_of
 
 TURNS = [Rotation.identity(), Rotation.from_euler("xyz", [40, 65, -130], degrees=True), Rotation.from_rotvec([2, 1, 1])]
 

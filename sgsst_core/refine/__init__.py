@@ -1,0 +1,1 @@
+"""Refinement: split Gaussians that are large in the views into smaller ones."""
