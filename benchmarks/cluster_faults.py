@@ -41,7 +41,7 @@ import httpx
 
 from benchmarks.cluster_hosts import Host, Network, missing
 from benchmarks.machine import write_result
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from tests.api.service import undisturbed
 from tests.networks import install_tiny_weights
 from tests.small_scenes import wall, write_files

@@ -21,7 +21,7 @@ from torch import Tensor
 from benchmarks.machine import write_result
 from benchmarks.rasterizer import timed
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer

@@ -27,7 +27,7 @@ from sgsst_core import Stylizer, make_settings
 from sgsst_core.bench.quality import make_novel_views
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import load_image
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.loss.feature_scale import with_scales
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips

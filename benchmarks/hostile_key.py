@@ -30,7 +30,7 @@ from benchmarks.machine import write_result
 from benchmarks.service_load import spread
 from service.settings import ServiceSettings
 from service.store import open_store
-from sgsst_core.files.ply import write_scene
+from sgsst_core.files.scene_file import write_scene
 from tests.api.service import Service
 from tests.small_scenes import cameras, wall, write_files
 

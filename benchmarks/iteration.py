@@ -13,7 +13,7 @@ from benchmarks.rasterizer import resized
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.scene.camera import spread
 
 NETWORK = ("vgg_forward", "vgg_backward", "network")

@@ -28,7 +28,7 @@ from benchmarks.machine import write_result
 from benchmarks.rasterizer import DATA, generated_scene, timed
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.planning.pictures import soft_picture
 from sgsst_core.planning.planner import make_plan

@@ -23,7 +23,7 @@ from benchmarks.cameras import read_views
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.report.machine import peak_memory
 from sgsst_core.scene.camera import Camera
 

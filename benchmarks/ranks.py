@@ -27,7 +27,7 @@ from sgsst_core import Stylizer, make_settings
 from sgsst_core.features.partition import Rectangle, computed_twice
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide, loads
 from sgsst_core.planning.cost import pieces_of

@@ -30,7 +30,7 @@ from typing import Any
 import httpx
 
 from benchmarks.machine import write_result
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from tests.api.service import Service, undisturbed
 from tests.small_scenes import wall, write_files
 

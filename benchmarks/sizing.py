@@ -21,7 +21,7 @@ from api.cli.demo_scene import build_demo
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.cost import RasterCost, gaussian_bytes
 from sgsst_core.planning.decide import decide

@@ -22,7 +22,7 @@ import torch
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips

@@ -21,7 +21,7 @@ from PIL import Image
 
 from benchmarks.cameras import read_views
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, between, resized
 from sgsst_core.scene.gaussians import Scene

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from sgsst_core.files.ply import write_scene
+from sgsst_core.files.scene_file import write_scene
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.pictures import picture

@@ -13,7 +13,7 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers
 from sgsst_core.files.colors import write_colors
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.ply import write_packed, write_stylized
+from sgsst_core.files.scene_file import write_packed, write_stylized
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements

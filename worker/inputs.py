@@ -18,7 +18,7 @@ from sgsst_core.errors import SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import check_photos, load_image, load_photo
-from sgsst_core.files.ply import SceneFile, read_scene
+from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.loss.mixture import StyleMixture, normalized
 from sgsst_core.loss.regions import Regions

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from sgsst_core.errors import CheckpointError
-from sgsst_core.files.ply import SceneFile
+from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import GPU_RASTERIZERS
 from sgsst_core.planning.plan import Plan

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from sgsst_core.errors import ImageError, SceneError
 from sgsst_core.files.images import find_masks, load_photo
-from sgsst_core.files.ply import SceneFile
 from sgsst_core.files.ply_columns import read_property
+from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Region, Regions, check_regions
 from sgsst_core.planning.masks import count_votes, decide_by_votes

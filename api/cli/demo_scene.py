@@ -25,7 +25,7 @@ from skimage import data
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder
-from sgsst_core.files.ply import write_scene
+from sgsst_core.files.scene_file import write_scene
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.scene.gaussians import Scene
 

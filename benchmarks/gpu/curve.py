@@ -80,7 +80,7 @@ def inputs(side: int, *, small: bool) -> tuple[str, Scene, list[Camera]]:
     if not small and (folder / "cameras.json").is_file():
         try:
             from sgsst_core.files.camera_files import read_cameras
-            from sgsst_core.files.ply import read_scene
+            from sgsst_core.files.scene_file import read_scene
         except ModuleNotFoundError as error:
             return f"synthetic, for want of {error.name}", *synthetic(side, small)
         scene = read_scene(folder / "point_cloud.ply").scene

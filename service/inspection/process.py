@@ -35,9 +35,9 @@ from sgsst_core.compiled import keep_in_memory, kernel_folders
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.cache_folder import cache_folder
+from sgsst_core.files.formats.ply_header import element_offsets
 from sgsst_core.files.images import check_photos, image_size, load_image
-from sgsst_core.files.ply import pack_scene, read_scene, write_scene
-from sgsst_core.files.ply_header import element_offsets
+from sgsst_core.files.scene_file import pack_scene, read_scene, write_scene
 from sgsst_core.files.scene_headers import form_of_name, read_scene_header
 from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.loss.mixture import StyleMixture

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files.ply import SceneFile, file_stamp, text_vertices
-from sgsst_core.files.ply_header import element_offsets
+from sgsst_core.files.formats.ply_header import element_offsets
+from sgsst_core.files.scene_file import SceneFile, file_stamp, text_vertices
 from sgsst_core.scene.stored_harmonics import changed
 
 #: Standard 3DGS properties by their names in PLY files: field of `Scene`, and column of its tensor (None for a 1D

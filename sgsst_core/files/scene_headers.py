@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files.ply_header import PlyElement, PlyHeader, element_offsets, read_header
+from sgsst_core.files.formats.ply_header import PlyElement, PlyHeader, element_offsets, read_header
 
 Form = Literal["ply", "compressed.ply", "spz", "splat"]
 #: Compressed formats that can be written in addition to a PLY, named by their file extension.

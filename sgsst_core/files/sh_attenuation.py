@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files.ply_header import PlyHeader
+from sgsst_core.files.formats.ply_header import PlyHeader
 from sgsst_core.scene.gaussians import attenuation_factor
 
 

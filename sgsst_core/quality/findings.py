@@ -18,7 +18,7 @@ from torch import Tensor
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN
 from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
-from sgsst_core.files.ply import SceneFile
+from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.planning.survey import Survey, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer

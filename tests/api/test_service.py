@@ -24,7 +24,7 @@ import torch
 from plyfile import PlyData
 
 from api.client import AsyncClient, Client, Job
-from sgsst_core.files.ply import SceneFile, read_scene, write_packed
+from sgsst_core.files.scene_file import SceneFile, read_scene, write_packed
 from sgsst_core.files.scene_headers import PACKED_FORMS
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall, write_files

@@ -13,7 +13,7 @@ import torch
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
 
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.optimizer import is_too_large
 from sgsst_core.stylizing.stylizer import Stylizer

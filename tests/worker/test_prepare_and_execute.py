@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sgsst_core.errors import CheckpointError
-from sgsst_core.files.ply import read_scene, write_packed, write_scene
+from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
 from sgsst_core.files.scene_headers import PackedForm
 from sgsst_core.planning.progress import PlanningProgress
 from sgsst_core.rasterizer.trial import drawing_problem

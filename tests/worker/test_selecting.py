@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 
 from sgsst_core.errors import ImageError, SceneError, SettingsError
 from sgsst_core.files.images import save_png
-from sgsst_core.files.ply import SceneFile, read_scene, write_packed
+from sgsst_core.files.scene_file import SceneFile, read_scene, write_packed
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneTooLargeError, SgsstError
-from sgsst_core.files.ply import HELD_BYTES, SceneFile, read_scene, stays_in_file
+from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_scene, stays_in_file
 from sgsst_core.files.scene_headers import read_scene_header
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.cost import OPTIMIZER_BYTES

@@ -14,7 +14,7 @@ import torch
 
 from sgsst_core.bench.stability.case import Case, CaseResult, Group, ordinary, repeated
 from sgsst_core.errors import InvalidInputError
-from sgsst_core.files.ply import read_scene, write_packed
+from sgsst_core.files.scene_file import read_scene, write_packed
 from sgsst_core.files.scene_headers import PackedForm
 from sgsst_core.orbit.choice import OrbitRequest, make_orbit
 from sgsst_core.scene.gaussians import Scene

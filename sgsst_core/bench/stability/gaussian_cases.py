@@ -25,7 +25,7 @@ from sgsst_core.bench.stability.case import (
 )
 from sgsst_core.constants import ALPHA_MIN, NEAR, SH_C0
 from sgsst_core.errors import SceneError
-from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.projection import Outcome, project
 from sgsst_core.scene.gaussians import Scene

@@ -26,7 +26,7 @@ from plyfile import PlyData
 from api.cli.main import main
 from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
-from sgsst_core.files.ply import read_scene, write_packed, write_scene
+from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
 from sgsst_core.files.scene_headers import PackedForm
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
@@ -123,7 +123,16 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     assert found["left"]["gaussians"] == kept.sum()
     assert not found["far"]["stylized"]
     assert sum(each["share"] for each in report["regions"]) == pytest.approx(1)
-    plan = ["plan", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style), "--backbone", "vgg16"]
+    plan = [
+        "plan",
+        str(files.ply),
+        "--cameras",
+        str(files.cameras),
+        "--style",
+        str(files.style),
+        "--backbone",
+        "vgg16",
+    ]
     assert main([*plan, *told, "--out", str(files.out.with_suffix(".json"))]) == 0
     assert "region right" in files.out.with_suffix(".json").read_text()
 
@@ -366,7 +375,15 @@ def test_held_out_views_approximations_and_findings_are_reported(files: Files) -
 @pytest.mark.slow
 def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     folder = files.out.with_name("bench")
-    command = ["bench", "error-time", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
+    command = [
+        "bench",
+        "error-time",
+        str(files.ply),
+        "--cameras",
+        str(files.cameras),
+        "--style",
+        str(files.style),
+    ]
     command += ["--backbone", "vgg16", "--out", str(folder), "--coarsest-side", "24"]
     assert main([*command, "--variants", "standard,faster"]) == 2
     assert "no variant faster" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from api.cli.main import main
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.scene.stored_harmonics import held
 from tests.small_scenes import wall, write_files
 

@@ -11,7 +11,7 @@ import torch
 
 from api.cli import main as cli
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from api.cli.demo_scene import (
 )
 from sgsst_core.errors import OutputError
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene

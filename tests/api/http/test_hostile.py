@@ -32,7 +32,7 @@ from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.tables import UploadRow
-from sgsst_core.files.ply import write_packed
+from sgsst_core.files.scene_file import write_packed
 from sgsst_core.files.scene_headers import PACKED_FORMS
 from sgsst_core.options import declared
 from tests.api.service import Service, check_documented, wait_for

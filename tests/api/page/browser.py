@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors

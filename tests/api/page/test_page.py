@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene, write_packed, write_scene
+from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
 from sgsst_core.scene.camera import resized
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene, write_packed
-from sgsst_core.files.quantized import SH_C0
+from sgsst_core.files.formats.quantized import SH_C0
+from sgsst_core.files.scene_file import read_scene, write_packed
 from sgsst_core.files.scene_headers import SPLAT_BYTES, splat_rows
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.scene.camera import Camera, resized

@@ -16,7 +16,7 @@ from service.inspection.inspector import Inspector
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
-from sgsst_core.files.ply import write_scene
+from sgsst_core.files.scene_file import write_scene
 from tests.small_scenes import wall, write_files
 
 

@@ -14,7 +14,7 @@ import httpx
 import pytest
 import torch
 
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from tests.api.service import Service, undisturbed, wait_for
 from tests.small_scenes import wall, write_files
 

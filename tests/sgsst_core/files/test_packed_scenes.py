@@ -25,7 +25,7 @@ from plyfile import PlyData, PlyElement
 
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene, write_packed, write_scene, write_stylized
+from sgsst_core.files.scene_file import read_scene, write_packed, write_scene, write_stylized
 from sgsst_core.files.scene_headers import PackedForm, form_of_name, read_scene_header
 from sgsst_core.quality.packed import measure_packed
 from sgsst_core.rasterizer import make_rasterizer

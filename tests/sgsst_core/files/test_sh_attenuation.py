@@ -12,8 +12,8 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files import ply
-from sgsst_core.files.ply import read_scene, write_packed, write_scene, write_stylized
+from sgsst_core.files import scene_file
+from sgsst_core.files.scene_file import read_scene, write_packed, write_scene, write_stylized
 from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
@@ -25,7 +25,7 @@ FADES = (1e-9, 0.25, 0.7, 1.0)
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
-    monkeypatch.setattr(ply, "BLOCK_ROWS", 17)
+    monkeypatch.setattr(scene_file, "BLOCK_ROWS", 17)
 
 
 def written(folder: Path, degree: int = 3) -> Path:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import RESOLUTION, middle_of, orbit, share_out
 from sgsst_core.orbit.subject import find_subject
 from sgsst_core.rasterizer import make_rasterizer

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sgsst_core.decision import Decision
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import middle_of
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit, orbit_decisions
 from sgsst_core.orbit.subject import find_subject

@@ -13,7 +13,7 @@ from torch import Tensor
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.quality.consistency import (
     LONG_RANGE,
     SHORT_RANGE,

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sgsst_core.constants import NEAR
-from sgsst_core.files.ply import SceneFile, read_scene, write_scene
+from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.quality import findings
 from sgsst_core.quality.findings import (

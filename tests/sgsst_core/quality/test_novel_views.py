@@ -18,7 +18,7 @@ from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.loss.sos_reference import box_average_reference, features_reference
 from sgsst_core.loss.terms import GRAM_WEIGHT

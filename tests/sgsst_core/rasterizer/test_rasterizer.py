@@ -21,7 +21,7 @@ from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
-from sgsst_core.files.ply import read_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.rasterizer import Rows, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer

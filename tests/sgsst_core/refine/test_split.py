@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sgsst_core.files.ply import read_scene, write_scene
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import split as module
 from sgsst_core.refine.split import (

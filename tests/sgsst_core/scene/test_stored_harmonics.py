@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files import ply
-from sgsst_core.files.ply import read_scene, write_scene, write_stylized
+from sgsst_core.files import scene_file
+from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
 from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
@@ -33,8 +33,8 @@ from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the block size, so that small scenes have many blocks, including incomplete ones."""
     monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
-    monkeypatch.setattr(ply, "READ_BYTES", 3000)
-    monkeypatch.setattr(ply, "BLOCK_ROWS", 17)
+    monkeypatch.setattr(scene_file, "READ_BYTES", 3000)
+    monkeypatch.setattr(scene_file, "BLOCK_ROWS", 17)
 
 
 def both(path: Path, *, drop: bool = False) -> tuple[Scene, Scene]:
@@ -224,7 +224,7 @@ def test_a_file_that_is_replaced_or_deleted_stays_readable(tmp_path: Path) -> No
 
 def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path)
-    check = ply._check_properties
+    check = scene_file._check_properties
 
     def shrink(*arguments: object) -> int:
         degree = check(*arguments)  # type: ignore[arg-type]
@@ -237,7 +237,7 @@ def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path: Path, monkeyp
         monkeypatch.setattr(RowFile, "__init__", late)
         return degree
 
-    monkeypatch.setattr(ply, "_check_properties", shrink)
+    monkeypatch.setattr(scene_file, "_check_properties", shrink)
     with pytest.raises(SceneError, match="was changed"):
         read_scene(path, held_bytes=0)
 
@@ -258,7 +258,7 @@ _PEAK = textwrap.dedent("""
     import sys
     from pathlib import Path
     import torch
-    from sgsst_core.files.ply import read_scene, write_stylized
+    from sgsst_core.files.scene_file import read_scene, write_stylized
     from sgsst_core.scene.spherical_harmonics import rest_colors
     from tests.sgsst_core.splat_scenes import camera
 
@@ -287,7 +287,9 @@ def test_memory_holds_neither_the_harmonics_nor_the_result(tmp_path: Path) -> No
     count, one = 300_000, cloud(3000, degree=3)
     write_scene(tmp_path / "large.ply", one.subset(torch.arange(3000).repeat(count // 3000)))
     run = [sys.executable, "-c", _PEAK, str(tmp_path)]
-    found = subprocess.run(run, capture_output=True, text=True, check=True, cwd=Path(ply.__file__).parents[2]).stdout
+    found = subprocess.run(
+        run, capture_output=True, text=True, check=True, cwd=Path(scene_file.__file__).parents[2]
+    ).stdout
     held_bytes, writing = map(int, found.split())
     assert held_bytes < 236  # a scene in memory without its subset
     assert writing < 40 << 20  # one block of rows plus the comparison of its colors; the file has 74 MB

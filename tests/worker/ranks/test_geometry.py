@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import SceneError, SceneTooLargeError
-from sgsst_core.files import ply
-from sgsst_core.files.ply import read_scene, write_packed, write_scene
+from sgsst_core.files import scene_file
+from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
 from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -96,7 +96,7 @@ def test_the_room_that_a_packed_scene_needs_is_that_of_its_floats(tmp_path: Path
 
 def shared_colors(collectives: Collectives, path: Path, drop: bool) -> tuple[bool, Tensor, Tensor]:
     """Return whether this rank leaves SH coefficients in the file, the coefficients, and the colors in a view."""
-    with patch.object(ply, "HELD_BYTES", 0):
+    with patch.object(scene_file, "HELD_BYTES", 0):
         scene = read_shared_scene(path, collectives, drop_invalid=drop)[0].scene
     stored = isinstance(scene.sh_rest, StoredHarmonics)
     return stored, held(scene.sh_rest), rest_colors(scene.sh_rest, scene.means, orbit(scene, 1)[0])

@@ -23,8 +23,8 @@ import zstandard
 from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.compressed_ply import Arrays
-from sgsst_core.files.quantized import OPACITY_LOGITS, byte_table, opacity_bytes, with_largest, without_largest
+from sgsst_core.files.formats.compressed_ply import Arrays
+from sgsst_core.files.formats.quantized import OPACITY_LOGITS, byte_table, opacity_bytes, with_largest, without_largest
 from sgsst_core.files.scene_headers import COEFFICIENTS, SceneHeader, SpzSection
 from sgsst_core.scene.stored_harmonics import RowFile
 

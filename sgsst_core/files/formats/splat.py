@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sgsst_core.files.compressed_ply import Arrays
-from sgsst_core.files.quantized import OPACITY_LOGITS, SH_C0
+from sgsst_core.files.formats.compressed_ply import Arrays
+from sgsst_core.files.formats.quantized import OPACITY_LOGITS, SH_C0
 from sgsst_core.files.scene_headers import SPLAT_BYTES, SceneHeader, splat_rows
 from sgsst_core.scene.stored_harmonics import RowFile
 

@@ -14,8 +14,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from sgsst_core.files.ply_header import element_offsets
-from sgsst_core.files.quantized import (
+from sgsst_core.files.formats.ply_header import element_offsets
+from sgsst_core.files.formats.quantized import (
     OPACITY_LOGITS,
     SH_C0,
     byte_table,

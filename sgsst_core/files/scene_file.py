@@ -28,12 +28,12 @@ from torch import Tensor
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.compressed_ply import read_compressed_ply, write_compressed_ply
-from sgsst_core.files.ply_header import PlyHeader, element_offsets
+from sgsst_core.files.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
+from sgsst_core.files.formats.splat import read_splat
+from sgsst_core.files.formats.spz import read_spz, write_spz
 from sgsst_core.files.scene_headers import COEFFICIENTS, Form, PackedForm, SceneHeader, read_scene_header
 from sgsst_core.files.sh_attenuation import ShAttenuation, check_sh_attenuation
-from sgsst_core.files.splat import read_splat
-from sgsst_core.files.spz import read_spz, write_spz
 from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
