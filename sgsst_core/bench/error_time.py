@@ -257,8 +257,7 @@ def _prepare(stylizer: _TimedStylizer) -> float:
         stylizer.style_targets(stylizer.views.cameras[index])
         scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
         stylizer.views.target(index, scales, stylizer.behind(index))
-        for phase in phases:
-            stylizer.keep_weights(index, phase.scales(chosen))
+        stylizer.keep_weights(index)
         stylizer.views.render(index, stylizer.views.colors(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started
 

@@ -154,7 +154,6 @@ class _Deciding:
             search=probe.machine.device == "cuda" and self._passes_of_a_size(steps_coarse, weighted) >= LEAST_PASSES,
             graphs=self._graphs_pay(steps_coarse, weighted),
             cached_weights=form,
-            coarse_weights=self._keeps_coarse(form, steps_coarse / views),
             measured=self.measured,
         )
 
@@ -198,14 +197,6 @@ class _Deciding:
         if self.probe.rasterizer not in GPU_RASTERIZERS:
             return visits >= LEAST_VISITS
         return raster.least_visits is not None and visits >= raster.least_visits
-
-    def _keeps_coarse(self, form: CachedWeights, visits: float) -> bool:
-        """Return whether phase 1, with this many visits per view, caches only the weights of the coarsest scale."""
-        on_cpu = self.probe.machine.device == "cpu" and self.probe.rasterizer not in GPU_RASTERIZERS
-        if form == "none" or self.settings.cached_weights != "auto" or not on_cpu:
-            return False
-        size = self.probe.raster.bytes if form == "float32" else self.probe.raster.half_bytes
-        return visits >= LEAST_VISITS and size is not None and size > self.budget
 
     def _decisions(self, ranks: Decision | None) -> tuple[Decision, ...]:
         probe, settings, plan = self.probe, self.settings, self.base
@@ -310,7 +301,6 @@ class _Deciding:
                     self.visits.rasterized(),
                     network.fixed * len(pieces),
                     int(self.base.seen.sum()),
-                    whole_image=not (coarsest and self.base.coarse_weights),
                     forward=network.rate.forward,
                     held=self.tiling.held * sharing,
                     working=self.tiling.working,

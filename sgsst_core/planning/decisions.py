@@ -385,8 +385,6 @@ def of_blend_weights(probe: Probe, plan: Plan, settings: Settings, budget: int) 
     share = Made(0.0, size, budget, len(plan.covered)).kept
     part = "all" if share == 1 else f"{share:.0%} of the views'"
     decision = f"{part} cached in {'half precision' if plan.cached_weights == 'half' else 'float32'}"
-    if plan.coarse_weights:
-        decision += "; in phase 1 only those of the coarsest scale"
     reason = f"they take {size / 1e9:.2f} GB for all views; {room}"
     if plan.uncached in GPU_RASTERIZERS and raster.kept_seconds is not None:
         reason += f"; {_against(raster)}"

@@ -74,7 +74,6 @@ class Plan:
         search: Whether cuDNN benchmarks its algorithms first (`FeatureNetwork.search`).
         graphs: Whether the loss of a view is captured as a CUDA graph where possible (`LossGraphs`).
         cached_weights: Format of blend weights that are cached between iterations.
-        coarse_weights: Whether phase 1 caches only the weights of the coarsest scale.
         measured: Whether the prediction includes measurements between steps and the report.
         measuring: Level of measurements between steps, as an index into `measuring.LEVELS`; a later level is used if
             measuring is slower than predicted.
@@ -102,7 +101,6 @@ class Plan:
     search: bool = False
     graphs: bool = False
     cached_weights: CachedWeights = "none"
-    coarse_weights: bool = False
     measured: bool = False
     measuring: int = 0
     loss_views: int = 4

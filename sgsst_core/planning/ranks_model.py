@@ -64,8 +64,6 @@ class IterationWork:
         raster: Time in seconds of render and gradient on one rank.
         fixed: Seconds that every rank needs regardless of their number: comparing statistics, and the optimizer.
         gaussians: Number of optimized Gaussians.
-        whole_image: Whether the full-size image and its gradient are exchanged (phase 1 with cached weights needs
-            neither).
         forward: Seconds per pixel of a forward pass alone, for pixels whose activations are not cached.
         held: Number of pixels whose activations a single rank can hold (see `choose_tile_size`).
         working: Memory of a pass in addition to the activations, as a fraction of them.
@@ -80,7 +78,6 @@ class IterationWork:
     raster: float
     fixed: float
     gaussians: int
-    whole_image: bool = True
     forward: float = 0.0
     held: float = math.inf
     working: float = 0.0
@@ -124,7 +121,7 @@ class IterationWork:
         """
         if ranks == 1:
             return 0.0
-        image = 2 * link.all_gather(self._image_bytes, ranks) if self.whole_image else 0.0
+        image = 2 * link.all_gather(self._image_bytes, ranks)
         statistics = link.all_reduce(_FIRST_BYTES, ranks) + link.all_reduce(_SECOND_BYTES, ranks)
         return image + statistics + link.all_reduce(self._gradient_bytes, ranks)
 
@@ -133,7 +130,7 @@ class IterationWork:
         twice = 2 * (ranks - 1) / ranks  # once to reduce, once to distribute
         statistics = len(self.pieces) * (_FIRST_BYTES + _SECOND_BYTES)
         return {
-            "image": int(twice * self._image_bytes) if self.whole_image else 0,
+            "image": int(twice * self._image_bytes),
             "statistics": int(twice * statistics),
             "gradient": int(twice * self._gradient_bytes),
         }

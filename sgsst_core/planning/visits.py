@@ -93,7 +93,6 @@ class Visits:
         raster: Time in seconds of a render and its gradient with recomputed weights.
         raster_kept: Time in seconds of a render and its gradient with cached weights.
         in_coarse: Whether phase 1 already computes tile intersections, colors and weights for phase 2.
-        coarse_weights: Whether phase 1 computes weights of its own.
     """
 
     intersections: Made
@@ -108,7 +107,6 @@ class Visits:
     raster: float
     raster_kept: float
     in_coarse: bool
-    coarse_weights: bool
 
     @staticmethod
     def of(plan: Plan, probe: Probe, settings: Settings, work: Work, coarse: Work, content: int) -> Visits:
@@ -158,7 +156,6 @@ class Visits:
             raster=raster.seconds,
             raster_kept=raster.seconds if raster.kept_seconds is None else raster.kept_seconds,
             in_coarse=plan.steps_coarse > 0,
-            coarse_weights=plan.coarse_weights,
         )
 
     def rasterized(self) -> float:
@@ -175,13 +172,10 @@ class Visits:
     def first(self, *, coarse: bool) -> float:
         """Return the additional time in seconds of a view's first visit in a phase."""
         content = (self.content_coarse if coarse else self.content).once + self.images.once
+        if self.in_coarse and not coarse:
+            return content
         intersections = (1 - self.handed) * self.intersections.once + self.colors.once + self.maps.once
-        keeping = self.weights.once if self.weights else 0.0
-        if coarse:
-            return content + intersections + (0.0 if self.coarse_weights else keeping)
-        if not self.in_coarse:
-            return content + intersections + keeping
-        return content + (keeping if self.coarse_weights else 0.0)
+        return content + intersections + (self.weights.once if self.weights else 0.0)
 
 
 def _maps(plan: Plan, probe: Probe, room: float) -> Made:

@@ -39,7 +39,7 @@ from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.state import StepRecord, StylizerState
 
 #: Increased whenever the meaning of a stored value changes.
-FORMAT_VERSION = "6"
+FORMAT_VERSION = "7"
 #: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
 #: measurements; the memory limit, which determines the partition, changes only rounding.
 _FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit", "measure"}

@@ -31,7 +31,6 @@ from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import PlanningContext, make_network, sharing_memory
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import repeatable
-from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
@@ -136,7 +135,7 @@ class Stylizer:
         self.scene = scene = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
         seen = scene if plan.seen.all() else scene.subset(plan.seen)
         seen = seen if "sh" in settings.keep else seen.without_zero_bands()
-        rasterizer, self._coarse = self._rasterizers(seen, planning_context)
+        rasterizer = self._make_rasterizer(seen, planning_context)
         self.views = self._views(seen, fit_cameras(cameras, settings), rasterizer)
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
         # Computed once, because another processor may round differently and ranks must start with the same bits.
@@ -274,10 +273,8 @@ class Stylizer:
             collectives=self.group,
         )
 
-    def _rasterizers(
-        self, seen: Scene, planning_context: PlanningContext | None
-    ) -> tuple[Rasterizer, CoarseRasterizer | None]:
-        """Return the plan's rasterizer, and the one that caches weights of the coarsest scale for phase 1."""
+    def _make_rasterizer(self, seen: Scene, planning_context: PlanningContext | None) -> Rasterizer:
+        """Return the plan's rasterizer of the rendered Gaussians."""
         plan, settings = self.plan, self.settings
         name = plan.uncached if plan.rasterizer == "cached" else plan.rasterizer
         options = rasterizer_options(name, settings, self.memory)
@@ -289,22 +286,16 @@ class Stylizer:
         else:  # data that a GPU rasterizer prepared for the whole scene refer to Gaussians by index
             uncached = make_rasterizer(name, seen, **options)
         if plan.rasterizer != "cached":
-            return uncached, None
-        budget = memory_for("rasterizer", self.memory)
-        share = budget // 4 if plan.coarse_weights else 0
-        cached = make_rasterizer(
+            return uncached
+        return make_rasterizer(
             "cached",
             seen,
-            max_bytes=budget - share,
+            max_bytes=memory_for("rasterizer", self.memory),
             least_intersection_bytes=self._least_intersection_bytes,
             precision="half" if plan.cached_weights == "half" else "float32",
             at_first_use=False,
             uncached=uncached,
         )
-        coarse = None
-        if plan.coarse_weights and isinstance(uncached, CpuRasterizer):
-            coarse = CoarseRasterizer(uncached, max_bytes=share, at_first_use=False)
-        return cached, coarse
 
     @property
     def _least_intersection_bytes(self) -> int:
@@ -413,8 +404,6 @@ class Stylizer:
         self._keep_visited()
         sent = dict(self.collectives.sent)
         phase = self.phase
-        if phase.scale is None:
-            self._coarse = None  # phase 1 is over
         self.latest = views = [self._next_view() for _ in range(self.settings.views_per_step)]
         gradient, results = self._mean_gradient(views, phase)
         with self.timer("optimizer"):
@@ -454,7 +443,7 @@ class Stylizer:
             scales = phase.scales(self.scales(index))
             behind = self.behind(index)
             with self.timer("prepare", whole=True):
-                self.keep_weights(index, scales)
+                self.keep_weights(index)
                 target = self.views.target(index, scales, behind)
                 self._look_ahead(own_views[place + 1 :], phase)
                 style = self.style_targets(self.views.cameras[index])
@@ -563,7 +552,7 @@ class Stylizer:
         """
         self._keep_visited()
         target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
-        with self.views.lending_weights(index, self._rasterizer_for(scales)):
+        with self.views.lending_weights(index):
             started = time.perf_counter()
             gradient = self._gradient(index, style, target, scales)[0]
             return gradient.cpu(), time.perf_counter() - started
@@ -577,26 +566,25 @@ class Stylizer:
         behind: Color | None = None,
     ) -> tuple[Tensor, SosResult]:
         """Return dE/dsh_dc [n, 3] of one view over a background color (None: that of the settings), and the loss."""
-        rasterizer = self._rasterizer_for(scales)
         with self.timer("render"), torch.no_grad():
             colors = self.views.colors(index, self.sh_dc.detach())
-            image = self.views.render(index, colors, rasterizer)
+            image = self.views.render(index, colors)
             if behind is not None:
-                image = self.views.put_behind(index, image, behind, rasterizer.scale)
+                image = self.views.put_behind(index, image, behind)
         with self.timer("loss"):
             evaluate = self.graphs.evaluate if self.graphs is not None else self.loss.evaluate
-            result = evaluate(image, style, target, scales, image_scale=rasterizer.scale)
+            result = evaluate(image, style, target, scales)
         with self.timer("raster_backward"):
             assert result.image_gradient is not None
-            return self.views.gradient(index, result.image_gradient.to(colors.device), colors, rasterizer), result
+            return self.views.gradient(index, result.image_gradient.to(colors.device), colors), result
 
-    def keep_weights(self, index: int, scales: Sequence[int]) -> None:
-        """Cache a view's blend weights for some scales, if they fit, as its first step does.
+    def keep_weights(self, index: int) -> None:
+        """Cache a view's blend weights, if they fit, as its first step does.
 
         Only steps cache weights. Renders between steps happen at varying times, and must not affect the results of
         steps.
         """
-        self.views.keep_weights(index, self._rasterizer_for(scales))
+        self.views.keep_weights(index)
 
     def _keep_visited(self) -> None:
         """Cache, once after a resume, the blend weights that previous steps cached.
@@ -608,19 +596,10 @@ class Stylizer:
             return
         order = drawn_views(self.views.covered, self.settings.seed)
         with self.timer("prepare"):
-            for step in range(steps):
+            for _ in range(steps):
                 views = [next(order) for _ in range(self.settings.views_per_step)]
-                phase = phase_at(self.schedule, step)
                 for index in views[self._team.own_group :: self._team.groups]:
-                    scales = phase.scales(self.scales(index))
-                    if self.phase.scale is not None or not self._rasterizer_for(scales).scale:
-                        self.keep_weights(index, scales)  # weights of a finished phase are not needed
-
-    def _rasterizer_for(self, scales: Sequence[int]) -> Rasterizer:
-        """Return the rasterizer of a view for some scales: the coarse one in phase 1, if cached."""
-        if self._coarse is not None and len(scales) == 1 and scales[0] > 0:
-            return self._coarse.at(scales[0])
-        return self.views.rasterizer
+                    self.keep_weights(index)
 
     def stylized(self) -> Tensor:
         """Return sh_dc [N, 3] float32 of the whole scene on the CPU: optimized colors, and colors of unseen Gaussians.

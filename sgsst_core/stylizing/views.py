@@ -17,7 +17,6 @@ from sgsst_core.parallel.division import Piece, divide_rows
 from sgsst_core.parallel.shown import ShownGaussians
 from sgsst_core.rasterizer import Rasterizer, Rows
 from sgsst_core.rasterizer.cached import CachedRasterizer, repeatable
-from sgsst_core.rasterizer.coarse import CoarseRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
@@ -93,7 +92,7 @@ class Views:
         self._sh_rest = scene.sh_rest.to(rasterizer.device)
         self._means = scene.means.to(rasterizer.device)
         shown = memory // 16 if collectives.size > 1 else 0
-        self._shown: Cache[_ShownKey, ShownGaussians] = Cache(shown)
+        self._shown: Cache[int, ShownGaussians] = Cache(shown)
         self._rest: Cache[int, Tensor] = Cache(memory // 4 - shown, _tensor_bytes)
         self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
         #: Budget for content, half of which goes to region maps if there are any.
@@ -129,63 +128,43 @@ class Views:
         Args:
             index: Index of the view.
             colors: [N, 3], colors of the view.
-            rasterizer: Replacement for the views' own rasterizer; h and w are those of its scale. Images at a coarse
-                scale are so small that every rank renders them completely.
+            rasterizer: Replacement for the views' own rasterizer.
         """
         rasterizer, camera = rasterizer or self.rasterizer, self.cameras[index]
-        if rasterizer.scale:
-            return rasterizer.render(colors, camera)
         band = self._own_band(index)
         some = band[0] < band[1]
         rows = rasterizer.render(colors, camera, band) if some else self._nothing(0, camera.width, 3)
         with self.loss.timer("communication"):
             return self.collectives.all_gather_rows(rows, self._bands[index])
 
-    def gradient(
-        self, index: int, image_gradient: Tensor, colors: Tensor, rasterizer: Rasterizer | None = None
-    ) -> Tensor:
+    def gradient(self, index: int, image_gradient: Tensor, colors: Tensor) -> Tensor:
         """Return dL/dsh_dc [N, 3].
 
         Args:
             index: Index of the view.
             image_gradient: [h, w, 3], this rank's summand of dL/dimage.
             colors: [N, 3], colors that were rendered.
-            rasterizer: Replacement for the views' own rasterizer, as in `render`.
         """
-        rasterizer, camera = rasterizer or self.rasterizer, self.cameras[index]
-        if rasterizer.scale:
-            rows, band = image_gradient, None
-        else:
-            band = self._own_band(index)
-            with self.loss.timer("communication"):
-                rows = self.collectives.reduce_scatter_rows(image_gradient, self._bands[index])
+        camera, band = self.cameras[index], self._own_band(index)
+        with self.loss.timer("communication"):
+            rows = self.collectives.reduce_scatter_rows(image_gradient, self._bands[index])
         some = len(rows) > 0
-        gradient = rasterizer.color_gradient(rows, camera, band) if some else self._nothing(len(colors), 3)
-        gradient = self._sum(gradient, self._shown_by(index, rasterizer, rows, band))
+        gradient = self.rasterizer.color_gradient(rows, camera, band) if some else self._nothing(len(colors), 3)
+        gradient = self._sum(gradient, self._shown_by(index, rows, band))
         # After the sum, because which colors pass the clamp depends on the sign of their total gradient.
         return view_colors_gradient(gradient, colors, clamp_aware_gradient=self.clamp_aware_gradient)
 
-    def keep_weights(self, index: int, rasterizer: Rasterizer | None = None) -> None:
-        """Cache the blend weights of this rank's band of a view, if the rasterizer can cache them and they fit.
-
-        Args:
-            index: Index of the view.
-            rasterizer: Replacement for the views' own rasterizer, as in `render`.
-        """
-        rasterizer, camera, band = rasterizer or self.rasterizer, self.cameras[index], self._own_band(index)
-        if isinstance(rasterizer, CoarseRasterizer):
-            rasterizer.keep(camera)
-        elif isinstance(rasterizer, CachedRasterizer) and band[0] < band[1]:
-            rasterizer.keep(camera, band)
-
-    def lending_weights(self, index: int, rasterizer: Rasterizer) -> AbstractContextManager[None]:
-        """Use in a `with` block the blend weights that `keep_weights` would cache, even if they are not cached.
-
-        A coarse rasterizer renders the same image with and without cached weights, so nothing is done for it.
-        """
+    def keep_weights(self, index: int) -> None:
+        """Cache the blend weights of this rank's band of a view, if the rasterizer can cache them and they fit."""
         band = self._own_band(index)
-        if isinstance(rasterizer, CachedRasterizer) and band[0] < band[1]:
-            return rasterizer.lending(self.cameras[index], band)
+        if isinstance(self.rasterizer, CachedRasterizer) and band[0] < band[1]:
+            self.rasterizer.keep(self.cameras[index], band)
+
+    def lending_weights(self, index: int) -> AbstractContextManager[None]:
+        """Use in a `with` block the blend weights that `keep_weights` would cache, even if they are not cached."""
+        band = self._own_band(index)
+        if isinstance(self.rasterizer, CachedRasterizer) and band[0] < band[1]:
+            return self.rasterizer.lending(self.cameras[index], band)
         return nullcontext()
 
     def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
@@ -196,7 +175,7 @@ class Views:
             indices = shown.indices()
             return gradient.index_copy_(0, indices, self.collectives.all_reduce(gradient.index_select(0, indices)))
 
-    def _shown_by(self, index: int, rasterizer: Rasterizer, rows: Tensor, band: Rows | None) -> ShownGaussians | None:
+    def _shown_by(self, index: int, rows: Tensor, band: Rows) -> ShownGaussians | None:
         """Return the Gaussians that any rank's band of a view shows.
 
         Ranks agree on them at the first visit, using the same blend weights as gradients do. Blend weights of another
@@ -204,26 +183,25 @@ class Views:
 
         Args:
             index: Index of the view.
-            rasterizer: Rasterizer of the gradients.
             rows: [h, w, 3], image gradient of this rank's band, used for its shape.
             band: Rows of the band.
 
         Returns:
             The Gaussians; None if there is only one rank, or if they do not fit in the cache.
         """
-        key, size = (index, rasterizer.scale), ShownGaussians.nbytes(len(self.scene))
-        if self.collectives.size == 1 or not self._shown.holds(key, size):
+        size = ShownGaussians.nbytes(len(self.scene))
+        if self.collectives.size == 1 or not self._shown.holds(index, size):
             return None
 
         def look() -> ShownGaussians:
             mask = torch.zeros(len(self.scene), dtype=torch.bool, device=self.rasterizer.device)
             with self.loss.timer("prepare"):
                 if len(rows):  # weights are never negative, so their sum is 0 only if all are
-                    mask = rasterizer.color_gradient(torch.ones_like(rows), self.cameras[index], band)[:, 0] > 0
+                    mask = self.rasterizer.color_gradient(torch.ones_like(rows), self.cameras[index], band)[:, 0] > 0
             with self.loss.timer("communication"):
                 return ShownGaussians(self.collectives.union(mask))
 
-        return self._shown.get(key, look, size)
+        return self._shown.get(index, look, size)
 
     def _nothing(self, *shape: int) -> Tensor:
         """Return zeros: the contribution of a rank that has no rows of a view."""
@@ -361,8 +339,6 @@ class Views:
         return self.loss.content_features(image(), scale, tiles)
 
 
-#: Index of the view, and scale of the rasterizer.
-_ShownKey = tuple[int, int]
 #: Index of the view, and scale.
 _ImageKey = tuple[int, int]
 #: Index of the view, scale, and every rank's pieces of it.

@@ -397,28 +397,26 @@ def test_on_the_cpu_weights_are_kept_where_they_pay() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "form", "coarse"),
+    ("values", "form"),
     [
-        ({}, "half", True),
-        ({"steps_coarse": 4 * VIEWS}, "half", False),  # too few visits of phase 1
-        ({"preset": "paper"}, "float32", True),
-        ({"cached_weights": "float32"}, "float32", False),
-        ({"cached_weights": "half"}, "half", False),
-        ({"cached_weights": "none"}, "none", False),
-        ({"keep": ("blend-weights",)}, "none", False),
+        ({}, "half"),
+        ({"preset": "paper"}, "float32"),
+        ({"cached_weights": "float32"}, "float32"),
+        ({"cached_weights": "half"}, "half"),
+        ({"cached_weights": "none"}, "none"),
+        ({"keep": ("blend-weights",)}, "none"),
     ],
 )
-def test_weights_that_do_not_fit(values: dict[str, Any], form: str, coarse: bool) -> None:
+def test_weights_that_do_not_fit(values: dict[str, Any], form: str) -> None:
     plan = plan_of(probe(raster=RasterCost(0.3, None, 6 * GIGABYTE, 3 * GIGABYTE)), **values)
-    assert (plan.cached_weights, plan.coarse_weights) == (form, coarse)
+    assert plan.cached_weights == form
     assert plan.rasterizer == ("cpu" if form == "none" else "cached")
-    assert ("phase 1 only those of the coarsest scale" in said(plan, "blend weights")) is coarse
     assert ("% of the views' cached" in said(plan, "blend weights")) is (form != "none")
 
 
 def test_half_precision_where_only_that_fits() -> None:
     plan = plan_of(probe(raster=RasterCost(0.3, None, 3 * GIGABYTE, 2 * GIGABYTE)))
-    assert (plan.cached_weights, plan.coarse_weights) == ("half", False)
+    assert plan.cached_weights == "half"
     assert said(plan, "blend weights").startswith("all cached in half precision: they take 2.00 GB")
     assert "1/2048" in line(plan, "blend weights").error  # type: ignore[union-attr]
 
@@ -440,12 +438,7 @@ FASTER = RasterCost(0.01, 0.004, GIGABYTE, GIGABYTE // 2, 0.012)
 
 def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
     kept, once = plan_of(on_a_gpu(FASTER)), plan_of(on_a_gpu(FASTER), steps_coarse=0, steps_sos=VIEWS)
-    assert (kept.rasterizer, kept.uncached, kept.cached_weights, kept.coarse_weights) == (
-        "cached",
-        "triton",
-        "float32",
-        False,
-    )
+    assert (kept.rasterizer, kept.uncached, kept.cached_weights) == ("cached", "triton", "float32")
     assert said(kept, "rasterizer") == "Triton on the GPU, with cached blend weights: Triton works here"
     assert said(kept, "blend weights") == (
         "all cached in float32: they take 1.00 GB for all views; 2.5 GB are available for blend weights; measured per "
@@ -482,11 +475,10 @@ def test_on_a_gpu_weights_are_not_kept_where_they_do_not_pay(raster: RasterCost,
 
 def test_on_a_gpu_half_precision_where_only_that_fits() -> None:
     plan = plan_of(on_a_gpu(replace(FASTER, bytes=4 * GIGABYTE, half_bytes=2 * GIGABYTE)))
-    assert (plan.cached_weights, plan.coarse_weights) == ("half", False)
+    assert plan.cached_weights == "half"
     assert "1/2048" in line(plan, "blend weights").error  # type: ignore[union-attr]
     most = plan_of(on_a_gpu(replace(FASTER, bytes=10 * GIGABYTE, half_bytes=5 * GIGABYTE)))
     assert said(most, "blend weights").startswith("50% of the views' cached in half precision")
-    assert not most.coarse_weights
 
 
 def test_gsplat_keeps_no_weights() -> None:
@@ -502,12 +494,7 @@ def test_on_a_gpu_without_a_rasterizer_weights_are_kept_on_the_cpu() -> None:
     broken = probe(device="cuda", problems={"triton": "no driver", "cuda": "no kernels"})
     plan, once = plan_of(broken), plan_of(broken, cached_weights="none")
     why = "Triton cannot be used: no driver; gsplat cannot be used: no kernels"
-    assert (plan.rasterizer, plan.uncached, plan.cached_weights, plan.coarse_weights) == (
-        "cached",
-        "cpu",
-        "float32",
-        False,
-    )
+    assert (plan.rasterizer, plan.uncached, plan.cached_weights) == ("cached", "cpu", "float32")
     assert said(plan, "rasterizer") == f"on the CPU, with cached blend weights: {why}"
     assert (once.rasterizer, once.cached_weights) == ("cpu", "none")
     assert said(once, "rasterizer") == f"on the CPU: {why}"
@@ -562,14 +549,6 @@ def test_ranks_take_part_as_the_link_allows() -> None:
     assert fast.prediction is not None
     assert fast.prediction.seconds_one_rank is not None
     assert fast.prediction.seconds < fast.prediction.seconds_one_rank
-
-
-def test_kept_coarse_weights_need_no_exchange_of_images() -> None:
-    tight = RasterCost(0.3, 0.3, 6 * GIGABYTE, 6 * GIGABYTE)
-    plans = [plan_of(probe(ranks=2, link=Link(1e8, 1e-3), raster=tight), cached_weights=w) for w in ("auto", "float32")]
-    assert [plan.coarse_weights for plan in plans] == [True, False]
-    coarse, whole = (plan.prediction.seconds_coarse for plan in plans)  # type: ignore[union-attr]
-    assert coarse < whole
 
 
 # --- the plan ------------------------------------------------------------------------------------------------------

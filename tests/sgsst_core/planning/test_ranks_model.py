@@ -31,12 +31,6 @@ def test_links_are_counted_as_rings_move_bytes() -> None:
     assert link.all_reduce(4_000_000, 4) == pytest.approx(2 * link.all_gather(4_000_000, 4))
 
 
-def test_kept_coarse_weights_need_no_image() -> None:
-    whole, coarse = work(), replace(work(), whole_image=False)
-    difference = whole.communication(4, SLOW) - coarse.communication(4, SLOW)
-    assert difference == pytest.approx(2 * SLOW.all_gather(720 * 1280 * 12, 4))
-
-
 def test_a_gradient_travels_for_what_the_view_shows() -> None:
     def sent(shown: float | None) -> float:
         return replace(work(), shown=shown).communication(4, SLOW)
@@ -54,7 +48,6 @@ def test_bytes_that_are_sent_are_those_that_ranks_wait_for_but_for_statistics_of
         assert one_scale.communication(ranks, link) == pytest.approx(sum(sent.values()) / 1e6, rel=1e-5)
         assert replace(work(scales=3), shown=20_000).sent(ranks)["statistics"] == pytest.approx(3 * sent["statistics"])
     assert set(work().sent(1).values()) == {0}
-    assert replace(work(), whole_image=False).sent(2)["image"] == 0
 
 
 def test_groups_add_up_whole_gradients() -> None:

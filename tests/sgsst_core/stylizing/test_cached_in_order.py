@@ -75,26 +75,13 @@ def test_a_resumed_job_keeps_the_same_views(
     assert cached_views(rest) == cached_views(whole)
 
 
-def test_a_job_that_was_resumed_behind_phase_1_keeps_nothing_of_it(tiny_weights: BackboneWeights) -> None:
+@pytest.mark.parametrize("before", [3, 33])
+def test_job_resumed_in_either_phase_caches_the_same_views(before: int, tiny_weights: BackboneWeights) -> None:
     whole, first, rest = (job(tiny_weights, "auto", **PHASES) for _ in range(3))
-    assert whole.plan.coarse_weights
-    steps(whole, 36)
-    rest.load_state(steps(first, 33).state())
-    coarse: Any = rest._coarse
-    assert torch.equal(steps(rest, 3).sh_dc, whole.sh_dc)
-    assert coarse.cached_bytes == 0
+    steps(whole, before + 2)
+    rest.load_state(steps(first, before).state())
+    assert torch.equal(steps(rest, 2).sh_dc, whole.sh_dc)
     assert cached_views(rest) == cached_views(whole)
-
-
-def test_a_job_that_was_resumed_in_phase_1_keeps_its_operators(tiny_weights: BackboneWeights) -> None:
-    whole, first, rest = (job(tiny_weights, "auto", **PHASES) for _ in range(3))
-    operators: list[Any] = [whole._coarse, rest._coarse]
-    steps(whole, 5)
-    rest.load_state(steps(first, 3).state())
-    steps(rest, 2)
-    assert list(operators[0]._operators.values) == list(operators[1]._operators.values)
-    assert operators[0].cached_bytes == operators[1].cached_bytes
-    assert torch.equal(rest.sh_dc, whole.sh_dc)
 
 
 def test_keeping_is_left_to_the_caller() -> None:
