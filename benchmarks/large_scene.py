@@ -30,8 +30,8 @@ from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
-from sgsst_core.planning.pictures import soft_picture
 from sgsst_core.planning.planner import make_plan
+from sgsst_core.planning.probe import soft_image
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections, intersections_of_subset
@@ -148,7 +148,7 @@ def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """Time a job by part, from a loaded scene to the end of the first step, with network weights installed."""
     settings = make_settings(max_resolution=_RESOLUTION)
-    timer, weights, style = Timer(), load_network_weights("auto"), soft_picture(512)
+    timer, weights, style = Timer(), load_network_weights("auto"), soft_image(512)
     plan, planning_context = make_plan(scene, cameras, settings, weights=weights, timer=timer)
     with timer("preparing"):
         stylizer = Stylizer(plan, scene, cameras, style, settings, weights=weights, planning_context=planning_context)

@@ -30,8 +30,9 @@ from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide, loads
-from sgsst_core.planning.cost import pieces_of
-from sgsst_core.planning.ranks_model import IterationWork, Link, probe_link
+from sgsst_core.planning.cost import IterationWork, pieces_of
+from sgsst_core.planning.facts import Link
+from sgsst_core.planning.probe import probe_link
 from sgsst_core.scene.camera import Camera, spread
 from worker.ranks.process_group import process_group
 

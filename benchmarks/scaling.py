@@ -16,7 +16,8 @@ from benchmarks.machine import write_result
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO
 from sgsst_core.parallel.division import Piece, divide, loads
-from sgsst_core.planning.ranks_model import IterationWork, Link
+from sgsst_core.planning.cost import IterationWork
+from sgsst_core.planning.facts import Link
 from sgsst_core.scene.pyramid import scale_count
 
 RANKS = (1, 2, 4, 8, 16, 32, 64)

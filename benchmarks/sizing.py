@@ -23,11 +23,12 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.cost import RasterCost, gaussian_bytes
+from sgsst_core.planning.context import equip
+from sgsst_core.planning.cost import gaussian_bytes
 from sgsst_core.planning.decide import decide
+from sgsst_core.planning.facts import Probe, RasterCost
 from sgsst_core.planning.plan import Prediction
-from sgsst_core.planning.probe import Probe, equip, measure
-from sgsst_core.planning.ranks_model import probe_link
+from sgsst_core.planning.probe import measure, probe_link
 from sgsst_core.planning.survey import Survey, survey_views
 from sgsst_core.scene.camera import fit_cameras
 from sgsst_core.settings import Settings, make_settings
@@ -62,7 +63,6 @@ def changed(probe: Probe, gaussians: int, width: int, views: int) -> Probe:
         scene=facts,
         sizes=((height, width),) * views,
         survey=Survey(seen, list(range(views)), whole, 0.0, shown=gaussians / 2),
-        distinct=tuple(range(views)),
         raster=_raster(probe.raster, pixels, gaussians / probe.scene.gaussians, views / len(probe.sizes)),
         process_bytes=probe.process_bytes + more,
     )
@@ -73,10 +73,10 @@ def _raster(cost: RasterCost, pixels: float, gaussians: float, views: float) -> 
     return replace(
         cost,
         seconds=cost.seconds * seconds,
-        kept_seconds=None if cost.kept_seconds is None else cost.kept_seconds * seconds,
+        cached_seconds=None if cost.cached_seconds is None else cost.cached_seconds * seconds,
         bytes=None if cost.bytes is None else int(cost.bytes * pixels * views),
         half_bytes=None if cost.half_bytes is None else int(cost.half_bytes * pixels * views),
-        keeping_seconds=None if cost.keeping_seconds is None else cost.keeping_seconds * seconds,
+        caching_seconds=None if cost.caching_seconds is None else cost.caching_seconds * seconds,
         first_seconds=cost.first_seconds * seconds,
         intersection_bytes=int(cost.intersection_bytes * seconds),
     )

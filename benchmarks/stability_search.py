@@ -181,7 +181,6 @@ def _settings(rng: random.Random) -> dict[str, Any]:
         "position_weights": ["on", "off"],
         "clamp_aware_gradient": [False],
         "unseen": ["freeze"],
-        "prune_weight": [_size(rng, 1e-6, 1.0)],
         "views_per_step": [2, 3],
         "cached_weights": ["float32", "half", "none"],
         "memory_limit": [1 << 20, 1 << 24],

@@ -27,16 +27,23 @@ RENAMED = {
     "sh_fade": "sh_attenuation",
     "surround": "training_background",
 }
+#: Removed options and parameters, with advice. Only error messages use them.
+REMOVED = {
+    "prune_weight": "it saved no time",
+    "similar_views": "use fewer views instead (--views)",
+}
 
 
 def renamed_hint(name: str) -> str:
-    """Return a hint with the new name of a renamed option or parameter; empty if it was not renamed.
+    """Return a hint about a renamed or removed option or parameter; empty if it is neither.
 
     Args:
         name: Name of a parameter ("sh_fade", "regions.0.keep") or a flag ("--sh-fade", "--no-revive").
     """
     flag = name.startswith("--")
     plain = name.removeprefix("--").removeprefix("no-").replace("-", "_").rpartition(".")[2]
+    if plain in REMOVED:
+        return f"it was removed: {REMOVED[plain]}"
     new = RENAMED.get(plain, "")
     return f"it is called {'--' + new.replace('_', '-') if flag else new} now" if new else ""
 

@@ -221,16 +221,6 @@ class Settings(BaseModel):
             description="Stop when the loss has fallen to this fraction of the initial loss, such as 0.05.",
         )
     )
-    prune_weight: Annotated[float, Option(unit="pixels", metavar="W")] = Field(
-        0.0,
-        ge=0,
-        allow_inf_nan=False,
-        description="Exclude Gaussians whose blend weights sum to at most W pixels over all views; 0 excludes none "
-        "that any pixel shows.",
-    )
-    similar_views: Annotated[float, Option(unit="fraction of the longer side", metavar="S")] = Field(
-        0.0, ge=0, lt=1, description="Drop views that show the same as another one, shifted by less than S of its side."
-    )
     cached_weights: CachedWeights = Field(
         "auto", description="Precision of blend weights that are cached between steps; auto: as memory allows."
     )

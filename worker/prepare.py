@@ -16,10 +16,10 @@ from sgsst_core.errors import CheckpointError
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import GPU_RASTERIZERS
+from sgsst_core.planning.context import common_device, rasterizer_problem
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import common_device, rasterizer_problem
-from sgsst_core.planning.progress import ShowPlanning
+from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.refine.split import Refinement
 from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings

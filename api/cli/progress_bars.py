@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
 
 if TYPE_CHECKING:
-    from sgsst_core.planning.progress import PlanningProgress
+    from sgsst_core.planning.survey import PlanningProgress
     from sgsst_core.stylizing.loop import Progress as StepProgress
     from worker.description import Prepared
 

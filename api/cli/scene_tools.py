@@ -18,7 +18,7 @@ from sgsst_core.files.json_files import write_json
 from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.progress import ShowPlanning
+from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.quality.findings import Finding, findings_of
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views

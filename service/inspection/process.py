@@ -46,7 +46,7 @@ from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.orbit.choice import Orbit
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.progress import PlanningProgress, ShowPlanning
+from sgsst_core.planning.survey import PlanningProgress, ShowPlanning
 from sgsst_core.quality.packed import measure_packed
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras

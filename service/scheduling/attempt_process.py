@@ -28,7 +28,7 @@ from service.store.leases import Published
 from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
-    from sgsst_core.planning.progress import PlanningProgress
+    from sgsst_core.planning.survey import PlanningProgress
     from sgsst_core.stylizing.loop import Progress
     from worker.description import Prepared
     from worker.execute import Result

@@ -42,10 +42,6 @@ SLICES = 32
 MOMENTS = (1, 2, 4, 8, 16, 32)
 #: Fraction of the time for phase 1, if a variant has one: about as much as in the standard preset.
 PHASE_1 = 0.15
-#: Threshold of the `pruned` variant: Gaussians are pruned if their blend weights in all views sum to less than one
-#: pixel.
-PRUNE_WEIGHT = 1.0
-
 #: Function that returns the phases of a variant, given the number of scales. A phase is (name, scale counted from the
 #: coarsest or None for all scales, fraction of the time).
 Shares = Callable[[int], list[tuple[str, int | None, float]]]
@@ -121,7 +117,6 @@ VARIANTS = {
         Variant("two-views", "standard with two views in each step", settings={"views_per_step": 2}),
         Variant("nnfm", "standard with ARF's nearest-neighbor style loss", settings={"style_loss": "nnfm"}),
         Variant("mixed", "standard with nearest neighbors beside the statistics", settings={"style_loss": "mixed"}),
-        Variant("pruned", "standard without hardly visible Gaussians", settings={"prune_weight": PRUNE_WEIGHT}),
     )
 }
 

@@ -1,64 +1,197 @@
-"""Choices that follow directly from the settings and a first measurement.
+"""Choices of a plan, each with the lines that state its reasons to users.
 
-Later measurements depend on them, so the probe and `decide` share them.
+Some of them follow from the settings and a first measurement alone. Later measurements depend on these, so the probe
+makes them too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from sgsst_core.budget import memory_for
-from sgsst_core.errors import SettingsError
-from sgsst_core.loss.style_losses import has_statistics
+from sgsst_core.decision import Decision
+from sgsst_core.loss.convergence import LEAST_FALL, window_length
+from sgsst_core.loss.nearest import MOST_VECTORS
+from sgsst_core.loss.scale_weights import ScaleWeights
+from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, has_statistics
+from sgsst_core.planning.cost import OPTIMIZER_BYTES, CostModel, RanksChoice, ViewData
+from sgsst_core.planning.facts import LEAST_VISITS, LaunchCost, Link, Probe, RasterCost
 from sgsst_core.planning.plan import Device
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RasterizerName
-from sgsst_core.settings import PlannedBackground, Precision, Settings
+from sgsst_core.settings import CachedWeights, PlannedBackground, Precision, Settings
 
-#: Minimum visits of a view for which caching its blend weights pays off on a CPU. Computing them takes as long as about
-#: three renders with gradient, and each use saves two thirds of a render. On GPUs, both times are measured
-#: (`RasterCost.least_visits`).
-LEAST_VISITS = 5
+#: Fraction of uncovered pixels above which statistics are weighted by coverage, unless the settings say otherwise.
+_UNCOVERED = 0.01
 #: Above this fraction of uncovered pixels, views are assumed to show an object without background. (Views of a room
 #: that was captured from only some places have holes of a few percent.)
-SCAN_SHARE = 0.2
+_SCAN = 0.2
 #: Default training background for such an object (docs/quality.md).
-SCAN_BACKGROUND: PlannedBackground = "palette"
+_SCAN_BACKGROUND: PlannedBackground = "palette"
+#: Minimum passes per image size for which benchmarking cuDNN's algorithms pays off. It takes as long as about ten
+#: passes, and makes later passes a few percent faster.
+LEAST_PASSES = 200
+#: GPU rasterizers in order of preference.
+GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
+ANOTHER_LOSS = "differs from the paper's loss"
 
 
-def optimized_gaussians(survey: Survey, settings: Settings) -> Tensor:
-    """Return the mask [N] bool of Gaussians whose colors are determined by the views.
+# --- scene and views -----------------------------------------------------------------------------------------------
 
-    Raises:
-        SettingsError: If pruning would leave none.
-    """
-    optimized = survey.total_blend_weights > settings.prune_weight
-    if not optimized.any():
-        raise SettingsError(
-            f"--prune-weight {settings.prune_weight:g} would leave out every Gaussian: the largest total blend weight "
-            f"is {float(survey.total_blend_weights.max()):.3g}. Give a smaller one."
+
+def rendered_gaussians(survey: Survey, settings: Settings) -> Tensor:
+    """Return the mask [N] bool of Gaussians that are rendered: those that a view shows, or all if requested."""
+    visible = survey.total_blend_weights > 0
+    return torch.ones_like(visible) if "unseen" in settings.keep else visible
+
+
+def about_gaussians(probe: Probe, rendered: Tensor, settings: Settings) -> list[Decision]:
+    """Return the lines about Gaussians that are not rendered, and about spherical harmonics."""
+    unseen = int((~rendered).sum())
+    harmonics = _about_harmonics(probe, settings)
+    if not unseen:
+        return harmonics
+    change = "keep their colors" if settings.unseen == "freeze" else "follow their neighbors' color change at the end"
+    line = Decision(
+        "unseen Gaussians",
+        f"{unseen:,} of {probe.scene.gaussians:,} are neither rendered nor optimized; they {change}",
+        "their blend weights are 0 in every pixel of every view",
+        bytes=unseen * OPTIMIZER_BYTES,
+    )
+    return [line, *harmonics]
+
+
+def _about_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
+    scene, item, attenuation = probe.scene, "spherical harmonics", settings.sh_attenuation
+    if not scene.sh_degree:
+        nothing = ": there is nothing to attenuate" if attenuation else ""
+        return [Decision(item, "no view directions are computed", f"the scene has degree 0{nothing}")]
+    if attenuation == 1:
+        return [
+            Decision(
+                item,
+                f"degrees 1 to {scene.sh_degree} are attenuated to 0, in the result too; no view directions are "
+                "computed",
+                "requested",
+                bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - 1) * 4,
+                error="colors no longer depend on the view direction",
+            )
+        ]
+    if attenuation:
+        return [
+            Decision(
+                item,
+                f"coefficients of degrees 1 to {scene.sh_degree} are multiplied by {1 - attenuation:.3g}, in the "
+                f"result too; evaluated up to degree {scene.used_degree}",
+                "requested",
+                error="colors depend less on the view direction",
+            )
+        ]
+    degree = scene.used_degree
+    if "sh" in settings.keep or degree == scene.sh_degree:
+        return []
+    return [
+        Decision(
+            item,
+            f"evaluated up to degree {degree}",
+            f"all coefficients of degrees {degree + 1} to {scene.sh_degree} are 0",
+            bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - (degree + 1) ** 2) * 4,
         )
-    return optimized
+    ]
+
+
+def about_views(probe: Probe) -> list[Decision]:
+    """Return the line about views that show nothing."""
+    total = len(probe.sizes)
+    blind = total - len(probe.survey.covered)
+    return [Decision("views", f"{blind} of {total} are skipped", "they see no Gaussian")] if blind else []
+
+
+def position_weights(survey: Survey, settings: Settings) -> tuple[bool, list[Decision]]:
+    """Choose whether statistics are weighted by coverage."""
+    asked = settings.position_weights
+    if asked == "off" or (asked == "auto" and survey.uncovered_share <= _UNCOVERED):
+        return False, []
+    line = Decision("position weights", "statistics are weighted by coverage", _uncovered(survey), error=ANOTHER_LOSS)
+    return True, [line]
+
+
+def about_uncovered_pixels(model: CostModel, probe: Probe) -> list[Decision]:
+    """Return the line about uncovered pixels that skip the network."""
+    work = model.work
+    if work.pixels >= work.without_region:
+        return []
+    return [
+        Decision(
+            "uncovered pixels",
+            f"{1 - work.pixels / work.without_region:.0%} of the pixels skip the network",
+            _uncovered(probe.survey),
+            seconds=(work.without_region - work.pixels) * probe.network.rate.both,
+        )
+    ]
+
+
+def _uncovered(survey: Survey) -> str:
+    return f"{survey.uncovered_share:.1%} of the views' pixels are uncovered"
 
 
 def is_scan(survey: Survey, *, weighted: bool) -> bool:
     """Return whether views show an object without background, and statistics are weighted by coverage (`weighted`)."""
-    return weighted and survey.uncovered_share > SCAN_SHARE
+    return weighted and survey.uncovered_share > _SCAN
 
 
-def starts_warm(settings: Settings, *, scan: bool) -> bool:
-    """Return whether the job starts with the style's colors.
+def training_background(settings: Settings, *, scan: bool) -> PlannedBackground:
+    """Return the training background, the background of renders in optimization steps."""
+    if settings.training_background == "auto":
+        return _SCAN_BACKGROUND if scan else "background"
+    return settings.training_background
+
+
+def about_training_background(
+    background: PlannedBackground, survey: Survey, settings: Settings, model: CostModel
+) -> list[Decision]:
+    """Return the line about the training background, unless it is the job's own background."""
+    if background == "background":
+        return []
+    color = {"random": "a random color", "palette": "the color of a random pixel of the style"}[background]
+    reason = "requested"
+    if settings.training_background == "auto":
+        reason = f"{_uncovered(survey)}: colors would be fitted to a fixed background"
+    cost = model.views.content.always + model.views.images.always
+    if cost:
+        reason += f"; content features are recomputed with it, {cost:.2g} s per step"
+    return [Decision("training_background", f"{color} each time", reason, error=ANOTHER_LOSS)]
+
+
+def warm_start(survey: Survey, settings: Settings, *, scan: bool) -> tuple[bool, list[Decision]]:
+    """Choose whether the job starts with the style's colors.
 
     Optimization changes the overall color of a scene only slowly (docs/quality.md). If only luminance is stylized, a
     warm start pays off only for scans, because nothing around the object determines its brightness.
     """
-    if settings.warm_start is None:
-        return scan or settings.preserve_colors != "luminance"
-    return settings.warm_start
+    by_luminance = settings.preserve_colors == "luminance"
+    warm = settings.warm_start
+    if warm is None:
+        warm = scan or not by_luminance
+    if not warm:
+        return False, []
+    start = "colors start with the style's distribution"
+    if by_luminance:
+        start = "luminance starts with the style's mean and standard deviation"
+    if ends_with_transfer(settings, warm=True):
+        start += f"; they are reset to it after the last step, because {settings.style_loss} lets them drift"
+    reason = "steps change the overall color only slowly"
+    if settings.warm_start is not None:
+        reason = "requested"
+    elif scan:
+        reason = f"{_uncovered(survey)}: nothing around the object determines how bright it should be"
+    return True, [Decision("start", start, reason, error="differs from the paper's start")]
 
 
 def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
@@ -70,22 +203,115 @@ def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
     return warm and not has_statistics(settings.style_loss)
 
 
-def training_background_of(settings: Settings, *, scan: bool) -> PlannedBackground:
-    """Return the training background, the background of renders in optimization steps."""
-    if settings.training_background == "auto":
-        return SCAN_BACKGROUND if scan else "background"
-    return settings.training_background
+def about_colors(settings: Settings) -> list[Decision]:
+    """Return the line about color preservation, if luminance alone is stylized."""
+    if settings.preserve_colors != "luminance":
+        return []
+    line = "only luminance is compared and optimized; each Gaussian keeps its chroma"
+    return [Decision("colors", line, "requested", error=ANOTHER_LOSS)]
 
 
-def rendered_gaussians(optimized: Tensor, settings: Settings) -> Tensor:
-    """Return the mask [N] bool of Gaussians that are rendered: the optimized ones, or all if requested."""
-    everything = "unseen" in settings.keep and not settings.prune_weight
-    return torch.ones_like(optimized) if everything else optimized
+# --- schedule ------------------------------------------------------------------------------------------------------
 
 
-def pruned_gaussians(survey: Survey, seen: Tensor) -> Tensor:
-    """Return the mask [N] bool of pruned Gaussians: visible in a view, but excluded from rendering."""
-    return ~seen & (survey.total_blend_weights > 0)
+def steps_coarse(scales: Sequence[int], settings: Settings) -> tuple[int, list[Decision]]:
+    """Choose the number of steps of phase 1. `scales` are the numbers of scales with a weight, of all views."""
+    if not settings.steps_coarse or max(scales) > 1 or settings.preset == "paper":
+        return settings.steps_coarse, []
+    reason = "there is only one scale, so it would be the same as phase 2"
+    if settings.scales:
+        reason = "only one scale has a weight, so it would be the same as phase 2"
+    skipped = f"its {settings.steps_coarse} steps are skipped"
+    return 0, [Decision("phase 1", skipped, reason, error="these steps, which would reduce the same loss")]
+
+
+def about_scales(counts: Sequence[int], settings: Settings) -> list[Decision]:
+    """Return the lines about scales and their weights. `counts` are the numbers of scales of the job's views."""
+    scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
+    reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
+    lines = [Decision("scales", scales, reason)]
+    if settings.scales:
+        weights, most = ScaleWeights(settings.scales), max(counts)
+        chosen = weights.chosen(most)
+        text = ", ".join(f"scale {scale} {weights.of(scale):g}" for scale in chosen)
+        if len(chosen) < most:
+            text += f"; {most - len(chosen)} of {most} scales are not computed"
+        lines.append(Decision("weights of scales", text, "requested", error=ANOTHER_LOSS))
+    return lines
+
+
+def about_early_stop(background: PlannedBackground, views: int, settings: Settings) -> list[Decision]:
+    """Return the line about the condition to stop early. `views` is the number of views of the job."""
+    if not settings.early_stop:
+        return []
+    if background != "background":
+        return [Decision("early stop", "none: all steps are run", "losses on different backgrounds cannot be compared")]
+    return [
+        Decision(
+            "early stop",
+            f"when the mean loss of {window_length(views)} steps is less than {LEAST_FALL:.1%} below that of the same "
+            "number of steps before",
+            "later steps would gain little",
+            error="the remaining decrease of the loss",
+        )
+    ]
+
+
+@dataclass(frozen=True)
+class Visits:
+    """Numbers of visits in the whole schedule.
+
+    Attributes:
+        of_a_view: Visits of each view.
+        of_a_size: Passes of images of one size through the network.
+    """
+
+    of_a_view: float
+    of_a_size: int
+
+    @staticmethod
+    def of(probe: Probe, settings: Settings, steps_coarse: int, *, weighted: bool) -> Visits:
+        """Count the visits of a schedule.
+
+        With weighted statistics, every view has its own size, because it is cropped to its covered pixels.
+        """
+        views = probe.survey.covered
+        visits = (steps_coarse + settings.steps_sos) * settings.views_per_step
+        sizes = len(views) if weighted else len({probe.sizes[index] for index in views})
+        return Visits(visits / len(views), visits // sizes)
+
+
+# --- network -------------------------------------------------------------------------------------------------------
+
+
+def about_network(model: CostModel, probe: Probe, settings: Settings) -> list[Decision]:
+    """Return the lines about layers, style loss, content, partition and forward passes."""
+    network, work = probe.network, model.work
+    layers = f"up to {network.deepest}, the deepest one used"
+    lines = [Decision("network layers", layers, "the loss reads no deeper layer")]
+    if settings.style_loss != "sos":
+        weight = NEAREST_WEIGHTS[settings.style_loss]
+        what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
+        distance = (
+            f"the distance of relu3 features to the nearest of at most {MOST_VECTORS:,} style features {what}, with "
+            f"weight {weight:.3g}; the search takes {work.pairs * network.rate.search:.2g} s per view"
+        )
+        lines.append(Decision("style loss", distance, f"{settings.style_loss} was requested", error=ANOTHER_LOSS))
+    if not settings.content_weight:
+        lines.append(Decision("content", "no content features are computed or cached", "its weight is 0"))
+    memory = f"the {memory_for('activations', probe.machine.memory) / 1e9:.1f} GB for activations"
+    if work.tiles <= 1:
+        lines.append(Decision("partition", "none: the network takes each view as a whole", f"it fits in {memory}"))
+    else:
+        tiles = f"up to {work.tiles} tiles per view"
+        lines.append(Decision("partition", tiles, f"larger tiles would not fit in {memory}"))
+    if work.again:
+        again = work.again / work.pixels
+        reason = f"activations of {1 - again:.0%} of the pixels fit in {memory}"
+        return [*lines, Decision("second forward", f"for {again:.0%} of the pixels", reason)]
+    none = "none: activations are cached between statistics and gradient"
+    saved = work.pixels * network.rate.forward
+    return [*lines, Decision("second forward", none, f"they fit in {memory}", seconds=saved)]
 
 
 def precision_of(asked: Precision, ratio: float | None) -> Precision:
@@ -101,8 +327,85 @@ def precision_of(asked: Precision, ratio: float | None) -> Precision:
     return asked if ratio is not None and ratio > 1 else "float32"
 
 
-#: GPU rasterizers in order of preference.
-GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
+def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decision]]:
+    """Choose the network's precision; there is no line if float32 was requested."""
+    asked, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
+    chosen = precision_of(asked, ratio)
+    if asked == "float32":
+        return chosen, []
+    if ratio is None:
+        reason = f"{asked} was requested, but needs an NVIDIA GPU of compute capability 8.0 or higher"
+        return chosen, [Decision("precision", "features in float32", reason)]
+    if chosen == "float32":
+        reason = f"{asked} was requested, but takes {1 / ratio:.1f} times as long as float32 on this processor"
+        return chosen, [Decision("precision", "features in float32", reason)]
+    known = "the error of the colors is measured during the run"
+    if error is not None:
+        known = (
+            f"the first view's pixel gradient has a relative error of {error.relative_error:.2g} (cosine "
+            f"{error.cosine:.5f}); {known}"
+        )
+    what = {"bfloat16": "features in bfloat16", "tf32": "convolutions in TF32"}[asked]
+    return chosen, [Decision("precision", what, f"requested, {ratio:.1f} times faster here", error=known)]
+
+
+def convolutions(probe: Probe, visits: Visits) -> tuple[bool, list[Decision]]:
+    """Choose whether cuDNN benchmarks its algorithms on a GPU."""
+    if probe.machine.device != "cuda":
+        return False, []
+    search, item = visits.of_a_size >= LEAST_PASSES, "convolutions"
+    reason = f"the network evaluates images of one size about {visits.of_a_size:,} times"
+    if not search:
+        return search, [Decision(item, "cuDNN does not benchmark its algorithms", reason)]
+    return search, [Decision(item, "cuDNN benchmarks its algorithms", reason, error="runs may round differently")]
+
+
+def launches(probe: Probe, settings: Settings, visits: Visits, phases: int) -> tuple[bool, list[Decision]]:
+    """Choose whether the loss of a view is captured as a CUDA graph on a GPU, one per image size and phase."""
+    cost = probe.launches
+    if probe.machine.device != "cuda":
+        return False, []
+    visited = f"views of one size are visited about {visits.of_a_size:,} times"
+    if "launches" in settings.keep:
+        reason = "requested"
+    elif probe.machine.ranks > math.gcd(settings.views_per_step, probe.machine.ranks):  # several ranks share a view
+        reason = "a graph cannot contain communication between workers"
+    elif cost is None:
+        reason = visited
+    elif cost.problem is not None:
+        reason = f"CUDA graphs are unavailable: {cost.problem}"
+    elif cost.least_visits is None:
+        reason = f"a graph saves hardly any time: {_launch_times(cost)}"
+    elif visits.of_a_size < phases * cost.least_visits:
+        pays = f"one graph per phase pays off from {cost.least_visits:.1f} visits"
+        reason = f"{visited}, but {pays}; {_launch_times(cost)}"
+    else:
+        reason = f"{_launch_times(cost)}; {visited}"
+        graph = "the loss of a view is captured as a CUDA graph"
+        return True, [Decision("launches", graph, reason, seconds=cost.saved)]
+    return False, [Decision("launches", "kernel by kernel", reason)]
+
+
+def _launch_times(cost: LaunchCost) -> str:
+    return (
+        f"measured per view: {1e3 * cost.replayed:.3g} ms as a graph, {1e3 * cost.seconds:.3g} ms kernel by kernel, "
+        f"{1e3 * cost.capture:.3g} ms to capture"
+    )
+
+
+# --- rasterizer ----------------------------------------------------------------------------------------------------
+
+
+def uncached_rasterizer(device: Device, problems: Mapping[str, str]) -> RasterizerName:
+    """Return the rasterizer that computes blend weights: on a GPU, the first of `GPU_RASTERIZERS` that works.
+
+    Args:
+        device: Device of the job.
+        problems: Reason by name for each GPU rasterizer that does not work.
+    """
+    if device == "cuda":
+        return next((name for name in GPU_RASTERIZERS if name not in problems), "cpu")
+    return "cpu"
 
 
 def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, Any]:
@@ -123,13 +426,80 @@ def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, 
     return options
 
 
-def uncached_rasterizer(device: Device, problems: Mapping[str, str]) -> RasterizerName:
-    """Return the rasterizer that computes blend weights: on a GPU, the first of `GPU_RASTERIZERS` that works.
+def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[CachedWeights, Decision]:
+    """Choose the format of cached blend weights: float32 if they fit, else half precision; none if caching does not pay."""
+    raster, item = probe.raster, "blend weights"
+    why_not = _why_not_cached(probe, settings, visits)
+    if why_not is not None:
+        return "none", Decision(item, "recomputed in every step", why_not, bytes=raster.bytes)
+    budget, cached = memory_for("rasterizer", probe.machine.memory), settings.cached_weights
+    if cached == "auto":
+        cached = "float32" if (raster.bytes or 0) <= budget or settings.preset == "paper" else "half"
+    name, size, error = "float32", raster.bytes or 0, "none"
+    if cached == "half":
+        name, size = "half precision", raster.half_bytes or 0
+        error = "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
+    fraction = ViewData(0.0, size, budget, len(probe.survey.covered)).cached
+    portion = "all" if fraction == 1 else f"{fraction:.0%} of the views'"
+    reason = f"they take {size / 1e9:.2f} GB for all views; {budget / 1e9:.1f} GB are available for blend weights"
+    if probe.rasterizer in GPU_RASTERIZERS and raster.cached_seconds is not None:
+        reason += f"; {_weight_times(raster)}"
+    saved = (raster.seconds - raster.cached_seconds) * fraction if raster.cached_seconds else None
+    return cached, Decision(item, f"{portion} cached in {name}", reason, seconds=saved, error=error)
+
+
+def _why_not_cached(probe: Probe, settings: Settings, visits: Visits) -> str | None:
+    """Return the reason for caching no blend weights; None if they are cached."""
+    raster, visited = probe.raster, f"a view is visited {visits.of_a_view:.1f} times"
+    if settings.cached_weights == "none" or "blend-weights" in settings.keep:
+        return "requested"
+    if raster.bytes is None or raster.half_bytes is None:
+        return "gsplat cannot cache them"
+    if settings.cached_weights != "auto":
+        return None
+    if probe.rasterizer not in GPU_RASTERIZERS:
+        return visited if visits.of_a_view < LEAST_VISITS else None
+    if raster.cached_seconds is None:
+        return "the weights of one view do not fit"
+    if raster.least_visits is None:
+        return f"cached weights are not faster here: {_weight_times(raster)}"
+    if visits.of_a_view < raster.least_visits:
+        return f"{visited}, but caching pays off from {raster.least_visits:.1f} visits; {_weight_times(raster)}"
+    return None
+
+
+def _weight_times(raster: RasterCost) -> str:
+    cached, recomputed = 1e3 * (raster.cached_seconds or 0), 1e3 * raster.seconds
+    return f"measured per view: {cached:.3g} ms cached, {recomputed:.3g} ms recomputed"
+
+
+def about_rasterizer(probe: Probe, *, cached: bool) -> list[Decision]:
+    """Return the line about the rasterizer on a GPU; on the CPU there is no choice.
 
     Args:
-        device: Device of the job.
-        problems: Reason by name for each GPU rasterizer that does not work.
+        probe: Measured facts.
+        cached: Whether blend weights are cached.
     """
-    if device == "cuda":
-        return next((name for name in GPU_RASTERIZERS if name not in problems), "cpu")
-    return "cpu"
+    if probe.machine.device != "cuda":
+        return []
+    names = {"cuda": "gsplat", "triton": "Triton"}
+    how = f"{names[probe.rasterizer]} on the GPU" if probe.rasterizer in names else "on the CPU"
+    if cached:
+        how += ", with cached blend weights"
+    reasons = [f"{names[name]} cannot be used: {problem}" for name, problem in probe.machine.problems.items()]
+    if probe.rasterizer in names:
+        reasons.append(f"{names[probe.rasterizer]} works here")
+    return [Decision("rasterizer", how, "; ".join(reasons) or "requested")]
+
+
+def about_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
+    """Return the line about the number of ranks."""
+    speed = f"{choice.speed_up:.2f} times as fast as one"
+    measured = f"{link.bandwidth / 1e9:.2g} GB/s and {link.latency * 1e6:.0f} microseconds between ranks were measured"
+    if choice.ranks == available:
+        return Decision("ranks", f"all {available} take part, {speed}", measured)
+    other = choice.seconds[1] / choice.seconds[available]
+    reason = (
+        f"all of them would be {other:.2f} times as fast, because the others would only add communication; {measured}"
+    )
+    return Decision("ranks", f"{choice.ranks} of {available} take part, {speed}", reason)

@@ -5,21 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
+from sgsst_core.loss.style_losses import has_statistics
 from sgsst_core.orbit.choice import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.choices import ANOTHER_LOSS
+from sgsst_core.planning.context import PlanningContext, equip
+from sgsst_core.planning.cost import MAP_BYTES, MAPS_OF_A_RENDER
 from sgsst_core.planning.decide import decide
-from sgsst_core.planning.decisions import of_regions, of_styles
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.probe import PlanningContext, Probe, equip, measure
-from sgsst_core.planning.progress import ShowPlanning
-from sgsst_core.planning.ranks_model import probe_link
-from sgsst_core.planning.survey import Survey, survey_views
+from sgsst_core.planning.probe import measure, probe_link
+from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.scene.camera import Camera, fit_cameras
@@ -68,8 +70,8 @@ def make_plan(
 
     Raises:
         CameraError: If there are no cameras, or none sees a Gaussian.
-        SettingsError: If pruning leaves no Gaussian, regions freeze everything visible, views lack requested scales, or
-            the rasterizer does not work here.
+        SettingsError: If regions freeze everything visible, views lack requested scales, or the rasterizer does not
+            work here.
         WeightsError: If there are no weights.
     """
     if not cameras:
@@ -87,31 +89,82 @@ def make_plan(
         resolved = regions and regions.resolved(survey.total_blend_weights)
         maps = len(resolved.active) if resolved is not None and resolved.mapped else 0
         link = probe_link(collectives, planning_context.network.device)
+
+        def decide_here() -> Plan:
+            probe = measure(planning_context, survey, link, maps)
+            frozen = None if resolved is None else resolved.frozen
+            return decide(
+                replace(probe, styles=_style_count(style, resolved), frozen=frozen), settings, measured=measured
+            )
+
         # Timings differ between ranks, so one rank decides for all.
-        plan = collectives.broadcast(
-            lambda: _decide(measure(planning_context, survey, link, maps), settings, measured, style, resolved)
+        plan = collectives.broadcast(decide_here)
+        request_lines = [
+            *([refine_decision(refinement, settings)] if refinement is not None else []),
+            *(orbit_decisions(orbit, fitted, survey.uncovered) if orbit is not None else []),
+            *(_about_regions(regions, resolved, plan, fitted) if regions is not None and resolved is not None else []),
+            *(_about_styles(style, settings) if style is not None else []),
+        ]
+    return replace(plan, refinement=refinement, decisions=(*request_lines, *plan.decisions)), planning_context
+
+
+def _style_count(style: StyleMixture | None, regions: Regions | None) -> int:
+    """Return the number of style images of a job, including those of regions as resolved by `Regions.resolved`."""
+    mixtures = [style] if regions is None else [regions.every[index].style or style for index in regions.active]
+    return sum(len(mixture.pictures) if mixture else 1 for mixture in mixtures)
+
+
+def _about_styles(style: StyleMixture, settings: Settings) -> list[Decision]:
+    """Return the line about the mixture of several style images."""
+    if len(style.pictures) == 1:
+        return []
+    reason = f"{len(style.pictures)} images were given"
+    if not has_statistics(settings.style_loss):
+        reason += (
+            "; features are matched with those of all images, whose weights matter only if there are too many features"
         )
-        if regions is not None and resolved is not None:
-            plan = replace(plan, decisions=(*of_regions(regions, resolved, plan, fitted), *plan.decisions))
-        if orbit is not None:
-            plan = replace(plan, decisions=(*orbit_decisions(orbit, fitted, survey.uncovered), *plan.decisions))
-        if refinement is not None:
-            decisions = (refine_decision(refinement, settings), *plan.decisions)
-            plan = replace(plan, refinement=refinement, decisions=decisions)
-    return plan, planning_context
+    return [Decision("styles", f"a mixture: {style.text}", reason, error=ANOTHER_LOSS)]
 
 
-def _decide(
-    probe: Probe, settings: Settings, measured: bool, style: StyleMixture | None, regions: Regions | None
-) -> Plan:
-    """Plan for one or several style images, and for one or several regions as resolved by `Regions.resolved`."""
-    if regions is not None:
-        own = [regions.every[place].style or style for place in regions.active]
-        count = sum(len(each.pictures) if each else 1 for each in own)
-        probe = replace(probe, kept=regions.frozen, styles=count)
-    elif style is not None:
-        probe = replace(probe, styles=len(style.pictures))
-    plan = decide(probe, settings, measured=measured)
-    if style is None or len(style.pictures) == 1:
-        return plan
-    return replace(plan, decisions=(*of_styles(style, settings), *plan.decisions))
+def _about_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[Camera]) -> list[Decision]:
+    """Return the lines about the regions and the cost of their maps.
+
+    Args:
+        asked: Regions as requested.
+        resolved: Regions after `Regions.resolved`.
+        plan: Plan under construction.
+        cameras: Cameras of all views.
+    """
+    weights = plan.survey.total_blend_weights
+    lines = []
+    for index, region in enumerate(asked.every):
+        requested, members = int(asked.members(index).sum()), resolved.members(index)
+        reason = region.select or "not in any other region"
+        lost = region.selected - requested
+        if lost > 0:
+            reason += f"; {lost:,} more are also in a later region, which takes precedence"
+        if index and not requested:
+            decision = f"warning: ignored, because it has no Gaussians{' of its own' if lost > 0 else ''}"
+        elif region.freeze:
+            decision = f"{requested:,} Gaussians stay unchanged"
+        elif index and index not in resolved.active:
+            decision = f"warning: ignored, because no view sees its {requested:,} Gaussians; they count as rest"
+        elif index not in resolved.active:
+            continue  # the rest is empty
+        else:
+            fraction = float(weights[members].sum() / weights.sum())
+            decision = f"{int(members.sum()):,} of {len(weights):,} Gaussians, {fraction:.1%} of what the views show,"
+            decision += f" use {region.style.text if region.style else 'the style'}"
+            decision += f", with weight {region.weight:g}" if region.weight != 1 else ""
+        lines.append(Decision(f"region {region.name}", decision, reason, error=ANOTHER_LOSS))
+    if not resolved.mapped:
+        return lines
+    count = len(resolved.active)
+    pixels = sum(cameras[index].width * cameras[index].height for index in plan.covered)
+    renders = 1 + -(-count // MAPS_OF_A_RENDER)  # plus one for the background
+    decision = (
+        f"statistics of {count} region{'' if count == 1 else 's'} are weighted by each region's fraction of a pixel's "
+        f"blend weights; {renders} renders at a view's first visit, {int(MAP_BYTES * count * pixels) / 1e6:.1f} MB for "
+        "all views"
+    )
+    return [*lines, Decision("regions", decision, "otherwise styles would leak into other regions", error=ANOTHER_LOSS)]

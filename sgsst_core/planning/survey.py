@@ -7,7 +7,7 @@ distributed among ranks.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,13 +16,48 @@ from torch import Tensor
 from sgsst_core.errors import CameraError
 from sgsst_core.features.partition import Rectangle, covered_region
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.progress import ShowPlanning, progress_of
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
 #: Below this coverage, the color of a pixel is invisible in 8 bits.
 SEEN_COVERAGE = 1 / 255
+
+
+@dataclass(frozen=True)
+class PlanningProgress:
+    """Progress of a survey.
+
+    Attributes:
+        done: Views surveyed by all ranks together.
+        total: Views to survey.
+        seconds_left: Remaining seconds of the survey at the current rate; None before the first view is done.
+    """
+
+    done: int
+    total: int
+    seconds_left: float | None = None
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of the views, 0 to 1."""
+        return self.done / max(self.total, 1)
+
+
+ShowPlanning = Callable[[PlanningProgress], None]
+
+
+def progress_of(own: int, total: int, ranks: int, seconds: float) -> PlanningProgress:
+    """Return the progress of all ranks, assuming that they are as fast as this one.
+
+    Args:
+        own: Number of views that this rank has surveyed.
+        total: Number of views that all ranks survey.
+        ranks: Number of ranks.
+        seconds: Seconds since the survey started.
+    """
+    done = min(total, own * ranks)
+    return PlanningProgress(done, total, seconds * (total - done) / done if done else None)
 
 
 def sees_something(coverage: Tensor) -> bool:

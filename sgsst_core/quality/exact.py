@@ -1,7 +1,7 @@
 """Exact loss and gradient of a job, as the reference for measuring its approximations.
 
-Features are float32, no Gaussian with a nonzero blend weight is pruned, and blend weights are recomputed instead of
-cached. The result is within 1e-6 of the float64 reference (tests/sgsst_core/loss/test_sos.py).
+Features are float32, and blend weights are recomputed instead of cached. The
+result is within 1e-6 of the float64 reference (tests/sgsst_core/loss/test_sos.py).
 """
 
 from __future__ import annotations
@@ -35,8 +35,6 @@ def approximations(stylizer: Stylizer) -> list[str]:
     found = []
     if stylizer.network.precision != "float32":
         found.append("TF32 convolutions" if stylizer.network.tf32 else f"{stylizer.network.precision} features")
-    if bool((stylizer.plan.survey.total_blend_weights[~stylizer.plan.seen] > 0).any()):
-        found.append("pruned Gaussians")
     if stylizer.plan.cached_weights == "half" and stylizer.views.rasterizer.name == "cached":
         found.append("half-precision blend weights")
     return found

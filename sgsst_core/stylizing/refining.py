@@ -28,9 +28,8 @@ from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import ScaleTarget, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import rasterizer_options
-from sgsst_core.planning.probe import PlanningContext, equip
-from sgsst_core.planning.progress import ShowPlanning, progress_of
-from sgsst_core.planning.survey import sees_something
+from sgsst_core.planning.context import PlanningContext, equip
+from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, most_children
 from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split

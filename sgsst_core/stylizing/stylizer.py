@@ -26,9 +26,9 @@ from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import ends_with_transfer, rasterizer_options
+from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import PlanningContext, make_network, sharing_memory
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import repeatable
 from sgsst_core.rasterizer.cpu import CpuRasterizer

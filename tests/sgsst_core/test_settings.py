@@ -18,7 +18,6 @@ def test_paper_is_the_published_schedule() -> None:
     assert not (settings.early_stop)
     assert settings.warm_start is False
     assert (settings.training_background, settings.background) == ("background", (0, 0, 0))
-    assert not (settings.prune_weight)
 
 
 def test_single_values_go_on_top_and_none_leaves_the_preset() -> None:

@@ -13,7 +13,7 @@ import torch
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
 from sgsst_core.files.scene_headers import PackedForm
-from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from worker.ranks.rank import RankStatus
 
 if TYPE_CHECKING:
-    from sgsst_core.planning.progress import PlanningProgress
+    from sgsst_core.planning.survey import PlanningProgress
     from sgsst_core.stylizing.loop import Progress
     from worker.description import Prepared
 

@@ -22,7 +22,7 @@ from worker.processes import ProcessId, die_with_parent, listen
 
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
-    from sgsst_core.planning.progress import PlanningProgress
+    from sgsst_core.planning.survey import PlanningProgress
     from sgsst_core.stylizing.loop import Progress
     from worker.description import Prepared
     from worker.execute import Result

@@ -17,7 +17,7 @@ from api.cli.options_table import reference
 from api.cli.values import parse_strength
 from service.parameters import JobParameters, stored_parameters
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import RENAMED, Declared, declared
+from sgsst_core.options import REMOVED, RENAMED, Declared, declared
 from sgsst_core.settings import EVERYTHING, Settings, checked, make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
 from worker.request import SceneRequest
@@ -110,10 +110,10 @@ def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.
 def test_bounds_have_settings_numbers_and_no_other(capsys: pytest.CaptureFixture[str]) -> None:
     """Whether the bound itself is valid is as the help text says."""
     assert {name for name, option in OPTIONS.items() if option.bounds} == {name for name, _ in BEYOND}
-    assert OPTIONS["similar_views"].bounds == "0<=x<1"
+    assert OPTIONS["measure"].bounds == "0<=x<=1"
+    assert OPTIONS["target_loss"].bounds == "0<x<1"
     assert OPTIONS["near"].bounds == "x>0"
     assert OPTIONS["steps_sos"].bounds == "0<=x<=10000000"
-    assert OPTIONS["prune_weight"].bounds == "x>=0"
     assert OPTIONS["up"].bounds == ""
     assert OPTIONS["orbit"].bounds == "1<=x<=2000"
 
@@ -174,6 +174,17 @@ def test_former_names_are_refused_with_the_present_one(old: str, new: str, capsy
         return
     with pytest.raises(SettingsError, match=f"it is called {new} now"):
         checked(JobParameters, {old: "x"})
+
+
+@pytest.mark.parametrize(("name", "advice"), REMOVED.items())
+def test_removed_options_are_refused_with_advice(name: str, advice: str, capsys: pytest.CaptureFixture[str]) -> None:
+    flag = "--" + name.replace("_", "-")
+    assert main(["stylize", "scene.ply", flag, "1"]) == 2
+    assert f"{flag}: it was removed: {advice}" in capsys.readouterr().err
+    with pytest.raises(SettingsError, match="it was removed"):
+        checked(JobParameters, {name: 1.0})
+    with pytest.raises(SettingsError, match="stored by an earlier version"):
+        stored_parameters({name: 1.0})
 
 
 def test_a_stored_job_is_read_under_former_names() -> None:

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from api.cli import progress_bars
 from api.cli.progress_bars import clock, job_bar
-from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.stylizing.loop import Progress
 from worker.description import Prepared
 

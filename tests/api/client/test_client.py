@@ -245,8 +245,9 @@ def test_a_plan_tells_how_far_it_is(connect: Any, service: Service, files: dict[
         )
         assert (plan["gaussians"], plan["views"]) == (616, 3)
         assert told[-1] == (3, 3)
-        with pytest.raises(RequestError, match="prun") as caught:
-            client.plan(files["scene"], files["style"], prune_weight=1e9, **options)
+        frozen = {"name": "middle", "select": "sphere=0,0,3,2.5", "freeze": True}
+        with pytest.raises(RequestError, match="that a view sees is frozen") as caught:
+            client.plan(files["scene"], files["style"], regions=[frozen], **options)
         assert (caught.value.status, caught.value.problem["code"]) == (422, "invalid-settings")
 
 

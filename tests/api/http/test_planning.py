@@ -14,6 +14,8 @@ from httpx_sse import ServerSentEvent, connect_sse
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.small_scenes import wall, write_files
 
+#: Region that freezes every Gaussian in view, but not those at the corners of the wall.
+IN_VIEW = {"name": "middle", "select": "sphere=0,0,3,2.5", "freeze": True}
 PARAMETERS = {"preset": "preview", "backbone": "vgg16", "resolution": 128}
 
 
@@ -68,9 +70,9 @@ def test_what_cannot_be_used_is_refused_before_the_first_event(service: Service,
 
 def test_what_only_the_plan_finds_is_an_event(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
-        last = events(client, files, prune_weight=1e9)[-1]
+        last = events(client, files, regions=[IN_VIEW])[-1]
         assert (last.event, last.json()["status"], last.json()["code"]) == ("problem", 422, "invalid-settings")
-        plain = client.post("/v1/jobs", **request(files, prune_weight=1e9))
+        plain = client.post("/v1/jobs", **request(files, regions=[IN_VIEW]))
         assert (plain.status_code, plain.json()) == (422, last.json())
 
 

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_variants_run_and_are_judged_at_the_same_moments(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
-    names = ["standard", "coarse-only", "coarse-to-fine", "cold-start", "pruned", "half-weights"]
+    names = ["standard", "coarse-only", "coarse-to-fine", "cold-start", "half-weights"]
     scene, views = wall(), cameras(2, 96, 72)
     curves = error_time(scene, views, style(), choose_variants(names), 1.0, weights=tiny_weights, coarsest_side=36)
     assert [curve.variant.name for curve in curves] == names
@@ -72,9 +72,9 @@ def test_the_front_holds_what_nothing_beats() -> None:
     def curve(name: str, *points: tuple[float, float]) -> Curve:
         return Curve(VARIANTS[name], [Point(seconds, 1, loss, {0: loss}) for seconds, loss in points])
 
-    curves = [curve("standard", (1, 0.9), (2, 0.5), (4, 0.3)), curve("pruned", (1, 0.8), (2, 0.6), (3, 0.4))]
+    curves = [curve("standard", (1, 0.9), (2, 0.5), (4, 0.3)), curve("two-views", (1, 0.8), (2, 0.6), (3, 0.4))]
     front = [(name, point.seconds) for name, point in pareto_front(curves)]
-    assert front == [("pruned", 1), ("standard", 2), ("pruned", 3), ("standard", 4)]
+    assert front == [("two-views", 1), ("standard", 2), ("two-views", 3), ("standard", 4)]
 
 
 def test_an_unknown_variant_is_named() -> None:

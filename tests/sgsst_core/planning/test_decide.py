@@ -11,18 +11,14 @@ import pytest
 import torch
 
 from sgsst_core.decision import Decision
-from sgsst_core.errors import SettingsError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import MOST_VECTORS
-from sgsst_core.planning.choices import uncached_rasterizer
-from sgsst_core.planning.cost import OPTIMIZER_BYTES, LaunchCost, RasterCost, Rate, gaussian_bytes
-from sgsst_core.planning.decide import LEAST_PASSES, decide
-from sgsst_core.planning.memory import MEASURING_BYTES, SHAPE_BYTES
+from sgsst_core.planning.choices import LEAST_PASSES, uncached_rasterizer
+from sgsst_core.planning.cost import MEASURING_BYTES, OPTIMIZER_BYTES, SHAPE_BYTES, gaussian_bytes
+from sgsst_core.planning.decide import decide
+from sgsst_core.planning.facts import LaunchCost, Link, Machine, NetworkFacts, Probe, RasterCost, Rate, SceneFacts
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.probe import Machine, NetworkFacts, Probe, SceneFacts
-from sgsst_core.planning.pruning import ImageError
-from sgsst_core.planning.ranks_model import Link
 from sgsst_core.planning.survey import Survey
 from sgsst_core.settings import make_settings
 
@@ -48,7 +44,6 @@ def probe(**changes: Any) -> Probe:
         **{
             **parts,
             "sizes": ((HEIGHT, WIDTH),) * VIEWS,
-            "distinct": tuple(range(VIEWS)),
             "rasterizer": "cpu",
             "raster": RasterCost(0.3, 0.1, GIGABYTE, GIGABYTE // 2),
             "link": Link(math.inf, 0.0),
@@ -89,16 +84,6 @@ def test_unseen_gaussians_are_left_out_unless_they_are_kept() -> None:
     assert line(everything, "unseen Gaussians") is None
 
 
-def test_pruned_gaussians_come_with_their_error() -> None:
-    plan = plan_of(probe(pruned_error=ImageError(0.1, 0.01)), prune_weight=1.0, keep=("unseen",))
-    assert plan.seen.tolist() == [False, False, False, True, True, True]
-    assert said(plan, "pruned Gaussians").startswith("2 of 6 are neither rendered")
-    assert "no pixel of a view changes by more than 25.5" in line(plan, "pruned Gaussians").error  # type: ignore[union-attr]
-    assert line(plan_of(probe()), "pruned Gaussians") is None
-    with pytest.raises(SettingsError, match="the largest total blend weight is 8"):
-        plan_of(probe(), prune_weight=8.0)
-
-
 @pytest.mark.parametrize(
     ("degree", "used", "keep", "expected"),
     [
@@ -116,14 +101,11 @@ def test_spherical_harmonics(degree: int, used: int, keep: tuple[Any, ...], expe
 # --- views ---------------------------------------------------------------------------------------------------------
 
 
-def test_blind_and_similar_views_are_left_out() -> None:
-    plan = plan_of(probe(covered=[0, 1, 3], distinct=(0, 3)), similar_views=0.01)
-    assert plan.covered == (0, 3)
+def test_blind_views_are_skipped() -> None:
+    plan = plan_of(probe(covered=[0, 1, 3]))
+    assert plan.covered == (0, 1, 3)
     assert said(plan, "views") == "1 of 4 are skipped: they see no Gaussian"
-    assert said(plan, "similar views").startswith("1 of 4 are skipped")
-    assert line(plan, "similar views").bytes > 0  # type: ignore[union-attr, operator]
-    whole = plan_of(probe())
-    assert line(whole, "views") is line(whole, "similar views") is None
+    assert line(plan_of(probe()), "views") is None
 
 
 @pytest.mark.parametrize(
@@ -460,7 +442,7 @@ def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
     ("raster", "reason"),
     [
         (
-            replace(FASTER, kept_seconds=0.011),
+            replace(FASTER, cached_seconds=0.011),
             "cached weights are not faster here: measured per view: 11 ms cached, 10 ms recomputed",
         ),
         (RasterCost(0.01, None, 40 * GIGABYTE, 20 * GIGABYTE), "the weights of one view do not fit"),
@@ -617,26 +599,20 @@ def test_nothing_changes_a_plan() -> None:
 def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
     found = probe(
         covered=[0, 1, 2],
-        distinct=(0, 1),
         used_degree=0,
         uncovered_share=0.5,
         regions=[Rectangle(160, 160, 320, 320)] * VIEWS,
-        pruned_error=ImageError(0.1, 0.1),
         ranks=2,
         link=Link(1e9, 1e-4),
         precision_ratio=2.0,
         content_bytes=0,
         device="cuda",
     )
-    plan = plan_of(
-        found, prune_weight=1.0, content_weight=0, coarsest_side=4000, similar_views=0.1, precision="bfloat16"
-    )
+    plan = plan_of(found, content_weight=0, coarsest_side=4000, precision="bfloat16")
     assert [decision.item for decision in plan.decisions] == [
         "unseen Gaussians",
-        "pruned Gaussians",
         "spherical harmonics",
         "views",
-        "similar views",
         "uncovered pixels",
         "position weights",
         "training_background",

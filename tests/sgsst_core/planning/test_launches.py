@@ -13,9 +13,7 @@ if torch.cuda.is_available():
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.planning import launches
-from sgsst_core.planning.launches import launch_cost
-from sgsst_core.planning.probe import LEAST_GRAPH_VISITS
+from sgsst_core.planning.probe import LAUNCH_RUNS, LEAST_GRAPH_VISITS, launch_cost
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
@@ -46,7 +44,7 @@ def test_both_ways_are_timed(counts: Counts, tiny_weights: BackboneWeights) -> N
     assert found.replayed > 0
     assert found.capture >= 0
     replays = [count for line, count in counts.launches.items() if "loss/graphs.py" in line]
-    assert launches.RUNS + 1 in replays  # including the run after the capture
+    assert LAUNCH_RUNS + 1 in replays  # including the run after the capture
 
 
 def test_what_cannot_be_timed_has_a_reason(

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from sgsst_core.planning.cost import RasterCost
 from sgsst_core.planning.decide import decide
+from sgsst_core.planning.facts import RasterCost
 from sgsst_core.planning.measuring import (
     LEAST_ALLOWED,
     LEVELS,

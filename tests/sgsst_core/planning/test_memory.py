@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sgsst_core.planning.cost import OPTIMIZER_BYTES, RasterCost, gaussian_bytes
+from sgsst_core.planning.cost import (
+    BUILDING_BYTES,
+    MEASURING_BYTES,
+    OPTIMIZER_BYTES,
+    SEARCH_BYTES,
+    SHAPE_BYTES,
+    gaussian_bytes,
+)
 from sgsst_core.planning.decide import decide
+from sgsst_core.planning.facts import RasterCost
 from sgsst_core.planning.measuring import LEVELS
-from sgsst_core.planning.memory import BUILDING_BYTES, MEASURING_BYTES, SEARCH_BYTES, SHAPE_BYTES
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import GIGABYTE, HEIGHT, VIEWS, WIDTH, plan_of, probe
-from tests.sgsst_core.planning.test_visits import HUGE, LARGE, expected
-from tests.sgsst_core.planning.test_visits import plan_of as plan_of_raster
+from tests.sgsst_core.planning.test_view_costs import HUGE, LARGE, expected
+from tests.sgsst_core.planning.test_view_costs import plan_of as plan_of_raster
 
 #: Budget in bytes for tile intersections and weights.
 ROOM = 10 * GIGABYTE // 4

@@ -8,9 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.planning.pruning import distinct_views, pruned_image_error
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
@@ -86,50 +84,6 @@ def test_blend_weights_are_kept_as_memory_and_visits_allow(tiny_weights: Backbon
     decision = next(d for d in little.plan.decisions if d.item == "blend weights")
     assert "half precision" in decision.decision
     assert "1/2048" in decision.error
-
-
-def test_pruning_stays_within_its_bound_and_is_made_up_for(tiny_weights: BackboneWeights) -> None:
-    scene, views = behind(ball(600)), cameras(3)
-    whole = make(scene, views, tiny_weights)
-    threshold = float(whole.plan.survey.total_blend_weights.quantile(0.5))
-    pruned = make(scene, views, tiny_weights, prune_weight=threshold)
-    left_out = ~pruned.plan.seen
-    assert 0.4 < float(left_out.double().mean()) < 0.6
-    bound = pruned_image_error(left_out, views, [0, 1, 2], make_rasterizer("cpu", scene))
-    for index in range(3):
-        images = [s.views.render(index, s.views.colors(index, s.sh_dc.detach())) for s in (whole, pruned)]
-        reach = float(max(image.max() for image in images))
-        difference = (images[0] - images[1]).abs()
-        assert 0 < float(difference.max()) <= bound.largest * reach
-    run(pruned)
-    assert bool((pruned.stylized()[left_out] != scene.sh_dc[left_out]).any(dim=1).all())
-    assert any(decision.item == "pruned Gaussians" for decision in pruned.plan.decisions)
-
-
-def test_pruning_everything_is_refused(tiny_weights: BackboneWeights) -> None:
-    with pytest.raises(SettingsError, match="largest total blend weight"):
-        make(wall(), cameras(1), tiny_weights, prune_weight=1e9)
-
-
-def test_similar_views_are_left_out_only_when_asked(tiny_weights: BackboneWeights) -> None:
-    scene = wall()
-    views = [camera for camera in cameras(3) for _ in range(2)]  # every view twice
-    assert make(scene, views, tiny_weights).plan.covered == (0, 1, 2, 3, 4, 5)
-    plan = make(scene, views, tiny_weights, similar_views=1e-4).plan
-    assert plan.covered == (0, 2, 4)
-    assert any(decision.item == "similar views" for decision in plan.decisions)
-
-
-def test_distinct_views_by_their_shift() -> None:
-    """Cameras 0.3 apart, at distance 3 from a wall, with a focal length of one image width: a shift by 0.1 widths."""
-    scene, views = wall(), cameras(3)
-    turned = [replace(camera, world_to_camera=camera.world_to_camera.clone()) for camera in views]
-    for camera, x in zip(turned, (-0.3, 0.0, 0.3), strict=True):
-        camera.world_to_camera[:] = torch.eye(4)
-        camera.world_to_camera[0, 3] = -x
-    weights = torch.ones(len(scene), dtype=torch.float64)
-    assert distinct_views(scene, turned, [0, 1, 2], weights, 0.09) == [0, 1, 2]
-    assert distinct_views(scene, turned, [0, 1, 2], weights, 0.11) == [0, 2]
 
 
 def test_rendering_without_unseen_gaussians_is_bitwise_the_same(tiny_weights: BackboneWeights) -> None:

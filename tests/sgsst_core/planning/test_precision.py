@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,9 +12,9 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.difference import Difference
 from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning import precision
-from sgsst_core.planning.precision import convolution_ratio, gradient_error, precision_ratio, seconds_of
-from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.planning import context as module
+from sgsst_core.planning.context import convolution_ratio, equip, precision_ratio, seconds_of
+from sgsst_core.planning.probe import gradient_error
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToTf32, to_tf32
@@ -23,8 +24,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def error_of(network: FeatureNetwork, weights: BackboneWeights, side: int = 384) -> Difference | None:
-    scene = wall(sh_degree=1)
-    return gradient_error(network, weights, scene, cameras(1)[0], make_rasterizer("cpu", scene), 1 << 30, side)
+    settings = make_settings(memory_limit=2 << 30)
+    context = equip(wall(sh_degree=1), cameras(1), settings, weights, ALONE, "cpu")
+    return gradient_error(replace(context, network=network), cameras(1)[0], side)
 
 
 def test_ten_bits_have_an_error_of_a_thousandth_but_for_flips(vgg16_weights: BackboneWeights) -> None:
@@ -70,8 +72,8 @@ def test_tf32_needs_every_rank_to_have_it(monkeypatch: pytest.MonkeyPatch) -> No
         def all_gather(self, value: Any) -> list[Any]:
             return [value, has_it]
 
-    monkeypatch.setattr(precision, "has_tf32", lambda device: True)
-    monkeypatch.setattr(precision, "convolution_ratio", lambda asked, device: 3.0)
+    monkeypatch.setattr(module, "has_tf32", lambda device: True)
+    monkeypatch.setattr(module, "convolution_ratio", lambda asked, device: 3.0)
     has_it = True
     assert precision_ratio("tf32", "cuda", Others()) == 3.0
     has_it = False

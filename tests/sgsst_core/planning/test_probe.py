@@ -13,13 +13,11 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.cost import Rate
+from sgsst_core.planning.context import PlanningContext, equip
+from sgsst_core.planning.facts import Link, Rate
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import PlanningContext, _side, equip, measure, measure_rate
-from sgsst_core.planning.progress import PlanningProgress, progress_of
-from sgsst_core.planning.pruning import pruned_image_error
-from sgsst_core.planning.ranks_model import Link
-from sgsst_core.planning.survey import survey_views
+from sgsst_core.planning.probe import _side, measure, measure_rate
+from sgsst_core.planning.survey import PlanningProgress, progress_of, survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
@@ -44,8 +42,6 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     probe = measure(planning_context, survey_views(scene, planning_context.cameras, planning_context.rasterizer), FREE)
     assert (probe.scene.gaussians, probe.scene.sh_degree, probe.scene.used_degree) == (len(scene), 3, 0)
     assert probe.sizes == tuple((camera.height, camera.width) for camera in cameras(3))
-    assert probe.distinct == (0, 1, 2)
-    assert probe.pruned_error is None
     assert (probe.network.halo, probe.network.held_bytes) == (
         planning_context.network.halo,
         planning_context.network.held_bytes_per_pixel(),
@@ -104,15 +100,6 @@ def test_the_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, mo
     loss = SosLoss(equipped(tiny_weights, wall()).network, memory=1 << 30)
     assert measure_rate(loss, 64) == Rate(forward=2.0 / 64**2, both=3.0 / 64**2)
     assert next(taken, None) is None
-
-
-def test_the_error_of_pruning_is_measured_where_something_is_pruned(tiny_weights: BackboneWeights) -> None:
-    scene = wall()
-    survey = survey_views(scene, cameras(3), make_rasterizer("cpu", scene))
-    threshold = float(survey.total_blend_weights.quantile(0.5))
-    probe = measure(equipped(tiny_weights, scene, prune_weight=threshold), survey, FREE)
-    left_out = survey.total_blend_weights <= threshold
-    assert probe.pruned_error == pruned_image_error(left_out, cameras(3), [0, 1, 2], make_rasterizer("cpu", scene))
 
 
 def test_the_survey_counts_what_a_view_shows() -> None:

@@ -74,17 +74,6 @@ def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeigh
     assert reference.gradient_error().relative_error != first.relative_error
 
 
-def test_pruning_has_an_error_that_grows_with_what_is_pruned(tiny_weights: BackboneWeights) -> None:
-    weights = make(tiny_weights).plan.survey.total_blend_weights
-    errors = []
-    for share in (0.2, 0.7):
-        stylizer = make(tiny_weights, prune_weight=float(weights.quantile(share)))
-        stylizer.run_step()
-        assert approximations(stylizer) == ["pruned Gaussians"]
-        errors.append(Float32Reference(stylizer).gradient_error().relative_error)
-    assert 0 < errors[0] < errors[1]
-
-
 def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -> None:
     """The plan is constructed by hand, and TF32 is emulated, because a CPU would use float32."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12, warm_start=False)

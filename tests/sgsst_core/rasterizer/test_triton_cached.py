@@ -13,9 +13,10 @@ from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.context import equip
+from sgsst_core.planning.facts import Link
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import equip, measure
-from sgsst_core.planning.ranks_model import Link
+from sgsst_core.planning.probe import measure
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
@@ -232,9 +233,9 @@ def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) ->
         for view in VIEWS:
             cached.coverage(view)
         assert cached.cached_bytes == size
-    assert found.kept_seconds is not None
-    assert found.keeping_seconds is not None
-    assert min(found.seconds, found.kept_seconds, found.keeping_seconds) > 0
+    assert found.cached_seconds is not None
+    assert found.caching_seconds is not None
+    assert min(found.seconds, found.cached_seconds, found.caching_seconds) > 0
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sgsst_core.planning.progress import PlanningProgress
+from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.stylizing.loop import Progress
 from worker.description import Prepared
 from worker.ranks.listener import Listener, Relay

@@ -14,7 +14,7 @@ from torch import Tensor
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.ranks_model import probe_link
+from sgsst_core.planning.probe import probe_link
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.pictures import relative_error

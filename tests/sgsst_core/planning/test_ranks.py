@@ -9,7 +9,8 @@ import pytest
 
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.parallel.division import Piece
-from sgsst_core.planning.ranks_model import IterationWork, Link, choose_ranks
+from sgsst_core.planning.cost import IterationWork, choose_ranks
+from sgsst_core.planning.facts import Link
 
 FREE = Link(math.inf, 0.0)
 SLOW = Link(1e6, 1e-3)

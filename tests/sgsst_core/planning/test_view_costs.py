@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 import torch
 
-from sgsst_core.planning.cost import RasterCost
+from sgsst_core.planning.cost import ViewData
 from sgsst_core.planning.decide import decide
+from sgsst_core.planning.facts import RasterCost
 from sgsst_core.planning.plan import Plan, Prediction
-from sgsst_core.planning.visits import Made
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import GIGABYTE, probe
 
@@ -32,23 +32,24 @@ def expected(*arguments: Any, **values: Any) -> Prediction:
     return found
 
 
-def test_what_fits_is_made_once_and_the_rest_at_every_visit() -> None:
-    made = Made(6.0, 400, 100)
-    assert (made.kept, made.once, made.always, made.cached_bytes) == (0.25, 1.5, 4.5, 100)
-    assert Made(6.0, 400, 500) == replace(made, room=500)
-    assert (Made(6.0, 400, 500).once, Made(6.0, 400, 500).always, Made(6.0, 400, 500).cached_bytes) == (6.0, 0.0, 400)
-    assert (Made(6.0).once, Made(6.0, 400, 0).always) == (6.0, 6.0)
+def test_data_that_fit_cost_time_once_and_others_at_every_visit() -> None:
+    data = ViewData(6.0, 400, 100)
+    assert (data.cached, data.once, data.always, data.cached_bytes()) == (0.25, 1.5, 4.5, 100)
+    assert ViewData(6.0, 400, 500) == replace(data, budget=500)
+    fits = ViewData(6.0, 400, 500)
+    assert (fits.once, fits.always, fits.cached_bytes()) == (6.0, 0.0, 400)
+    assert (ViewData(6.0).once, ViewData(6.0, 400, 0).always) == (6.0, 6.0)
 
 
-def test_views_that_are_kept_whole_leave_a_part_of_the_room() -> None:
-    made = Made(6.0, 400, 250, views=4)
-    assert (made.kept, made.once, made.always, made.cached_bytes) == (0.5, 3.0, 3.0, 200)
-    assert (made.fitting(2), made.fitting(4)) == (200, 100)
-    alone = Made(6.0, 400, 250, views=1)
-    assert (alone.kept, alone.always, alone.cached_bytes, alone.fitting(2)) == (0.0, 6.0, 0, 200)
+def test_views_that_are_cached_completely_leave_some_budget_unused() -> None:
+    data = ViewData(6.0, 400, 250, views=4)
+    assert (data.cached, data.once, data.always, data.cached_bytes()) == (0.5, 3.0, 3.0, 200)
+    assert (data.cached_bytes(2), data.cached_bytes(4)) == (200, 100)
+    alone = ViewData(6.0, 400, 250, views=1)
+    assert (alone.cached, alone.always, alone.cached_bytes(), alone.cached_bytes(2)) == (0.0, 6.0, 0, 200)
 
 
-def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
+def test_blend_weights_take_no_memory_if_no_view_fits() -> None:
     """Tile intersections are cached in the memory that is not used for weights, and used to render each view."""
     found = {size: plan_of(replace(LARGE, bytes=8 * size, half_bytes=4 * size)) for size in (GIGABYTE, 3 * GIGABYTE)}
     predictions = [plan.prediction for plan in found.values()]
@@ -56,45 +57,45 @@ def test_blend_weights_of_which_no_view_fits_take_no_memory() -> None:
     assert predictions[0] is not None
     assert predictions[1] is not None
     assert predictions[0].peak_bytes - predictions[1].peak_bytes == pytest.approx(2 * GIGABYTE, rel=0.2)
-    assert predictions[1].first_visit < predictions[0].first_visit, "nothing is made to be kept"
-    told = [next(each for each in plan.decisions if each.item == "blend weights").decision for plan in found.values()]
-    assert told[0].startswith("50% of the views'")
-    assert told[1].startswith("0% of the views'")
+    assert predictions[1].first_visit < predictions[0].first_visit, "nothing is computed to be cached"
+    lines = [next(each for each in plan.decisions if each.item == "blend weights").decision for plan in found.values()]
+    assert lines[0].startswith("50% of the views'")
+    assert lines[1].startswith("0% of the views'")
 
 
-def test_tile_intersections_and_colors_come_with_the_first_visit_where_they_fit() -> None:
+def test_cached_tile_intersections_and_colors_add_to_the_first_visit() -> None:
     """Reducing the survey's intersections to the rendered Gaussians takes a quarter of their cost."""
     small, large = expected(replace(LARGE, first_seconds=0.0, colors_seconds=0.0)), expected(LARGE)
     assert large.first_visit - small.first_visit == pytest.approx(0.25 * 5 + 0.5)
     assert large.seconds == small.seconds
 
 
-def test_tile_intersections_that_do_not_fit_are_made_at_every_visit() -> None:
+def test_tile_intersections_that_do_not_fit_add_to_every_visit() -> None:
     large, huge = expected(LARGE), expected(HUGE)
     assert huge.seconds - large.seconds == pytest.approx(5.0 * 3 / 4)
     assert large.first_visit - huge.first_visit == pytest.approx(0.25 * 5.0 * 3 / 4)
     assert huge.job > large.job
 
 
-def test_tile_intersections_of_the_survey_are_the_jobs_where_every_gaussian_is_rendered() -> None:
+def test_survey_intersections_are_reused_if_every_gaussian_is_rendered() -> None:
     """If only some Gaussians are rendered, the intersections must be reduced first."""
-    cut, handed = expected(LARGE), expected(LARGE, keep=("unseen",))
-    assert cut.first_visit - handed.first_visit == pytest.approx(0.25 * 5.0)
+    restricted, reused = expected(LARGE), expected(LARGE, keep=("unseen",))
+    assert restricted.first_visit - reused.first_visit == pytest.approx(0.25 * 5.0)
 
 
-def test_phase_1_makes_what_phase_2_finds() -> None:
+def test_phase_1_prepares_views_for_phase_2() -> None:
     alone, both = expected(LARGE), expected(LARGE, steps_coarse=40)
     assert alone.first_visit - both.first_visit == pytest.approx(0.25 * 5 + 0.5)
     assert both.first_visit_coarse > 0.25 * 5 + 0.5
 
 
-def test_content_that_is_not_kept_is_computed_at_every_visit() -> None:
-    kept, uncached = expected(LARGE), expected(LARGE, keep=("content",))
-    assert uncached.seconds - kept.seconds == pytest.approx(kept.first_visit - uncached.first_visit)
+def test_uncached_content_adds_to_every_visit() -> None:
+    cached, uncached = expected(LARGE), expected(LARGE, keep=("content",))
+    assert uncached.seconds - cached.seconds == pytest.approx(cached.first_visit - uncached.first_visit)
     assert uncached.first_visit == pytest.approx(0.25 * 5 + 0.5)
 
 
-def test_weights_that_do_not_fit_save_nothing() -> None:
+def test_uncached_weights_save_no_time() -> None:
     """Cached weights get a quarter of 10 GB."""
     fit, quarter = (
         expected(RasterCost(0.3, 0.1, 40 * GIGABYTE, size), cached_weights="half")
@@ -103,7 +104,7 @@ def test_weights_that_do_not_fit_save_nothing() -> None:
     assert quarter.seconds - fit.seconds == pytest.approx(0.2 * 3 / 4)
 
 
-def test_maps_of_regions_come_with_the_first_visit() -> None:
+def test_region_maps_add_to_the_first_visit() -> None:
     """Four regions take two renders, plus one for the background.
 
     Each takes half as long as a render with its gradient.
@@ -119,11 +120,11 @@ def test_maps_of_regions_come_with_the_first_visit() -> None:
     assert found[1].peak_bytes - found[0].peak_bytes == pytest.approx(4 * pixels * 16 / 3, abs=2)
 
 
-def test_kept_gaussians_are_rendered_and_not_optimized() -> None:
+def test_frozen_gaussians_are_rendered_and_not_optimized() -> None:
     plain = probe()
-    kept = torch.zeros(plain.scene.gaussians, dtype=torch.bool)
-    kept[:10] = True
+    frozen = torch.zeros(plain.scene.gaussians, dtype=torch.bool)
+    frozen[:10] = True
     settings = make_settings(steps_coarse=0, steps_sos=40)
-    without, found = (decide(each, settings) for each in (plain, replace(plain, kept=kept)))
+    without, found = (decide(each, settings) for each in (plain, replace(plain, frozen=frozen)))
     assert torch.equal(found.seen, without.seen)
-    assert torch.equal(found.optimized, without.optimized & ~kept)
+    assert torch.equal(found.optimized, without.optimized & ~frozen)

@@ -1,0 +1,180 @@
+"""Objects that are created to measure a job before its first step, and that the job continues to use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from sgsst_core.budget import default_memory_limit
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
+from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, rasterizer_options, uncached_rasterizer
+from sgsst_core.planning.facts import Machine
+from sgsst_core.planning.plan import Device
+from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
+from sgsst_core.rasterizer.trial import drawing_problem
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Precision, Settings
+from sgsst_core.timing import Timer
+
+DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16}
+#: Channels and side of the timed convolution: about a millisecond of work on a CPU core, and enough to fill a GPU.
+_CHANNELS: dict[Device, int] = {"cpu": 128, "cuda": 256}
+_SIDE: dict[Device, int] = {"cpu": 24, "cuda": 256}
+#: Minimum total seconds of the repetitions, so that the launch time is negligible.
+_LEAST_SECONDS: dict[Device, float] = {"cpu": 0.0, "cuda": 5e-3}
+
+
+@dataclass(frozen=True)
+class PlanningContext:
+    """Objects that are created for measuring before the job, and that the job continues to use.
+
+    Attributes:
+        scene: Whole scene, with the SH attenuation of the settings applied.
+        cameras: Cameras at the size used for stylization.
+        settings: Settings of the job.
+        machine: Facts about the machine.
+        weights: Weights of the network.
+        network: Network in the precision in which it will run.
+        precision_ratio: See `NetworkFacts`.
+        rasterizer: Rasterizer of the whole scene that computes blend weights.
+        sh_degree: SH degree of the original scene.
+    """
+
+    scene: Scene
+    cameras: tuple[Camera, ...]
+    settings: Settings
+    machine: Machine
+    weights: BackboneWeights
+    network: FeatureNetwork
+    precision_ratio: float | None
+    rasterizer: Rasterizer
+    sh_degree: int
+
+
+def equip(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: Settings,
+    weights: BackboneWeights,
+    collectives: Collectives,
+    rasterizer: str | None = None,
+) -> PlanningContext:
+    """Create the planning context. Every rank must call this, and gets the same result up to rounding.
+
+    Args:
+        scene: Scene as it was read.
+        cameras: Cameras at the size used for stylization.
+        settings: Settings of the job.
+        weights: Weights of the network.
+        collectives: Ranks of the job.
+        rasterizer: Rasterizer that computes blend weights; None to choose one.
+    """
+    sh_degree, scene = scene.sh_degree, scene.attenuated(settings.sh_attenuation)
+    device = common_device(collectives)
+    problems = gpu_problems(collectives) if device == "cuda" else {}
+    ratio = precision_ratio(settings.precision, device, collectives)
+    network = make_network(weights, settings, precision_of(settings.precision, ratio), device)
+    limit = settings.memory_limit or default_memory_limit(network.device)
+    machine = Machine(
+        device,
+        # The partition, and thereby rounding, depends on the limit, so it must be identical on all ranks.
+        memory_limit=min(collectives.all_gather(limit)),
+        sharing=sharing_memory(collectives, device),
+        ranks=collectives.size,
+        problems=problems,
+    )
+    name = rasterizer or uncached_rasterizer(device, problems)
+    whole = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
+    return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, ratio, whole, sh_degree)
+
+
+def common_device(collectives: Collectives) -> Device:
+    """Return the device that is available on all ranks."""
+    return "cuda" if all(collectives.all_gather(torch.cuda.is_available())) else "cpu"
+
+
+def gpu_problems(collectives: Collectives) -> dict[str, str]:
+    """Return the reason, by name, why each GPU rasterizer that was tried does not work on some rank.
+
+    Rasterizers are tried in order of preference, until one works.
+    """
+    problems: dict[str, str] = {}
+    for name in GPU_RASTERIZERS:
+        problem = rasterizer_problem(collectives, name)
+        if problem is None:
+            break
+        problems[name] = problem
+    return problems
+
+
+def rasterizer_problem(collectives: Collectives, name: RasterizerName) -> str | None:
+    """Return the reason why a GPU rasterizer does not work on some rank; None if it works on all."""
+    return next(filter(None, collectives.all_gather(drawing_problem(name))), None)
+
+
+def sharing_memory(collectives: Collectives, device: Device) -> int:
+    """Return the maximum number of ranks that share the memory of a machine; GPUs do not share theirs."""
+    return max(collectives.all_gather(1 if device == "cuda" else collectives.local_size))
+
+
+def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
+    """Create the feature network with layers up to the deepest one used."""
+    layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0)
+    use_whole_float32()
+    return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
+
+
+def precision_ratio(asked: Precision, device: Device, collectives: Collectives) -> float | None:
+    """Return how many times faster a convolution is in the requested precision than in float32.
+
+    All ranks must call this.
+
+    Returns:
+        Ratio measured on the first rank. None if float32 was requested, or TF32 is missing on some rank.
+    """
+    if asked == "float32" or (asked == "tf32" and not all(collectives.all_gather(has_tf32(device)))):
+        return None
+    return collectives.broadcast(lambda: convolution_ratio(asked, device))
+
+
+def convolution_ratio(precision: Precision, device: Device) -> float:
+    """Return the ratio of a convolution's time in float32 to its time in another precision."""
+    return _convolution_seconds("float32", device) / _convolution_seconds(precision, device)
+
+
+def _convolution_seconds(precision: Precision, device: Device) -> float:
+    """Return the time in seconds of a 3x3 convolution."""
+    channels, side, dtype = _CHANNELS[device], _SIDE[device], DTYPES[precision]
+    image = torch.ones((1, channels, side, side), dtype=dtype, device=device)
+    kernel = torch.ones((channels, channels, 3, 3), dtype=dtype, device=device)
+    if device == "cuda":
+        image, kernel = (tensor.contiguous(memory_format=torch.channels_last) for tensor in (image, kernel))
+
+    def run(times: int) -> float:
+        timer = Timer(device)
+        with convolutions(image.device, tf32=precision == "tf32"), timer("convolution"):
+            for _ in range(times):
+                torch.nn.functional.conv2d(image, kernel, padding=1)
+        return timer.read()["convolution"]
+
+    return seconds_of(run, _LEAST_SECONDS[device])
+
+
+def seconds_of(run: Callable[[int], float], least: float) -> float:
+    """Return the time in seconds of one repetition, from enough repetitions to take `least` seconds after a warm-up.
+
+    Args:
+        run: Function that repeats something a number of times and returns the total seconds.
+        least: Minimum total seconds.
+    """
+    run(1)
+    times = 1
+    while (seconds := run(times)) < least:
+        times *= 2
+    return seconds / times
