@@ -427,7 +427,7 @@ def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, 
 
 
 def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[CachedWeights, Decision]:
-    """Choose the format of cached blend weights: float32 if they fit, else half precision; none if caching does not pay."""
+    """Choose the format of cached blend weights: float32 if they fit, else half precision; none if it does not pay."""
     raster, item = probe.raster, "blend weights"
     why_not = _why_not_cached(probe, settings, visits)
     if why_not is not None:
