@@ -13,7 +13,7 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers
 from sgsst_core.files.colors import write_colors
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.scene_file import write_packed, write_stylized
+from sgsst_core.files.scene_file import write_scene, write_stylized
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
@@ -193,11 +193,11 @@ def _only_colors_change(job: Job) -> bool:
 
 def _write_packed(job: Job) -> PackedLoss | None:
     """Write the stylized scene in a compressed format beside the PLY, and measure the loss of quality."""
-    path, form, stylizer = job.outputs.packed, job.outputs.packed_form, job.stylizer
-    if path is None or form is None:
+    path, format, stylizer = job.outputs.packed, job.outputs.packed_format, job.stylizer
+    if path is None or format is None:
         return None
     scene = replace(stylizer.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
-    write_packed(path, scene, form)
+    write_scene(path, scene, format)
     settings = stylizer.settings
     return measure_packed(path, scene, stylizer.views.cameras, background=settings.background, near=settings.near)
 

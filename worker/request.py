@@ -7,7 +7,9 @@ from pathlib import Path
 
 from sgsst_core.errors import CameraError, OutputError, SettingsError
 from sgsst_core.files.atomic import ensure_writable_folder
-from sgsst_core.files.scene_headers import PackedForm, form_of_name
+from sgsst_core.files.formats import RESULT_SUFFIXES, format_of_name
+from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, ViewOptions
@@ -19,7 +21,7 @@ class SceneRequest(ViewOptions):
     """Scene and cameras of a request.
 
     Attributes:
-        scene: Path of the 3DGS scene: PLY, compressed PLY, SPZ or .splat.
+        scene: Path of the 3DGS scene, in any of `FORMATS`.
         cameras: Camera file or folder; None for an orbit.
     """
 
@@ -77,19 +79,19 @@ class Outputs:
         """Return the output files of a job, given the name of its PLY or of the compressed file beside it.
 
         Raises:
-            OutputError: If the name does not end in .ply, .compressed.ply or .spz.
+            OutputError: If the name does not end in a suffix of a format that can be written.
         """
-        form = form_of_name(out.name)
-        if form is None:
-            raise OutputError(f"{out}: does not end in .ply, .compressed.ply or .spz. Name the scene file to write.")
-        if form == "ply":
+        format = format_of_name(out.name)
+        if format is None or format.write is None:
+            raise OutputError(f"{out}: does not end in {RESULT_SUFFIXES}. Name the scene file to write.")
+        if format is PLY:
             return Outputs(out)
-        return Outputs(out.with_name(out.name[: -len(form) - 1] + ".ply"), out)
+        return Outputs(out.with_name(out.name[: -len(format.suffix)] + PLY.suffix), out)
 
     @property
-    def packed_form(self) -> PackedForm | None:
+    def packed_format(self) -> SceneFormat | None:
         """Return the format of the compressed file; None if there is none."""
-        return None if self.packed is None else "spz" if form_of_name(self.packed.name) == "spz" else "compressed.ply"
+        return None if self.packed is None else format_of_name(self.packed.name)
 
     def _beside(self, suffix: str) -> Path:
         return self.ply.with_name(self.ply.stem + suffix)

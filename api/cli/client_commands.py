@@ -21,7 +21,15 @@ from api.cli.progress_bars import clock
 from api.cli.region_options import RegionKeepOption, RegionOption, RegionStyleOption, RegionWeightOption
 from api.client.inputs import different_names
 from service.parameters import JobParameters
-from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm, form_of_name, packed_name
+from sgsst_core.files.formats import (
+    EXTRA_FORMATS,
+    RESULT_SUFFIXES,
+    SUFFIXES,
+    ExtraName,
+    by_name,
+    format_of_name,
+    result_name,
+)
 from worker.regions import RegionOptions, region_options, region_requests
 from worker.styles import parse_styles
 
@@ -55,7 +63,7 @@ def add_to(app: typer.Typer) -> None:
 def submit(
     scene: Annotated[
         Path,
-        typer.Argument(metavar="SCENE", help="3DGS scene: .ply, .compressed.ply, .spz or .splat.", show_default=False),
+        typer.Argument(metavar="SCENE", help=f"3DGS scene: {SUFFIXES}.", show_default=False),
     ],
     style: Annotated[
         list[str],
@@ -84,7 +92,7 @@ def submit(
     webhook: Annotated[str | None, typer.Option(help="URL to notify when the job ends.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Wait for the job, and write the scene to this file: .ply, .compressed.ply or .spz."),
+        typer.Option(help=f"Wait for the job, and write the scene to this file: {RESULT_SUFFIXES}."),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check the inputs and plan the job without queueing it.")
@@ -164,7 +172,7 @@ def download(
     ),
     out: Annotated[Path | None, typer.Option(help="File to write, or folder for 'all'. [default: NAME]")] = None,
     form: Annotated[
-        PackedForm | None,
+        ExtraName | None,
         typer.Option("--format", help="Compressed format of stylized.ply. [default: from the ending of --out]"),
     ] = None,
     as_json: JsonOption = False,
@@ -181,7 +189,7 @@ def download(
             with _transfer(each) as progress:
                 chosen = (form or _packed_form(target)) if each == "stylized.ply" else None
                 if form and out is None and each == "stylized.ply":
-                    target = Path(packed_name(each, form))
+                    target = Path(result_name(each, by_name(form)))
                 written.append(str(client.download(job, target, each, progress, chosen)))
             if not as_json:
                 _tell_loss(client, job, chosen)
@@ -316,21 +324,21 @@ def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
 
 
-def _tell_loss(client: Client, job_id: str, form: PackedForm | None) -> None:
+def _tell_loss(client: Client, job_id: str, form: ExtraName | None) -> None:
     """Print the quality loss of a compressed result."""
     if form is None:
         return
     with tempfile.TemporaryDirectory() as folder:
-        name = f"{packed_name('stylized.ply', form)}.json"
+        name = f"{result_name('stylized.ply', by_name(form))}.json"
         found = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
     psnr = "renders identical to" if found["psnr_db"] is None else f"{found['psnr_db']:.1f} dB PSNR against"
     error_console.print(f"{form}, {found['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
 
 
-def _packed_form(out: Path) -> PackedForm | None:
+def _packed_form(out: Path) -> ExtraName | None:
     """Return the compressed format that the ending of a file name stands for; None for any other name."""
-    form = form_of_name(out.name)
-    return form if form in PACKED_FORMS else None
+    format = format_of_name(out.name)
+    return format.name if format in EXTRA_FORMATS else None
 
 
 def _step_text(progress: Any) -> str:

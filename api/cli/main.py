@@ -20,6 +20,7 @@ from api.cli.options import with_options
 from api.cli.progress_bars import clock, job_bar, live_bar
 from api.cli.region_options import RegionKeepOption, RegionOption, RegionStyleOption, RegionWeightOption
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, WeightsError
+from sgsst_core.files.formats import EXTRA_SUFFIXES, SUFFIXES
 from sgsst_core.options import renamed_hint
 from sgsst_core.settings import make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
@@ -60,7 +61,7 @@ error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=Tr
 
 SceneArgument = Annotated[
     Path,
-    typer.Argument(metavar="SCENE", help="3DGS scene: .ply, .compressed.ply, .spz or .splat.", show_default=False),
+    typer.Argument(metavar="SCENE", help=f"3DGS scene: {SUFFIXES}.", show_default=False),
 ]
 CamerasOption = Annotated[
     Path | None,
@@ -99,8 +100,8 @@ def stylize(
     out: Annotated[
         Path,
         typer.Option(
-            help="Stylized PLY to write; report and images go beside it. A .compressed.ply or .spz is written in "
-            "addition to a PLY of the same name."
+            help="Stylized PLY to write; report and images go beside it. "
+            f"A {EXTRA_SUFFIXES} is written in addition to a PLY of the same name."
         ),
     ],
     cameras: CamerasOption = None,

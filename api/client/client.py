@@ -168,7 +168,7 @@ class JobMethods(Methods):
         """Download a file of a job, and check its SHA-256. If part of it was downloaded before, resume from there.
 
         Args:
-            form: Format of stylized.ply: "compressed.ply" or "spz"; None for PLY. The service converts the file on the
+            form: Format of stylized.ply, such as "spz"; None for PLY. The service converts the file on the
                 first request.
 
         Raises:

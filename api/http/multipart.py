@@ -25,7 +25,7 @@ from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_name
 from service.settings import ServiceSettings
 from sgsst_core.errors import SceneError
-from sgsst_core.files.scene_headers import read_scene_header
+from sgsst_core.files.formats import read_scene_header
 
 #: Maximum bytes of a text field: JSON parameters or an id.
 _MAX_TEXT = 1 << 16
@@ -328,19 +328,9 @@ def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSet
     if role != "scene":
         return
     try:
-        declared = read_scene_header(path)
+        count = read_scene_header(path).count
     except SceneError as error:
         raise RefusedInputError(str(error).replace(os.fspath(path), name), error.code, input=role) from error
-    header = declared.ply
-    least = sum(element.count * element.least_row_bytes(header.text) for element in header.elements) if header else 0
-    if header and len(header.raw) + least - (1 if header.text else 0) > size:
-        raise RefusedInputError(
-            f"{name}: the header declares data of at least {least} bytes, but only {size - len(header.raw)} follow it: "
-            "the file is truncated or its header is wrong. Copy or export it again.",
-            "invalid-scene",
-            input=role,
-        )
-    count = declared.count
     if count > settings.max_gaussians:
         raise RefusedInputError(
             f"The scene has {count:,} Gaussians. At most {settings.max_gaussians:,} are allowed.",

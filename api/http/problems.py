@@ -39,7 +39,7 @@ class Problem(BaseModel):
                     "title": "Unprocessable Content",
                     "status": 422,
                     "code": "invalid-scene",
-                    "detail": "scene.ply: has no PLY header (it does not start with 'ply'). Give a 3DGS scene.",
+                    "detail": "scene.ply: holds no Gaussians (element vertex 0). Export the scene again.",
                     "input": "scene",
                 }
             ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import json
 import mimetypes
 import re
 from dataclasses import dataclass
@@ -18,10 +19,13 @@ from pathlib import Path
 from fastapi import FastAPI, Request, Response
 
 from service.errors import NotFoundError
+from sgsst_core.files.formats import FORMATS
 
 FOLDER = Path(__file__).parents[1] / "static"
 #: Placeholder in pages for the URL prefix of the files.
 _PLACE = b"{{static}}"
+#: Placeholder in `scene_formats.js` for the registry of scene formats.
+_SCENE_FORMATS = b'"{{scene_formats}}"'
 _DIGEST_LETTERS = 16
 #: Minimum size in bytes of files to compress. Smaller files fit in one packet anyway.
 _LEAST_PACKED = 1000
@@ -82,6 +86,8 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
         for path in sorted(folder.rglob("*"))
         if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     }
+    if "scene_formats.js" in contents:
+        contents["scene_formats.js"] = contents["scene_formats.js"].replace(_SCENE_FORMATS, _scene_formats())
     whole = hashlib.sha256()
     for name, body in contents.items():
         whole.update(f"{name}\0{len(body)}\0".encode() + body)
@@ -90,6 +96,16 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
     return StaticFiles(
         digest, *({name: _file(name, body) for name, body in part.items()} for part in (contents, pages))
     )
+
+
+def _scene_formats() -> bytes:
+    """Return the scene formats for the page, as JSON."""
+    return json.dumps(
+        [
+            {"suffix": each.suffix, "title": each.title, "shown": each.shown, "magic": list(each.magic)}
+            for each in FORMATS
+        ]
+    ).encode()
 
 
 def _file(name: str, body: bytes) -> StaticFile:

@@ -27,6 +27,7 @@ from service.errors import (
 )
 from service.files.staging import MOST_STYLES
 from service.parameters import JobParameters
+from sgsst_core.files.formats import TITLES
 
 
 class JobFromUploads(BaseModel):
@@ -46,7 +47,7 @@ class JobFromUploads(BaseModel):
         },
     )
 
-    scene: str = Field(description="Id of the upload with the 3DGS scene: PLY, compressed PLY, SPZ or .splat.")
+    scene: str = Field(description=f"Id of the upload with the 3DGS scene: {TITLES}.")
     style: str | Annotated[list[str], Field(min_length=1, max_length=MOST_STYLES)] = Field(
         description="Id of the upload with the style image; or a list of several, which are mixed by `style_weights`, "
         "or are those of `regions`."
@@ -62,7 +63,7 @@ _FORM = {
     "type": "object",
     "required": ["scene", "style"],
     "properties": {
-        "scene": {**_FILE, "description": "3DGS scene: PLY, compressed PLY, SPZ or .splat; or the id of an upload."},
+        "scene": {**_FILE, "description": f"3DGS scene: {TITLES}; or the id of an upload."},
         "style": {
             "type": "array",
             "items": _FILE,
@@ -109,7 +110,7 @@ REFUSALS: tuple[ServiceError, ...] = (
     MediaTypeError("The body must be multipart/form-data or application/json."),
     invalid("resolution", "Input should be greater than or equal to 1"),
     RefusedInputError(
-        "scene.ply: has no PLY header (it does not start with 'ply'). Give a 3DGS scene.",
+        "scene.ply: holds no Gaussians (element vertex 0). Export the scene again.",
         "invalid-scene",
         input="scene",
     ),

@@ -2,6 +2,7 @@
 /** Slots for a job's files, which can be chosen or dropped, are listed by name, and can be removed. */
 import { h, icon, newId, put } from "./dom.js";
 import { showWrong } from "./options.js";
+import { sceneSuffix } from "./scene_formats.js";
 import { size, words } from "./words.js";
 
 const say = words.submit;
@@ -85,7 +86,7 @@ export class Slot {
   }
 }
 
-const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp)$/i, SCENE = /\.(ply|spz|splat)$/i, CAMERAS = /\.(json|bin|txt)$/i;
+const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp)$/i, CAMERAS = /\.(json|bin|txt)$/i;
 
 /**
  * Sort dropped files into slots. Up to four images are styles; more are photos.
@@ -96,9 +97,9 @@ const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp)$/i, SCENE = /\.(ply|spz|splat)$/i,
 export function sorted(files) {
   const pictures = files.filter((file) => PICTURE.test(file.name)), many = pictures.length > 4;
   return {
-    scene: files.filter((file) => SCENE.test(file.name)), cameras: files.filter((file) => CAMERAS.test(file.name)),
+    scene: files.filter((file) => sceneSuffix(file.name)), cameras: files.filter((file) => CAMERAS.test(file.name)),
     style: many ? [] : pictures, photos: many ? pictures : [],
-    unknown: files.filter((file) => ![PICTURE, SCENE, CAMERAS].some((form) => form.test(file.name))),
+    unknown: files.filter(({ name }) => !PICTURE.test(name) && !CAMERAS.test(name) && !sceneSuffix(name)),
   };
 }
 

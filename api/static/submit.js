@@ -6,6 +6,7 @@ import { announce, h, icon, newId, put } from "./dom.js";
 import { optionControl } from "./options.js";
 import { costCard } from "./plan.js";
 import { RegionList } from "./regions.js";
+import { accepted, sceneSuffix } from "./scene_formats.js";
 import { droppedFiles, Slot, sorted } from "./slots.js";
 import { Stage } from "./stage.js";
 import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
@@ -25,7 +26,7 @@ export class SubmitView {
     this.title = say.title;
     const changed = (/** @type {() => void} */ act) => ({ changed: act });
     this.slots = {
-      scene: new Slot(say.scene, say.sceneHint, { accept: ".ply,.spz,.splat", ...changed(() => this.sceneChanged()) }),
+      scene: new Slot(say.scene, say.sceneHint, { accept: accepted, ...changed(() => this.sceneChanged()) }),
       style: new Slot(say.style, say.styleHint, { accept: "image/*", multiple: true, pictures: true, ...changed(() => this.styleChanged()) }),
       cameras: new Slot(say.cameras, say.camerasHint, { accept: ".json,.bin,.txt", multiple: true, ...changed(() => this.camerasChanged()) }),
       photos: new Slot(say.photos, say.photosHint, { accept: "image/*", multiple: true, ...changed(() => this.refresh()) }),
@@ -296,7 +297,8 @@ export class SubmitView {
     }
     if (this.orbiting) values.orbit ??= "auto";
     if (this.preset) values.preset = this.preset;
-    values.name ??= this.slots.scene.files[0]?.name.replace(/\.(compressed\.)?(ply|spz|splat)$/i, "").replace(/[\u0000-\u001f\u007f-\u009f]/g, "").slice(0, 200);
+    const scene = this.slots.scene.files[0]?.name;
+    values.name ??= scene?.slice(0, scene.length - sceneSuffix(scene).length).replace(/[\u0000-\u001f\u007f-\u009f]/g, "").slice(0, 200);
     const regions = this.regions.value(), taken = new Set(regions.flatMap((region) => region.style ?? []));
     if (regions.length) values.regions = regions;
     const own = this.weights.filter((_, i) => !taken.has(this.slots.style.files[i]?.name)).map((input) => Number(input.value));

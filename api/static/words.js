@@ -1,5 +1,6 @@
 // @ts-check
 /** All texts of the page that do not come from the service. */
+import { titles } from "./scene_formats.js";
 
 const number = new Intl.NumberFormat("en");
 const one = new Intl.NumberFormat("en", { maximumFractionDigits: 1 });
@@ -45,7 +46,8 @@ export const words = {
     status: (/** @type {number} */ status) => `The service returned status ${status}.`,
   },
   scene: {
-    notScene: "Not a scene file. Use PLY, SPZ or .splat.",
+    notScene: `Not a scene file. Use ${titles}.`,
+    notShown: (/** @type {string} */ title) => `${title} can't be previewed. You can still upload it; the result will be shown.`,
     notPly: "Not a PLY file.",
     notBinary: "Only binary little-endian PLY can be previewed. The service may still accept this file.",
     notGaussians: "This PLY contains no 3D Gaussians that can be previewed.",
@@ -82,7 +84,7 @@ export const words = {
   },
   submit: {
     title: "New job", heading: "Paint a scene", lead: "Repaint a 3D Gaussian scene in the style of a painting. Nothing is uploaded until you press a button below.",
-    scene: "Scene", sceneHint: "PLY, compressed PLY, SPZ or .splat", style: "Style", styleHint: "One painting, or several to blend",
+    scene: "Scene", sceneHint: titles, style: "Style", styleHint: "One painting, or several to blend",
     cameras: "Cameras", camerasHint: "cameras.json, transforms.json, or the files of a COLMAP model", photos: "Photos", photosHint: "Optional: the original photos",
     choose: "Choose", change: "Change", remove: (/** @type {string} */ name) => `Remove ${name}`, drop: "Drop your scene here", dropMore: "you can add cameras and a painting too", dropNow: "Drop to add files",
     files: "Files", views: "Views", fromFiles: "Use my cameras", around: "Orbit the object", howMany: "Number of views", look: "Look", weights: "Blend",

@@ -17,11 +17,12 @@ from service.files.cache import file_digest
 from service.files.objects import ObjectStore
 from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.formats import RESULT_FORMATS
 
 #: Error numbers that mean that a hard link is impossible: different file systems, or no support for hard links.
 _NO_LINKS = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK)
 _MEDIA_TYPES = {
-    ".ply": "application/octet-stream",
+    **{each.suffix: each.media_type for each in RESULT_FORMATS},
     ".json": "application/json",
     ".txt": "text/plain; charset=utf-8",
     ".html": "text/html; charset=utf-8",
@@ -121,7 +122,8 @@ class Artifacts:
 
 def media_type(name: str) -> str:
     """Return the media type of a result for HTTP."""
-    return _MEDIA_TYPES.get(Path(name).suffix) or mimetypes.guess_type(name)[0] or "application/octet-stream"
+    known = next((kind for suffix, kind in _MEDIA_TYPES.items() if name.endswith(suffix)), None)
+    return known or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
 def _linked(source: Path, target: Path) -> bool:

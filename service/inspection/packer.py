@@ -26,7 +26,8 @@ from service.settings import ServiceSettings
 from service.store import Store
 from service.store.leases import Published
 from service.store.tables import ArtifactRow, JobRow
-from sgsst_core.files.scene_headers import PackedForm, packed_name
+from sgsst_core.files.formats import result_name
+from sgsst_core.files.formats.scene_format import SceneFormat
 
 #: Additional CPU seconds per byte of a result, for reading, sorting, compressing, and rendering it several times.
 #: Actual use is less than a fifth.
@@ -46,7 +47,7 @@ class Packer:
             if time.time() - left.stat().st_mtime > LEFT_SECONDS:
                 shutil.rmtree(left, ignore_errors=True)
 
-    async def packed(self, job: JobRow, form: PackedForm) -> ArtifactRow:
+    async def packed(self, job: JobRow, format: SceneFormat) -> ArtifactRow:
         """Return a job's result in a compressed format; the compression error is stored beside it as JSON.
 
         Raises:
@@ -54,7 +55,7 @@ class Packer:
             RefusedInputError: If the format cannot represent the result, or compressing exceeds the limits.
             BusyError, NoSpaceError: If the result cannot be compressed now.
         """
-        name = packed_name(RESULT, form)
+        name = result_name(RESULT, format)
         result = await asyncio.to_thread(self._store.jobs.artifact, job.id, RESULT)
         if result is None:
             raise NotFoundError(f"Job {job.id} has no file {RESULT!r} (yet). Its artifacts list has all there are.")

@@ -35,10 +35,9 @@ from sgsst_core.compiled import keep_in_memory, kernel_folders
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.cache_folder import cache_folder
-from sgsst_core.files.formats.ply_header import element_offsets
+from sgsst_core.files.formats import format_of_name, read_scene_header
 from sgsst_core.files.images import check_photos, image_size, load_image
-from sgsst_core.files.scene_file import pack_scene, read_scene, write_scene
-from sgsst_core.files.scene_headers import form_of_name, read_scene_header
+from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
 from sgsst_core.files.sh_attenuation import check_sh_attenuation
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.regions import Regions
@@ -109,8 +108,6 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     source = scene_request(staged, parameters)
     with _ErrorsOf("scene"):
         header = read_scene_header(staged.scene)
-        if header.ply is not None:
-            element_offsets(staged.scene, header.ply)
         declared = int(header.count * settings.refine)
         if declared > limits["gaussians"]:
             raise RefusedError(
@@ -202,9 +199,10 @@ def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]
         Loss of the compression: `PackedLoss` as JSON.
     """
     source, settings = scene_request(staged, parameters), parameters.settings()
-    scene = read_scene(source.scene).scene
+    scene, format = read_scene(source.scene).scene, format_of_name(name)
+    assert format is not None
     with Path(name).open("wb") as output:
-        pack_scene(output, scene, "spz" if form_of_name(name) == "spz" else "compressed.ply", Path(name))
+        encode_scene(output, scene, format, Path(name))
     cameras = fit_cameras(read_cameras_of(source, scene)[0], settings)
     return measure_packed(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
 

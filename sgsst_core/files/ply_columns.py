@@ -34,7 +34,7 @@ def read_property(file: SceneFile, name: str) -> Tensor:
         field, column = _OWN[name]
         values: Tensor = getattr(file.scene, field)
         return values if column is None else values[:, column]
-    header = file.header if file.form == "ply" else None
+    header = file.header
     others = [] if header is None else [prop.name for prop in header.vertex.properties]
     if header is None or name not in others:
         known = sorted({*_OWN, *others})

@@ -1,11 +1,7 @@
-"""Reader of 3DGS scene files, and writer of stylized PLYs that changes only the colors.
+"""Reader and writer of scenes in any format, and writer of stylized PLYs that changes only the colors.
 
-The properties are those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023): x y z,
-f_dc_0..2, f_rest_* (channel-major: all coefficients of red first), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
-They may have any order and numeric type, and a file may have further properties.
-
-Compressed formats (see `scene_headers`) are read as well. Their stylized scenes are written as PLYs with the layout of
-3DGS trainers.
+PLYs may have any order and numeric type of the properties, and further ones; `write_stylized` returns them unchanged.
+Stylized scenes from other formats are written as PLYs with the layout of 3DGS trainers.
 """
 
 from __future__ import annotations
@@ -26,13 +22,12 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
-from sgsst_core.errors import SceneError
+from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
-from sgsst_core.files.formats.splat import read_splat
-from sgsst_core.files.formats.spz import read_spz, write_spz
-from sgsst_core.files.scene_headers import COEFFICIENTS, Form, PackedForm, SceneHeader, read_scene_header
+from sgsst_core.files.formats.scene_format import SceneFormat, SceneHeader
 from sgsst_core.files.sh_attenuation import ShAttenuation, check_sh_attenuation
 from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import Scene
@@ -47,18 +42,11 @@ READ_BYTES = 1 << 20
 #: Maximum bytes of SH coefficients above degree 0 in memory: those of 1.4 million Gaussians of degree 3.
 HELD_BYTES = 1 << 28
 
-_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_BASE = {
-    "means": ("x", "y", "z"),
-    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
-    "scales": ("scale_0", "scale_1", "scale_2"),
-    "sh_dc": _DC,
-}
+_DC = PROPERTIES["sh_dc"]
 #: Properties that differ between the pieces of a split Gaussian.
-_SHAPE = (*_BASE["means"], "opacity", *_BASE["scales"])
+_SHAPE = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"])
 #: Order of the properties in messages; f_rest_* follow.
-_ORDER = (*itertools.chain(*_BASE.values()), "opacity")
-_REST_DEGREES = {3 * number: degree for degree, number in COEFFICIENTS.items()}
+_ORDER = (*itertools.chain(*PROPERTIES.values()), "opacity")
 
 
 @dataclass(frozen=True)
@@ -68,10 +56,10 @@ class SceneFile:
     Attributes:
         path: Path of the file.
         scene: Gaussians of the file, without dropped ones.
-        header: PLY header; None for other formats.
+        header: PLY header, whose file `write_stylized` preserves; None for other formats.
         kept: Mask [rows] bool of the file's rows that the scene contains; None if it contains all.
         stamp: Size in bytes and modification time in ns of the file when it was read.
-        form: Format of the file.
+        format: Name of the file's format.
         copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
     """
 
@@ -80,7 +68,7 @@ class SceneFile:
     header: PlyHeader | None
     kept: NDArray[np.bool_] | None
     stamp: tuple[int, int]
-    form: Form = "ply"
+    format: str = PLY.name
     copies: NDArray[np.int64] | None = None
 
     def refined(self, refinement: Refinement | None) -> SceneFile:
@@ -91,7 +79,7 @@ class SceneFile:
         """
         if refinement is None or not refinement.split:
             return self
-        if self.header is not None and self.form == "ply":
+        if self.header is not None:
             kinds = {prop.name: prop.kind for prop in self.header.vertex.properties}
             whole = [name for name in _SHAPE if kinds[name][0] != "f"]
             if whole:
@@ -127,16 +115,14 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
             invalid values, or has changed while it was read.
     """
     declared = read_scene_header(path)
-    if declared.form != "ply":
-        return _read_packed(path, declared, drop_invalid)
-    assert declared.ply is not None
+    if not isinstance(declared, PlySceneHeader):
+        return _read_arrays(path, declared, drop_invalid)
     header = declared.ply
-    degree = _check_properties(path, header)
     offset = element_offsets(path, header).get("vertex", 0)
     file = RowFile(path)
     stamp = file.stamp
-    stored = _row_layout(path, header, stamp, offset) if stays_in_file(header, held_bytes) else None
-    into = _Columns(header.vertex.count, 0 if stored else degree, stored)
+    stored = _row_layout(path, header, stamp, offset) if stays_in_file(declared, held_bytes) else None
+    into = _Columns(header.vertex.count, 0 if stored else declared.coefficients, stored)
     if header.text:
         rows = text_vertices(path, header)
         for start in range(0, len(rows), BLOCK_ROWS):
@@ -152,18 +138,13 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
     return SceneFile(path, scene if kept is None else scene.subset(torch.from_numpy(kept)), header, kept, stamp)
 
 
-def _read_packed(path: Path, header: SceneHeader, drop_invalid: bool) -> SceneFile:
-    """Read a scene in any format other than plain PLY."""
+def _read_arrays(path: Path, header: SceneHeader, drop_invalid: bool) -> SceneFile:
+    """Read a scene in any format other than PLY."""
     file = RowFile(path)
     stamp = file.stamp
-    into = _Columns(header.count, header.sh_degree, None)
-    match header.form:
-        case "compressed.ply":
-            read_compressed_ply(path, file, header, into.arrays)
-        case "spz":
-            read_spz(path, file, header, into.arrays)
-        case _:
-            read_splat(file, header, into.arrays)
+    into = _Columns(header.count, header.coefficients, None)
+    assert header.format.read is not None
+    header.format.read(file, header, into.arrays)
     file.check_unchanged(stamp)
     for start in range(0, header.count, BLOCK_ROWS):
         into.check(start, min(BLOCK_ROWS, header.count - start))
@@ -171,15 +152,18 @@ def _read_packed(path: Path, header: SceneHeader, drop_invalid: bool) -> SceneFi
     scene = Scene(**{name: torch.from_numpy(array) for name, array in into.arrays.items()})
     if kept is not None:
         scene = scene.subset(torch.from_numpy(kept))
-    return SceneFile(path, scene, header.ply, kept, stamp, header.form)
+    return SceneFile(path, scene, None, kept, stamp, header.format.name)
 
 
-def stays_in_file(header: PlyHeader, held_bytes: int | None = None) -> bool:
+def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
     """Return whether a scene's SH coefficients above degree 0 stay in its file, rather than being loaded into memory.
 
     They do if they would take more than `held_bytes` and the file has the layout of 3DGS trainers: binary
     little-endian, float32 coefficients, in order.
     """
+    if not isinstance(declared, PlySceneHeader) or not declared.coefficients:
+        return False
+    header = declared.ply
     names = [prop.name for prop in header.vertex.properties]
     if header.text or header.byte_order != "<" or "f_rest_0" not in names:
         return False
@@ -219,7 +203,7 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
         raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
     if file_stamp(source.path) != source.stamp:
         raise changed(source.path)
-    if source.form != "ply" or source.header is None:
+    if source.header is None:
         write_scene(
             target, replace(source.scene.attenuated(sh_attenuation), sh_dc=sh_dc.detach().to("cpu", torch.float32))
         )
@@ -235,107 +219,38 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
             _write_binary(source, source.header, columns, attenuation, file, output)
 
 
-def write_scene(path: Path, scene: Scene) -> None:
-    """Write a scene as a binary little-endian float32 3DGS PLY with the usual order of properties. Normals are 0.
-
-    Raises:
-        OutputError: If the file cannot be written.
-    """
-    sh_rest = held(scene.sh_rest)
-    coefficients = int(sh_rest.shape[1])
-    names = ["x", "y", "z", "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(3 * coefficients)), "opacity"]
-    names += [*_BASE["scales"], *_BASE["quats"]]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scene)}"]
-    lines += [f"property float {name}" for name in names]
-    parts = scene.means, torch.zeros(1, 3), scene.sh_dc, sh_rest, scene.opacities, scene.scales, scene.quats
-    with atomic_path(path) as temporary, temporary.open("wb") as output:
-        output.write("\n".join([*lines, "end_header", ""]).encode())
-        for start in range(0, len(scene), BLOCK_ROWS):
-            rows = np.empty((min(BLOCK_ROWS, len(scene) - start), len(names)), "<f4")
-            column = 0
-            for part in parts:
-                width = part[0].numel()
-                block = part[start : start + len(rows)] if len(part) == len(scene) else part
-                if block.ndim == 3:  # channel-major
-                    block = block.transpose(1, 2)
-                rows[:, column : column + width] = block.detach().cpu().reshape(len(block), width).numpy()
-                column += width
-            output.write(rows.data)
-
-
-def write_packed(path: Path, scene: Scene, form: PackedForm) -> None:
-    """Write a scene in a compressed format to a file, atomically; see `pack_scene`.
+def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY) -> None:
+    """Write a scene to a file, atomically; see `encode_scene`.
 
     Raises:
         OutputError: If the file cannot be written, or the format cannot represent the scene.
     """
     with atomic_path(path) as temporary, temporary.open("wb") as output:
-        pack_scene(output, scene, form, path)
+        encode_scene(output, scene, format, path)
 
 
-def pack_scene(output: BinaryIO, scene: Scene, form: PackedForm, target: Path) -> None:
-    """Write a scene in a compressed format to a stream.
+def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Path) -> None:
+    """Write a scene to a stream.
 
-    SH bands that are 0 in all Gaussians are omitted. The order of the Gaussians may change.
+    Formats other than PLY omit SH bands that are 0 in all Gaussians, and may change the order of the Gaussians.
 
     Args:
         output: Stream to write to.
         scene: Scene to write.
-        form: Compressed format.
+        format: One of `RESULT_FORMATS`.
         target: Path of the output, for messages.
 
     Raises:
         OutputError: If the format cannot represent the scene.
     """
-    scene = scene.without_zero_bands()
+    assert format.write is not None
+    if format is not PLY:
+        scene = scene.without_zero_bands()
     arrays = {field.name: held(getattr(scene, field.name)).detach().cpu().float().numpy() for field in fields(scene)}
-    if form == "spz":
-        write_spz(output, arrays, target)
-    else:
-        write_compressed_ply(output, arrays)
-
-
-def _check_properties(path: Path, header: PlyHeader) -> int:
-    """Check that a PLY is a 3DGS scene before any data is read, and return its SH degree."""
-    vertex = header.vertex if "vertex" in header.names else None
-    kinds = {prop.name: prop.kind for prop in vertex.properties if not prop.length_kind} if vertex else {}
-    missing = [name for names in (*_BASE.values(), ("opacity",)) for name in names if name not in kinds]
-    if vertex is None or missing:
-        raise SceneError(f"{path}: is not a 3DGS scene but {_what_else(header)}; missing: {', '.join(missing)}.")
-    if vertex.count == 0:
-        raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
-    if vertex.has_lists:
-        name = next(prop.name for prop in vertex.properties if prop.length_kind)
-        raise SceneError(
-            f"{path}: vertex property {name!r} is a list, which 3DGS scenes do not have. Export without it."
-        )
-    for name in _DC:
-        if kinds[name][0] != "f":
-            raise SceneError(
-                f"{path}: {name} is stored as integers; new colors need float or double. Convert it first."
-            )
-    rest = [name for name in kinds if re.fullmatch(r"f_rest_\d+", name)]
-    if len(rest) not in _REST_DEGREES:
-        raise SceneError(
-            f"{path}: has {len(rest)} f_rest properties; SH degree 0, 1, 2, 3 have 0, 9, 24, 45. Export it again."
-        )
-    absent = [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in kinds]
-    if absent:
-        raise SceneError(
-            f"{path}: f_rest properties are not numbered 0 to {len(rest) - 1}; missing: {', '.join(absent)}."
-        )
-    return _REST_DEGREES[len(rest)]
-
-
-def _what_else(header: PlyHeader) -> str:
-    """Guess what a PLY without Gaussians contains, for the error message."""
-    vertex = header.vertex if "vertex" in header.names else None
-    names = {prop.name for prop in vertex.properties} if vertex else set()
-    if "face" in header.names:
-        return "a mesh (it has faces)"
-    if {"x", "y", "z"} <= names and not names & {"opacity", "scale_0", "rot_0", "f_dc_0"}:
-        return "a point cloud (train Gaussians on it first)"
-    return "something else" if vertex else "a PLY without vertices"
+    try:
+        format.write(output, arrays)
+    except OutputError as error:
+        raise OutputError(f"{target}: {error}") from error
 
 
 def _row_layout(path: Path, header: PlyHeader, stamp: tuple[int, int], offset: int) -> RowLayout:
@@ -369,7 +284,7 @@ class _Columns:
 
     Args:
         count: Number of rows.
-        degree: SH degree of the coefficients to load.
+        coefficients: Number of SH coefficients per color channel to load.
         stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
 
     Attributes:
@@ -377,15 +292,16 @@ class _Columns:
         flaws: Invalid values of each block that contains any.
     """
 
-    def __init__(self, count: int, degree: int, stored: RowLayout | None) -> None:
+    def __init__(self, count: int, coefficients: int, stored: RowLayout | None) -> None:
         self._stored = stored
-        coefficients = (degree + 1) ** 2 - 1
         self.arrays: dict[str, NDArray[Any]] = {
-            name: np.empty((count, len(names)), np.float32) for name, names in _BASE.items()
+            name: np.empty((count, len(names)), np.float32) for name, names in PROPERTIES.items()
         }
         self.arrays["opacities"] = np.empty(count, np.float32)
         self.arrays["sh_rest"] = np.empty((count, coefficients, 3), np.float32)
-        self._targets = {prop: self.arrays[name][:, i] for name, names in _BASE.items() for i, prop in enumerate(names)}
+        self._targets = {
+            prop: self.arrays[name][:, i] for name, names in PROPERTIES.items() for i, prop in enumerate(names)
+        }
         self._targets["opacity"] = self.arrays["opacities"]
         for i in range(3 * coefficients):
             self._targets[f"f_rest_{i}"] = self.arrays["sh_rest"][:, i % coefficients, i // coefficients]
@@ -544,7 +460,7 @@ def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
     columns = dict(zip(_DC, colors.numpy().T, strict=True))
     if source.copies is not None:
         columns["opacity"] = source.scene.opacities.numpy()
-        for names, values in ((_BASE["means"], source.scene.means), (_BASE["scales"], source.scene.scales)):
+        for names, values in ((PROPERTIES["means"], source.scene.means), (PROPERTIES["scales"], source.scene.scales)):
             columns |= dict(zip(names, values.numpy().T, strict=True))
     return columns
 

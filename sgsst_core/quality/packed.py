@@ -81,4 +81,4 @@ def measure_packed(
         squares += float((first.double() - second.double()).square().sum())
         values += first.numel()
     loss = psnr(squares / values) if squares else None
-    return PackedLoss(path.name, back.form, path.stat().st_size, [camera.name for camera in chosen], loss)
+    return PackedLoss(path.name, back.format, path.stat().st_size, [camera.name for camera in chosen], loss)

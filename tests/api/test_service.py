@@ -24,8 +24,9 @@ import torch
 from plyfile import PlyData
 
 from api.client import AsyncClient, Client, Job
-from sgsst_core.files.scene_file import SceneFile, read_scene, write_packed
-from sgsst_core.files.scene_headers import PACKED_FORMS
+from sgsst_core.files.formats import EXTRA_FORMATS
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall, write_files
 
@@ -222,22 +223,22 @@ def test_the_ply_in_ranges(service: Service, files: dict[str, Path], short_job: 
 def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
     scene, gaussians = tmp_path / "wall.ply", wall(sh_degree=1)
     gaussians.means[:, 2] += torch.linspace(0, 0.3, 616)  # at equal depths, the image would depend on their order
-    write_packed(scene, gaussians, "spz")
+    write_scene(scene, gaussians, SPZ)
     with service.client() as client:
         job_id = submit(client, files | {"scene": scene}, steps_sos=5)
         where = f"/v1/jobs/{job_id}/artifacts/stylized.ply"
         assert client.get(where, params={"format": "spz"}).status_code == 404
         wait_until(service, client, job_id, "succeeded")
         ply = read(tmp_path, client.get(where).content)
-        assert ply.form == "ply"
+        assert ply.format == "ply"
         assert torch.equal(ply.scene.means, read_scene(scene).scene.means)
-        for form in PACKED_FORMS:
+        for form in (each.name for each in EXTRA_FORMATS):
             first = client.get(where, params={"format": form})
             assert first.status_code == 200, first.text
             assert first.headers["content-disposition"] == f'attachment; filename="stylized.{form}"'
             assert first.headers["content-type"] == "application/octet-stream"
             found = read(tmp_path, first.content)
-            assert (found.form, len(found.scene)) == (form, len(ply.scene))
+            assert (found.format, len(found.scene)) == (form, len(ply.scene))
             again = client.get(where, params={"format": form}, headers={"If-None-Match": first.headers["etag"]})
             assert again.status_code == 304, "it is kept"
             assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.{form}").content == first.content
@@ -260,7 +261,7 @@ def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: d
         ended = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
         assert "compressed.ply, " in ended.stderr
         assert "dB PSNR against the PLY" in ended.stderr
-        assert read_scene(tmp_path / "other.compressed.ply").form == "compressed.ply"
+        assert read_scene(tmp_path / "other.compressed.ply").format == "compressed.ply"
         assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
         assert client.get(where, params={"format": "spz"}).status_code == 404
         assert not (service.data / "artifacts" / job_id).exists()

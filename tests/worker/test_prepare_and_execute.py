@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from sgsst_core.errors import CheckpointError
-from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
-from sgsst_core.files.scene_headers import PackedForm
+from sgsst_core.files.formats import by_name
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.gaussians import Scene
@@ -91,7 +91,7 @@ def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: Stylize
 
 
 @pytest.mark.parametrize("form", ["ply", "spz", pytest.param("compressed.ply", marks=pytest.mark.slow)])
-def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_path: Path, form: PackedForm) -> None:
+def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_path: Path, form: str) -> None:
     jobs = []
     for name in ("whole", "resumed"):
         request = small_request(tmp_path / name, 6, refine=3.0)
@@ -99,7 +99,7 @@ def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_pat
         write_scene(request.source.scene, scene)
         if form != "ply":
             source = request.source.scene.with_name(f"scene.{form}")
-            write_packed(source, scene, form)
+            write_scene(source, scene, by_name(form))
             out = request.out.with_name(f"s.{form}")
             request = replace(request, source=request.source.model_copy(update={"scene": source}), out=out)
         jobs.append(request)

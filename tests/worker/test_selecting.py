@@ -11,8 +11,9 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from sgsst_core.errors import ImageError, SceneError, SettingsError
+from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.images import save_png
-from sgsst_core.files.scene_file import SceneFile, read_scene, write_packed
+from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
@@ -71,7 +72,7 @@ def test_any_property_of_the_file(tmp_path: Path, kind: str, text: bool, order: 
 
 def test_properties_of_all_scenes_are_there_in_any_form(tmp_path: Path, file: SceneFile) -> None:
     packed = tmp_path / "wall.spz"
-    write_packed(packed, file.scene, "spz")
+    write_scene(packed, file.scene, SPZ)
     for source in (file, read_scene(packed)):
         assert select(parse_selection("property=opacity>4", "a"), source, cameras(), 0.2).all()
         assert not select(parse_selection("property=z<2", "a"), source, cameras(), 0.2).any()

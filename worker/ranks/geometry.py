@@ -23,8 +23,8 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneTooLargeError, SgsstError
+from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_scene, stays_in_file
-from sgsst_core.files.scene_headers import read_scene_header
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.cost import OPTIMIZER_BYTES
 from sgsst_core.scene.gaussians import Scene
@@ -170,21 +170,12 @@ def _check_room(path: Path, collectives: Collectives, sharing: int, growth: floa
 def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
     """Return the number of Gaussians that a file declares, and their bytes in memory and on a GPU.
 
-    The bytes in memory exclude spherical harmonics that stay in the file. All values are 0 for a file that `read_scene`
-    refuses.
+    The bytes in memory exclude spherical harmonics that stay in the file.
     """
-    declared = read_scene_header(path)
-    if declared.form != "ply":
-        size = declared.count * 4 * declared.float_values
-        return declared.count, size, size
-    header = declared.ply
-    if header is None or "vertex" not in header.names:
-        return 0, 0, 0
-    # A wrong header may declare any count, so the file's size limits it.
-    count = min(header.vertex.count, path.stat().st_size // max(header.vertex.least_row_bytes(header.text), 1))
-    rest = sum(prop.name.startswith("f_rest_") for prop in header.vertex.properties)
+    header = read_scene_header(path)
+    rest = 3 * header.coefficients
     held = 0 if stays_in_file(header, _held_bytes(growth)) else rest
-    return count, count * 4 * (14 + held), count * 4 * (14 + rest)
+    return header.count, header.count * 4 * (14 + held), header.count * 4 * (14 + rest)
 
 
 def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: int) -> SceneTooLargeError | None:

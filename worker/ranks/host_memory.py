@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from sgsst_core.files.formats import format_of_name
+
 #: Bytes of a Gaussian of SH degree 3 in memory: 62 float32 values.
 GAUSSIAN_BYTES = 248
-#: Bytes of a Gaussian in compressed files, by the ending of the file name. Compressed PLY has 16 bytes and one byte per
-#: SH coefficient, .splat has 32 bytes, and SPZ has about 25 after entropy coding.
-_PACKED_BYTES = ((".compressed.ply", 61), (".splat", 32), (".spz", 25))
 #: Bytes that a rank needs in addition to the scene: libraries of CUDA and PyTorch, and pinned buffers.
 _RANK_BYTES = 3_000_000_000
 #: Copies of the scene on a machine while it is loaded: the arrays read from the file, and the shared memory.
@@ -20,8 +19,8 @@ def scene_bytes(name: str, size: int) -> int:
         name: Name of the file; its ending determines the format.
         size: Size of the file in bytes.
     """
-    packed = next((each for suffix, each in _PACKED_BYTES if name.lower().endswith(suffix)), None)
-    return size if packed is None else size * GAUSSIAN_BYTES // packed
+    format = format_of_name(name)
+    return size if format is None else size * GAUSSIAN_BYTES // format.bytes_per_gaussian
 
 
 def memory_beside_gpus(ranks: int, scene: int) -> int:

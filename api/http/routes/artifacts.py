@@ -6,7 +6,7 @@ import asyncio
 import re
 from functools import partial
 from pathlib import PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
@@ -37,9 +37,8 @@ from service.errors import (
 from service.files.artifacts import media_type
 from service.files.names import RESULT
 from service.store.tables import ArtifactRow, JobRow
-
-#: File formats of a result.
-Form = Literal["ply", "compressed.ply", "spz"]
+from sgsst_core.files.formats import EXTRA_FORMATS, RESULT_FORMATS, ResultName, by_name, listed, result_name
+from sgsst_core.files.formats.ply import PLY
 
 router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
 
@@ -87,7 +86,7 @@ _ANSWERS: Responses = {
     **problems(
         NotFoundError(f"Job {JOB_ID} has no file 'stylized.ply' (yet). Its artifacts list has all there are."),
         NO_SUCH_RANGE,
-        invalid("query.format", "Input should be 'ply', 'compressed.ply' or 'spz'"),
+        invalid("query.format", f"Input should be {listed([repr(each.name) for each in RESULT_FORMATS])}"),
         RefusedInputError(
             "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",
             "invalid-output",
@@ -121,12 +120,13 @@ async def get_artifact(
     if_range: IfRange = None,
     if_none_match: IfNoneMatch = None,
     form: Annotated[
-        Form | None,
+        ResultName | None,
         Query(
             alias="format",
             description="Of `stylized.ply`: another form of it. It is made when it is first asked for, which takes "
-            "some ten seconds for a million Gaussians, and is kept beside the PLY; `stylized.spz.json` or "
-            "`stylized.compressed.ply.json` then says what it loses, as PSNR of the job's views.",
+            "some ten seconds for a million Gaussians, and is kept beside the PLY; "
+            f"{listed([f'`{result_name(RESULT, each)}.json`' for each in EXTRA_FORMATS])} then says what it loses, as "
+            "PSNR of the job's views.",
             examples=["spz"],
         ),
     ] = None,
@@ -148,12 +148,12 @@ async def get_artifact(
     return await send_file(request, file, range_, if_range, if_none_match)
 
 
-async def _find_artifact(context: Context, job: JobRow, name: str, form: Form | None) -> ArtifactRow:
+async def _find_artifact(context: Context, job: JobRow, name: str, form: ResultName | None) -> ArtifactRow:
     """Return the database row of a published file, or of the result in another format."""
-    if form is not None and form != "ply":
+    if form is not None and form != PLY.name:
         if name != RESULT:
             raise RefusedInputError(f"Only {RESULT} has other forms. Leave 'format' out.", "invalid-request")
-        return await context.packer.packed(job, form)
+        return await context.packer.packed(job, by_name(form))
     row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
     if row is None:
         raise NotFoundError(f"Job {job.id} has no file {name[:80]!r} (yet). Its artifacts list has all there are.")

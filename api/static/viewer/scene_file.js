@@ -4,6 +4,7 @@
  */
 import { ByteReader, SceneError } from "./byte_reader.js";
 import { compressedPly, isSplat, splat, spz } from "./packed.js";
+import { notShown } from "../scene_formats.js";
 import { plainPly, readHeader } from "./ply.js";
 import { words } from "../words.js";
 
@@ -30,6 +31,8 @@ export async function openScene(reader, size) {
   }
   if (start[0] === 0x1f && start[1] === 0x8b) return spz(reader);
   if (magic === "NGSP") throw new SceneError(words.scene.newSpz);
+  const other = notShown(start);
+  if (other) throw new SceneError(words.scene.notShown(other.title));
   if (isSplat(start, size)) return splat(reader, size);
   throw new SceneError(words.scene.notScene);
 }

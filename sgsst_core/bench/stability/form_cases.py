@@ -14,8 +14,10 @@ import torch
 
 from sgsst_core.bench.stability.case import Case, CaseResult, Group, ordinary, repeated
 from sgsst_core.errors import InvalidInputError
-from sgsst_core.files.scene_file import read_scene, write_packed
-from sgsst_core.files.scene_headers import PackedForm
+from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
+from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.choice import OrbitRequest, make_orbit
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held
@@ -27,10 +29,9 @@ _CAMERAS = "cameras that are not finite, or do not face the object"
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    forms: tuple[PackedForm, ...] = ("compressed.ply", "spz")
     found = [
-        Case(f"{name}, as {form}", _GROUP, _AGAIN, partial(_packed, make, form))
-        for form in forms
+        Case(f"{name}, as {format.name}", _GROUP, _AGAIN, partial(_packed, make, format))
+        for format in (COMPRESSED_PLY, SPZ)
         for name, make in _SCENES.items()
     ]
     found += [
@@ -77,18 +78,18 @@ _SCENES: dict[str, Callable[[], Scene]] = {
 }
 
 
-def _packed(make: Callable[[], Scene], form: PackedForm, full: bool) -> CaseResult:
+def _packed(make: Callable[[], Scene], format: SceneFormat, full: bool) -> CaseResult:
     """Check that a compressed file is finite and complete, and that writing it again keeps its quantized values."""
     scene = make()
     with tempfile.TemporaryDirectory() as folder:
-        first, second = Path(folder) / f"first.{form}", Path(folder) / f"second.{form}"
-        write_packed(first, scene, form)
+        first, second = Path(folder) / "first", Path(folder) / "second"
+        write_scene(first, scene, format)
         found = read_scene(first).scene
-        write_packed(second, found, form)
+        write_scene(second, found, format)
         again = read_scene(second).scene
     if len(found) != len(scene) or not all(map(_finite, (found, again))):
         return CaseResult(math.inf, 0.0, "Gaussians are missing, or hold values that are not finite")
-    steps = {"means": _position_step(found, form), "scales": 16 / 2047 if form == "compressed.ply" else 1 / 16}
+    steps = {"means": _position_step(found, format), "scales": 16 / 2047 if format is COMPRESSED_PLY else 1 / 16}
     steps |= {"sh_dc": 0.03, "opacities": math.inf, "quats": 0.02, "sh_rest": 1 / 16}
     error = 0.0
     for name, step in steps.items():
@@ -107,9 +108,9 @@ def _sorted(values: torch.Tensor, scene: Scene) -> torch.Tensor:
     return values.double()[torch.from_numpy(order)]
 
 
-def _position_step(scene: Scene, form: PackedForm) -> float:
+def _position_step(scene: Scene, format: SceneFormat) -> float:
     extent = float((scene.means.amax(0) - scene.means.amin(0)).max())
-    if form == "compressed.ply":  # 10 bits within the bounds of 256 Gaussians
+    if format is COMPRESSED_PLY:  # 10 bits within the bounds of 256 Gaussians
         return max(extent / 1023, 1e-6 * float(scene.means.abs().max()))
     farthest = float(scene.means.abs().max())
     return float(2.0 ** (math.ceil(math.log2(max(farthest, 1e-6))) - 22))

@@ -1,1 +1,82 @@
-"""Scene formats: one module per format, with its header check, reader and writer."""
+"""Registry of scene formats: one entry per format, each in a module of its own.
+
+To add a format, write a module with a `SceneFormat`, and append it to `FORMATS`. PyTorch is not imported, because the
+API process reads headers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
+from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.scene_format import FileStart, SceneFormat, SceneHeader
+from sgsst_core.files.formats.splat import SPLAT
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.formats.unsupported import refuse_unsupported
+
+#: All scene formats, in the order in which they are tried and listed. Formats without a magic number come last.
+FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPLAT)
+#: Formats of results: PLY, and those that can be written in addition to it.
+RESULT_FORMATS = tuple(each for each in FORMATS if each.write)
+EXTRA_FORMATS = tuple(each for each in RESULT_FORMATS if each is not PLY)
+
+if TYPE_CHECKING:
+    ResultName = str
+    ExtraName = str
+else:
+    #: Names of `RESULT_FORMATS` and `EXTRA_FORMATS`, as choices of options and query parameters.
+    ResultName = Literal[tuple(each.name for each in RESULT_FORMATS)]
+    ExtraName = Literal[tuple(each.name for each in EXTRA_FORMATS)]
+
+#: Number of leading bytes that are used to detect the format.
+HEAD_BYTES = 8192
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as an enumeration with "or"."""
+    return f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+#: Enumerations of formats for texts: titles, suffixes, suffixes of results, and of results in addition to a PLY.
+TITLES = listed([each.title for each in FORMATS])
+SUFFIXES = listed([each.suffix for each in FORMATS])
+RESULT_SUFFIXES = listed([each.suffix for each in RESULT_FORMATS])
+EXTRA_SUFFIXES = listed([each.suffix for each in EXTRA_FORMATS])
+
+
+def format_of_name(name: str) -> SceneFormat | None:
+    """Return the format that a file name ends with, regardless of case; None for other names."""
+    fitting = [each for each in FORMATS if name.lower().endswith(each.suffix)]
+    return max(fitting, key=lambda each: len(each.suffix), default=None)
+
+
+def by_name(name: str) -> SceneFormat:
+    """Return the format of a name such as "spz"."""
+    return next(each for each in FORMATS if each.name == name)
+
+
+def result_name(ply: str, format: SceneFormat) -> str:
+    """Return the name of a result in another format, given the name of its PLY."""
+    return ply.removesuffix(PLY.suffix) + format.suffix
+
+
+def read_scene_header(path: Path) -> SceneHeader:
+    """Detect the format of a scene file from its content, and check its header.
+
+    Raises:
+        SceneError: If the file cannot be read, is truncated, has a wrong header, or has an unsupported format.
+    """
+    try:
+        with path.open("rb") as file:
+            start = FileStart(path, file.read(HEAD_BYTES), path.stat().st_size)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    for each in FORMATS:
+        if each.matches(start):
+            return each.read_header(start)
+    refuse_unsupported(start)
+    raise SceneError(f"{path}: is not a scene file: expected {TITLES}. Export the scene in one of these formats.")

@@ -8,13 +8,16 @@ layout is that of `splat-transform` (https://github.com/playcanvas/splat-transfo
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sgsst_core.files.formats.ply_header import element_offsets
+from sgsst_core.errors import SceneError
+from sgsst_core.files.formats.ply_header import PlyElement, PlyHeader, element_offsets, read_header
 from sgsst_core.files.formats.quantized import (
     OPACITY_LOGITS,
     SH_C0,
@@ -24,12 +27,18 @@ from sgsst_core.files.formats.quantized import (
     with_largest,
     without_largest,
 )
-from sgsst_core.files.scene_headers import CHUNK_ROWS, SceneHeader, bounds
-from sgsst_core.scene.stored_harmonics import RowFile
+from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
 
-Arrays = dict[str, NDArray[np.float32]]
-
+#: Number of Gaussians per chunk. Each chunk has its own quantization bounds.
+CHUNK_ROWS = 256
 _BLOCK_ROWS = 256 * CHUNK_ROWS
+
+
+def bounds(prefix: str, axes: str) -> tuple[str, ...]:
+    """Return the names of a compressed PLY's bounds, the lower bounds of all axes first."""
+    return tuple(f"{side}_{prefix}{axis}" for side in ("min", "max") for axis in axes)
+
+
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = (*bounds("", "xyz"), *bounds("scale_", "xyz"), *bounds("", "rgb"))
 #: Largest absolute log scale: other writers of the format also clamp scales to e^-20..e^20.
@@ -49,20 +58,73 @@ def _harmonics() -> NDArray[np.float64]:
 _HARMONICS = byte_table(_harmonics())
 
 
-def read_compressed_ply(path: Path, file: RowFile, header: SceneHeader, into: Arrays) -> None:
-    """Read a compressed PLY into the arrays of a scene.
+@dataclass(frozen=True)
+class CompressedPlyHeader(SceneHeader):
+    """Header of a compressed PLY."""
 
-    Args:
-        path: Path of the file.
-        file: Open file.
-        header: Header of the file.
-        into: float32 arrays to fill, by the names of `Scene`'s tensors.
+    ply: PlyHeader
 
-    Raises:
-        SceneError: If the file has changed since its header was read.
-    """
-    assert header.ply is not None
-    starts = element_offsets(path, header.ply)
+
+def _matches(start: FileStart) -> bool:
+    return start.head.startswith(b"ply") and re.search(rb"[\r\n]property \w+ packed_position\s", start.head) is not None
+
+
+def _read_header(start: FileStart) -> CompressedPlyHeader:
+    path = start.path
+    header = read_header(path)
+    if "vertex" not in header.names:
+        raise SceneError(f"{path}: is a compressed PLY without element 'vertex'. Export it again.")
+    if header.text:
+        raise SceneError(f"{path}: is a compressed PLY as text, which no program writes. Export it again as binary.")
+    vertex = header.vertex
+    _check_kinds(path, vertex, "u4", _PACKED)
+    chunk = header.elements[header.names.index("chunk")] if "chunk" in header.names else None
+    if chunk is None:
+        raise SceneError(f"{path}: is a compressed PLY without element 'chunk', its bounds. Export it again.")
+    _check_kinds(path, chunk, "f4", (*bounds("", "xyz"), *bounds("scale_", "xyz")))
+    if "min_r" in {prop.name for prop in chunk.properties}:
+        _check_kinds(path, chunk, "f4", bounds("", "rgb"))
+    if not vertex.count:
+        raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
+    expected = -(-vertex.count // CHUNK_ROWS)
+    if chunk.count != expected:
+        raise SceneError(
+            f"{path}: the header declares {chunk.count} chunks, but {vertex.count} Gaussians make {expected}: it is "
+            "wrong. Export the scene again."
+        )
+    coefficients = _sh_coefficients(path, header, vertex.count)
+    element_offsets(path, header)
+    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, coefficients, header)
+
+
+def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:
+    found = {prop.name: prop.kind for prop in element.properties if not prop.length_kind}
+    wrong = [name for name in names if found.get(name) != kind]
+    if wrong or element.has_lists:
+        what = f"{', '.join(wrong)} missing or of another type" if wrong else "a list"
+        raise SceneError(
+            f"{path}: is not a readable compressed PLY: element {element.name!r} has {what}. Export it again."
+        )
+
+
+def _sh_coefficients(path: Path, header: PlyHeader, count: int) -> int:
+    """Return the SH coefficients per color channel above degree 0, which follow from the element `sh`."""
+    if "sh" not in header.names:
+        return 0
+    element = header.elements[header.names.index("sh")]
+    coefficients = len(element.properties) // 3
+    if len(element.properties) not in (9, 24, 45) or element.count != count:
+        raise SceneError(
+            f"{path}: element 'sh' has {element.count} rows of {len(element.properties)} properties; there should be "
+            f"{count} of 9, 24 or 45. Export the scene again."
+        )
+    _check_kinds(path, element, "u1", tuple(f"f_rest_{i}" for i in range(len(element.properties))))
+    return coefficients
+
+
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+    assert isinstance(header, CompressedPlyHeader)
+    starts = element_offsets(file.path, header.ply)
     kinds = {element.name: element.dtype(header.ply.byte_order) for element in header.ply.elements}
     for start in range(0, header.count, _BLOCK_ROWS):
         part = slice(start, min(start + _BLOCK_ROWS, header.count))
@@ -75,7 +137,7 @@ def read_compressed_ply(path: Path, file: RowFile, header: SceneHeader, into: Ar
         count = part.stop - start
         chunks = rows("chunk", start // CHUNK_ROWS, -(-count // CHUNK_ROWS))
         _unpack(rows("vertex", start, count), chunks, {name: array[part] for name, array in into.items()})
-        if header.sh_degree:
+        if header.coefficients:
             _unpack_harmonics(rows("sh", start, count), into["sh_rest"][part])
 
 
@@ -114,8 +176,8 @@ def _unpack_harmonics(rows: NDArray[Any], into: NDArray[np.float32]) -> None:
         into[:, i % coefficients, i // coefficients] = _HARMONICS[rows[f"f_rest_{i}"]]
 
 
-def write_compressed_ply(output: BinaryIO, arrays: Arrays) -> None:
-    """Write the arrays of a scene as a compressed PLY.
+def _write(output: BinaryIO, arrays: Arrays) -> None:
+    """Write a compressed PLY.
 
     Gaussians are sorted along a space-filling curve, so that chunks are compact and their bounds are tight.
     """
@@ -202,3 +264,15 @@ def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[Any]:
     packed: NDArray[np.uint32] = largest.astype(np.uint32) << np.uint32(30)
     packed |= a << np.uint32(20) | b << np.uint32(10) | c
     return packed
+
+
+COMPRESSED_PLY = SceneFormat(
+    name="compressed.ply",
+    title="compressed PLY",
+    matches=_matches,
+    read_header=_read_header,
+    bytes_per_gaussian=61,
+    read=_read,
+    write=_write,
+    shown=True,
+)

@@ -168,29 +168,34 @@ def _check_elements(path: Path, elements: tuple[PlyElement, ...]) -> None:
             raise SceneError(f"{path}: element {element.name!r} of the PLY header has no property. Export it again.")
 
 
-def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
-    """Check that a file is as long as its header declares, without allocating memory for the data.
-
-    Rows of text have no fixed length, so text files are only checked against a lower bound. Other errors are found when
-    the rows are parsed.
-
-    Returns:
-        Byte offset of each element's rows in a binary file, by element name; empty for text files.
+def check_length(path: Path, header: PlyHeader) -> None:
+    """Check that a file is at least as long as its header declares, without allocating memory for the data.
 
     Raises:
         SceneError: If the file is shorter than declared.
     """
-    size = path.stat().st_size
-    position = len(header.raw)
     least = sum(element.count * element.least_row_bytes(header.text) for element in header.elements)
-    if position + least - (1 if header.text else 0) > size:  # the last line may lack its line end
+    data = path.stat().st_size - len(header.raw)
+    if least - (1 if header.text else 0) > data:  # the last line may lack its line end
         declared = ", ".join(f"{element.count} {element.name}" for element in header.elements)
         raise SceneError(
-            f"{path}: the header declares {declared}, which takes at least {least} bytes, but only {size - position} "
-            "follow it: the file is truncated or its header is wrong. Copy or export it again."
+            f"{path}: the header declares {declared}, which takes at least {least} bytes, but only {data} follow "
+            "it: the file is truncated or its header is wrong. Copy or export it again."
         )
+
+
+def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
+    """Return the byte offset of each element's rows in a binary file, by element name; nothing for a text file.
+
+    Rows of text have no fixed length, so their number is only checked when they are parsed.
+
+    Raises:
+        SceneError: If the file is shorter than declared.
+    """
+    check_length(path, header)
     if header.text:
         return {}
+    size, position = path.stat().st_size, len(header.raw)
     offsets: dict[str, int] = {}
     for element in header.elements:
         offsets[element.name] = position

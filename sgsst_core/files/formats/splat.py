@@ -7,33 +7,59 @@ from __future__ import annotations
 
 import numpy as np
 
-from sgsst_core.files.formats.compressed_ply import Arrays
+from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, SH_C0
-from sgsst_core.files.scene_headers import SPLAT_BYTES, SceneHeader, splat_rows
-from sgsst_core.scene.stored_harmonics import RowFile
+from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
 
+ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 _BLOCK_ROWS = 1 << 16
 
 
-def read_splat(file: RowFile, header: SceneHeader, into: Arrays) -> None:
-    """Read a .splat file into the arrays of a scene. A standard deviation of 0 becomes a log scale of minus infinity.
+def _matches(start: FileStart) -> bool:
+    """Return whether the data looks like .splat records. The format has no header.
 
-    Args:
-        file: Open file.
-        header: Header of the file.
-        into: float32 arrays to fill, by the names of `Scene`'s tensors.
-
-    Raises:
-        SceneError: If the file has changed since its header was read.
+    Nearly all records must have finite positions, plausible sizes, and rotations of length 1.
     """
+    rows = np.frombuffer(start.head[: len(start.head) // ROW.itemsize * ROW.itemsize], ROW)
+    if not len(rows):
+        return False
+    length = np.linalg.norm((rows["rotation"].astype(np.float64) - 128) / 128, axis=1)
+    fits = np.isfinite(rows["position"]).all(axis=1) & (np.abs(length - 1) < 0.05)
+    fits &= ((rows["scale"] >= 0) & (rows["scale"] < 1e9)).all(axis=1)
+    return bool(fits.mean() > 0.9)
+
+
+def _read_header(start: FileStart) -> SceneHeader:
+    count, rest = divmod(start.size, ROW.itemsize)
+    if rest:
+        raise SceneError(
+            f"{start.path}: is a .splat file of {count} Gaussians of {ROW.itemsize} bytes and {rest} bytes more: it "
+            "is truncated. Copy or export it again."
+        )
+    return SceneHeader(SPLAT, count, 0)
+
+
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+    """Fill the arrays of a scene. A standard deviation of 0 becomes a log scale of minus infinity."""
     for start in range(0, header.count, _BLOCK_ROWS):
         part = slice(start, min(start + _BLOCK_ROWS, header.count))
-        data = np.empty((part.stop - start) * SPLAT_BYTES, np.uint8)
-        file.read(start * SPLAT_BYTES, data)
-        rows = splat_rows(data)
+        data = np.empty((part.stop - start) * ROW.itemsize, np.uint8)
+        file.read(start * ROW.itemsize, data)
+        rows = data.view(ROW)
         into["means"][part] = rows["position"]
         with np.errstate(divide="ignore", invalid="ignore"):  # invalid values are reported later
             into["scales"][part] = np.log(rows["scale"].astype(np.float64))
         into["sh_dc"][part] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
         into["opacities"][part] = OPACITY_LOGITS[rows["color"][:, 3]]
         into["quats"][part] = (rows["rotation"].astype(np.float64) - 128) / 128
+
+
+SPLAT = SceneFormat(
+    name="splat",
+    title=".splat",
+    matches=_matches,
+    read_header=_read_header,
+    bytes_per_gaussian=32,
+    read=_read,
+    shown=True,
+)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,10 +24,21 @@ import zstandard
 from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.formats.compressed_ply import Arrays
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, byte_table, opacity_bytes, with_largest, without_largest
-from sgsst_core.files.scene_headers import COEFFICIENTS, SceneHeader, SpzSection
-from sgsst_core.scene.stored_harmonics import RowFile
+from sgsst_core.files.formats.scene_format import (
+    COEFFICIENTS,
+    Arrays,
+    FileStart,
+    OpenScene,
+    SceneFormat,
+    SceneHeader,
+)
+from sgsst_core.files.formats.unsupported import advice
+
+_MAGIC = b"NGSP"
+_GZIP_MAGIC = b"\x1f\x8b"
+#: Maximum compression ratio of deflate: 258 bytes for every two bits.
+_DEFLATE_RATIO = 1032
 
 _BLOCK_ROWS = 1 << 16
 _READ_BYTES = 1 << 18
@@ -58,45 +70,145 @@ _DEFLATE_LEVEL = 4
 Take = Callable[[int], bytes]
 
 
-def read_spz(path: Path, file: RowFile, header: SceneHeader, into: Arrays) -> None:
-    """Read an SPZ file into the arrays of a scene.
+@dataclass(frozen=True)
+class SpzSection:
+    """Compressed stream of an SPZ file of version 4: byte offset, compressed size and decompressed size."""
 
-    Args:
-        path: Path of the file, for messages.
-        file: Open file.
-        header: Header of the file.
-        into: float32 arrays to fill, by the names of `Scene`'s tensors.
+    offset: int
+    compressed: int
+    size: int
 
-    Raises:
-        SceneError: If a stream is damaged or not as long as the header declares, or the file has changed.
+
+@dataclass(frozen=True)
+class SpzHeader(SceneHeader):
+    """Header of an SPZ file.
+
+    Attributes:
+        size: Size of the file in bytes.
+        version: Version of the format, 1 to 4.
+        fractional_bits: Fractional bits of the fixed-point positions; unused in version 1, which has 16-bit floats.
+        sections: Decompressed sizes in bytes of positions, opacities, colors, scales, rotations and spherical
+            harmonics.
+        streams: Streams of version 4, one per section that is not empty. Empty for other versions, which have one gzip
+            stream.
     """
-    spz = header.spz
-    assert spz is not None
+
+    size: int
+    version: int
+    fractional_bits: int
+    sections: tuple[int, ...]
+    streams: tuple[SpzSection, ...] = ()
+
+
+def _read_header(start: FileStart) -> SpzHeader:
+    read = _zstd_header if start.head.startswith(_MAGIC) else _gzip_header
+    return read(start.path, start.head, start.size)
+
+
+def _gzip_header(path: Path, head: bytes, size: int) -> SpzHeader:
+    """Read the header of version 1 to 3, which stores header and sections in one gzip stream."""
+    try:
+        start = zlib.decompressobj(31).decompress(head, 16)
+    except zlib.error as error:
+        raise SceneError(f"{path}: is a damaged gzip file: {error}. Copy or export it again.") from error
+    if not start.startswith(_MAGIC):
+        raise SceneError(f"{path}: is a gzip file, but no SPZ scene. Unpack it first (gunzip), and give what is in it.")
+    version, count, degree, fractional_bits, sections = _shared_fields(path, start, (1, 2, 3))
+    needed = 16 + sum(sections)
+    if needed > _DEFLATE_RATIO * size:
+        raise SceneError(
+            f"{path}: the header declares {count} Gaussians, which take {needed} bytes, more than the file's {size} "
+            "compressed bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
+        )
+    return SpzHeader(SPZ, count, COEFFICIENTS[degree], size, version, fractional_bits, sections)
+
+
+def _zstd_header(path: Path, head: bytes, size: int) -> SpzHeader:
+    """Read the header of version 4, which is uncompressed and followed by one zstd stream per section."""
+    version, count, degree, fractional_bits, sections = _shared_fields(path, head, (4,))
+    if len(head) < 32:
+        raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
+    number, table = head[15], int.from_bytes(head[16:20], "little")
+    expected = [section for section in sections if section]
+    if number != len(expected) or table < 32 or table + 16 * number > size:
+        raise SceneError(
+            f"{path}: the SPZ header declares {number} streams, listed at byte {table}; there should be "
+            f"{len(expected)} in the {size} bytes. The file is truncated or its header is wrong. Copy it again."
+        )
+    with path.open("rb") as file:
+        file.seek(table)
+        listed = list(struct.iter_unpack("<QQ", file.read(16 * number)))
+    streams, position = [], table + 16 * number
+    for (compressed, becomes), wanted in zip(listed, expected, strict=True):
+        if becomes != wanted or position + compressed > size:
+            raise SceneError(
+                f"{path}: the SPZ header declares a stream of {compressed} bytes that become {becomes}; {wanted} "
+                f"belong to {count} Gaussians, and {size - position} bytes are left. The file is truncated or its "
+                "header is wrong. Copy or export it again."
+            )
+        streams.append(SpzSection(position, compressed, becomes))
+        position += compressed
+    return SpzHeader(SPZ, count, COEFFICIENTS[degree], size, version, fractional_bits, sections, tuple(streams))
+
+
+def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, tuple[int, ...]]:
+    """Parse the header fields that all versions share.
+
+    Returns version, number of Gaussians, SH degree, fractional bits, and the decompressed size of each section.
+    """
+    if len(head) < 16:
+        raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
+    version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
+    if version not in versions:
+        raise SceneError(f"{path}: is SPZ of version {version}, which cannot be read. {advice('scene.spz')}")
+    if degree not in COEFFICIENTS:
+        raise SceneError(f"{path}: has SH degree {degree}; 0 to 3 can be read. {advice('scene.spz')}")
+    if not count:
+        raise SceneError(f"{path}: holds no Gaussians. Export the scene again.")
+    if version > 1 and not fractional_bits <= 24:
+        raise SceneError(
+            f"{path}: positions have {fractional_bits} fractional bits of 24: the SPZ header is wrong. Export it again."
+        )
+    sections = (
+        (6 if version == 1 else 9) * count,
+        count,
+        3 * count,
+        3 * count,
+        (3 if version < 3 else 4) * count,
+        3 * COEFFICIENTS[degree] * count,
+    )
+    return version, count, degree, fractional_bits, sections
+
+
+def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> None:
+    """Fill the arrays of a scene; raise a SceneError if a stream is damaged or not as long as the header declares."""
+    assert isinstance(spz, SpzHeader)
+    path = file.path
     unpack: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
         (into["means"], _halves if spz.version == 1 else lambda data: _fixed_point(data, spz.fractional_bits)),
         (into["opacities"], lambda data: OPACITY_LOGITS[data]),
         (into["sh_dc"], lambda data: _COLORS[data].reshape(-1, 3)),
         (into["scales"], lambda data: _SCALES[data].reshape(-1, 3)),
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
-        (into["sh_rest"], lambda data: _unpack_harmonics(data, header.sh_degree)),
+        (into["sh_rest"], lambda data: _unpack_harmonics(data, spz.coefficients)),
     ]
     streams = (
         _zstd_streams(path, file, spz.streams)
         if spz.streams
-        else _gzip_stream(path, file, header.size, sum(map(bool, spz.sections)))
+        else _gzip_stream(path, file, spz.size, sum(map(bool, spz.sections)))
     )
     for (array, values), size in zip(unpack, spz.sections, strict=True):
         if not size:
             continue
         take = next(streams)
-        each = size // header.count
-        for start in range(0, header.count, _BLOCK_ROWS):
+        each = size // spz.count
+        for start in range(0, spz.count, _BLOCK_ROWS):
             part = array[start : start + _BLOCK_ROWS]
             part[:] = values(np.frombuffer(take(len(part) * each), np.uint8))
     next(streams, None)  # reach the end of the last stream, where its checksum is verified
 
 
-def _gzip_stream(path: Path, file: RowFile, size: int, sections: int) -> Iterator[Take]:
+def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int) -> Iterator[Take]:
     """Yield, for each section, a function that reads its bytes from the common gzip stream."""
     inflate = zlib.decompressobj(31)
     position = 0
@@ -107,7 +219,7 @@ def _gzip_stream(path: Path, file: RowFile, size: int, sections: int) -> Iterato
         while len(found) < count and not inflate.eof:
             data = inflate.unconsumed_tail
             if not data:
-                data = _read(file, position, min(_READ_BYTES, size - position))
+                data = _read_bytes(file, position, min(_READ_BYTES, size - position))
                 position += len(data)
             try:
                 found += inflate.decompress(data, count - len(found))
@@ -132,7 +244,7 @@ def _gzip_stream(path: Path, file: RowFile, size: int, sections: int) -> Iterato
         raise _ends_early(path)
 
 
-def _zstd_streams(path: Path, file: RowFile, streams: tuple[SpzSection, ...]) -> Iterator[Take]:
+def _zstd_streams(path: Path, file: OpenScene, streams: tuple[SpzSection, ...]) -> Iterator[Take]:
     """Yield, for each section, a function that reads its own zstd stream; check that the stream ends there."""
     for stream in streams:
         decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
@@ -159,17 +271,17 @@ def _zstd_streams(path: Path, file: RowFile, streams: tuple[SpzSection, ...]) ->
 class _Part:
     """File-like object for a byte range of a file."""
 
-    def __init__(self, file: RowFile, part: SpzSection) -> None:
+    def __init__(self, file: OpenScene, part: SpzSection) -> None:
         self._file, self._position, self._end = file, part.offset, part.offset + part.compressed
 
     def read(self, size: int = -1) -> bytes:
         left = self._end - self._position
-        data = _read(self._file, self._position, left if size < 0 else min(size, left))
+        data = _read_bytes(self._file, self._position, left if size < 0 else min(size, left))
         self._position += len(data)
         return data
 
 
-def _read(file: RowFile, offset: int, count: int) -> bytes:
+def _read_bytes(file: OpenScene, offset: int, count: int) -> bytes:
     data = np.empty(count, np.uint8)
     file.read(offset, data)
     return data.tobytes()
@@ -216,27 +328,21 @@ def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     return np.roll(with_largest(packed >> 30, values), 1, axis=1) * _FLIP_QUATS
 
 
-def _unpack_harmonics(data: NDArray[np.uint8], degree: int) -> NDArray[Any]:
-    coefficients = COEFFICIENTS[degree]
+def _unpack_harmonics(data: NDArray[np.uint8], coefficients: int) -> NDArray[Any]:
     return _HARMONICS[data].reshape(-1, coefficients, 3) * _FLIP_HARMONICS[:coefficients, None]
 
 
-def write_spz(output: BinaryIO, arrays: Arrays, target: Path) -> None:
-    """Write the arrays of a scene as SPZ version 3, which most programs can read, with all 8 bits of SH coefficients.
-
-    Args:
-        output: Stream to write to.
-        arrays: Arrays of the scene by the names of `Scene`'s tensors.
-        target: Path of the output, for messages.
+def _write(output: BinaryIO, arrays: Arrays) -> None:
+    """Write SPZ version 3, which most programs can read, with all 8 bits of SH coefficients.
 
     Raises:
         OutputError: If a position is too far from the origin.
     """
     count, coefficients = arrays["sh_rest"].shape[:2]
-    bits = _fractional_bits(arrays["means"], target)
+    bits = _fractional_bits(arrays["means"])
     degree = next(degree for degree, number in COEFFICIENTS.items() if number == coefficients)
     deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
-    output.write(deflate.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, count, degree, bits, 0, 0)))
+    output.write(deflate.compress(struct.pack("<4sIIBBBB", _MAGIC, 3, count, degree, bits, 0, 0)))
     pack: list[tuple[NDArray[np.float32], Callable[[NDArray[np.float64]], NDArray[Any]]]] = [
         (arrays["means"], lambda values: _pack_positions(values, bits)),
         (arrays["opacities"], opacity_bytes),
@@ -252,13 +358,13 @@ def write_spz(output: BinaryIO, arrays: Arrays, target: Path) -> None:
     output.write(deflate.flush())
 
 
-def _fractional_bits(means: NDArray[np.float32], target: Path) -> int:
+def _fractional_bits(means: NDArray[np.float32]) -> int:
     """Return the largest number of fractional bits that can represent the position farthest from the origin."""
     farthest = max(float(np.abs(means).max()), 2.0**-30)
     bits = min(_MOST_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
     if bits < 1:
         raise OutputError(
-            f"{target}: SPZ cannot hold a Gaussian {farthest:.3g} from the origin. Write a PLY, or a .compressed.ply."
+            f"SPZ cannot hold a Gaussian {farthest:.3g} from the origin. Write a PLY, or a .compressed.ply."
         )
     return bits
 
@@ -279,3 +385,15 @@ def _pack_rotations(quats: NDArray[np.float64]) -> NDArray[Any]:
 
 def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+SPZ = SceneFormat(
+    name="spz",
+    title="SPZ",
+    matches=lambda start: start.head.startswith((_MAGIC, _GZIP_MAGIC)),
+    read_header=_read_header,
+    bytes_per_gaussian=25,
+    read=_read,
+    write=_write,
+    shown=True,
+)

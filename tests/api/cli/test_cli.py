@@ -26,8 +26,8 @@ from plyfile import PlyData
 from api.cli.main import main
 from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
-from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
-from sgsst_core.files.scene_headers import PackedForm
+from sgsst_core.files.formats import by_name
+from sgsst_core.files.scene_file import read_scene, write_scene
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -156,10 +156,8 @@ def test_regions_that_cannot_be_used(
 
 
 @pytest.mark.parametrize("form", [pytest.param("compressed.ply", marks=pytest.mark.slow), "spz"])
-def test_stylize_reads_and_writes_packed_scenes(
-    files: Files, capsys: pytest.CaptureFixture[str], form: PackedForm
-) -> None:
-    write_packed(files.ply, read_scene(files.ply).scene, form)
+def test_stylize_reads_and_writes_packed_scenes(files: Files, capsys: pytest.CaptureFixture[str], form: str) -> None:
+    write_scene(files.ply, read_scene(files.ply).scene, by_name(form))
     source = read_scene(files.ply).scene
     files.out = files.out.with_name(f"wall.{form}")
     assert main(files.stylize("--steps-sos", "3")) == 0
@@ -169,7 +167,7 @@ def test_stylize_reads_and_writes_packed_scenes(
     assert str(files.out) in shown
     assert str(files.out.with_name("wall.ply")) in shown
     ply, packed = read_scene(files.out.with_name("wall.ply")), read_scene(files.out)
-    assert (ply.form, packed.form) == ("ply", form)
+    assert (ply.format, packed.format) == ("ply", form)
     assert torch.equal(ply.scene.means, source.means)
     assert not torch.equal(ply.scene.sh_dc, source.sh_dc)
     report = json.loads(files.out.with_name("wall.report.json").read_text())

@@ -32,8 +32,8 @@ from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.tables import UploadRow
-from sgsst_core.files.scene_file import write_packed
-from sgsst_core.files.scene_headers import PACKED_FORMS
+from sgsst_core.files.formats import EXTRA_FORMATS
+from sgsst_core.files.scene_file import write_scene
 from sgsst_core.options import declared
 from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import wall, write_files
@@ -61,9 +61,9 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """Return the test scene as files in compressed formats."""
     folder, scene = tmp_path_factory.mktemp("packed"), wall()
     found: Files = {}
-    for form in PACKED_FORMS:
-        write_packed(folder / form, scene, form)
-        found[form] = (folder / form).read_bytes()
+    for format in EXTRA_FORMATS:
+        write_scene(folder / format.name, scene, format)
+        found[format.name] = (folder / format.name).read_bytes()
     color = bytes([200, 100, 50, 255, 255, 128, 128, 128])
     rows = [struct.pack("<6f", *mean, 0.16, 0.16, 0.01) + color for mean in scene.means.tolist()]
     return {**found, "splat": b"".join(rows)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ import httpx
 import pytest
 
 from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
+from sgsst_core.files.formats import FORMATS
 from tests.api.service import Service
 
 BUNDLE = "vendor/swagger-ui/swagger-ui-bundle.js"
@@ -56,12 +58,20 @@ def test_files_are_kept_for_ever_under_their_digest(client: httpx.Client, files:
     for name in files.files:
         path = f"/static/{files.digest}/{name}"
         plain = client.get(path, headers={"Accept-Encoding": "identity"})
-        assert plain.content == Path(FOLDER, name).read_bytes()
+        if name != "scene_formats.js":
+            assert plain.content == Path(FOLDER, name).read_bytes()
         assert "max-age=31536000" in plain.headers["cache-control"]
         assert "immutable" in plain.headers["cache-control"]
         assert plain.headers["content-security-policy"] == POLICY
         known = client.get(path, headers={"Accept-Encoding": "identity", "If-None-Match": plain.headers["etag"]})
         assert (known.status_code, known.content) == (304, b"")
+
+
+def test_page_knows_the_registered_scene_formats(client: httpx.Client, files: StaticFiles) -> None:
+    module = client.get(f"/static/{files.digest}/scene_formats.js").text
+    found = re.search(r"sceneFormats = .*\((\[.*\])\);", module)
+    assert found
+    assert [entry["suffix"] for entry in json.loads(found[1])] == [format.suffix for format in FORMATS]
 
 
 def test_modules_have_the_type_that_browsers_ask_for(client: httpx.Client, files: StaticFiles) -> None:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.camera import resized
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
@@ -328,7 +329,7 @@ def test_refined_result_has_a_geometry_of_its_own(visit: Visit, service: Service
 def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     """Geometry comes from the compressed file, colors from the result, in the order of the file."""
     packed = files["scene"].with_name("scene.spz")
-    write_packed(packed, read_scene(files["scene"]).scene, "spz")
+    write_scene(packed, read_scene(files["scene"]).scene, SPZ)
     job_id = done(service, submit(service, files | {"scene": packed}, name="packed"))
     result = files["scene"].with_name("stylized.ply")
     result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)

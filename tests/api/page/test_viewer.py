@@ -14,9 +14,10 @@ import pytest
 import torch
 
 from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.quantized import SH_C0
-from sgsst_core.files.scene_file import read_scene, write_packed
-from sgsst_core.files.scene_headers import SPLAT_BYTES, splat_rows
+from sgsst_core.files.formats.splat import ROW
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
@@ -75,7 +76,7 @@ def test_packed_scenes_are_shown(
     if form == "splat":
         ply.write_bytes(splat_bytes(scene))
     else:
-        write_packed(tmp_path / f"scene.{form}", scene, form)
+        write_scene(tmp_path / f"scene.{form}", scene, by_name(form))
         (tmp_path / f"scene.{form}").rename(ply)
     watched = visit("/#/jobs")
     for camera in views[:2]:
@@ -86,7 +87,7 @@ def test_packed_scenes_are_shown(
 
 def splat_bytes(scene: Scene) -> bytes:
     """Encode a scene in the .splat format, for which the project has no writer."""
-    rows = splat_rows(np.zeros(len(scene) * SPLAT_BYTES, np.uint8))
+    rows = np.zeros(len(scene), ROW)
     rows.flags.writeable = True
     quats = scene.quats / scene.quats.norm(dim=1, keepdim=True)
     shown = torch.cat([scene.sh_dc * SH_C0 + 0.5, scene.opacities.sigmoid()[:, None]], dim=1)

@@ -14,7 +14,7 @@ from typing import Any
 
 from service.inspection import process, sandbox
 from sgsst_core.errors import SceneError
-from sgsst_core.files.scene_headers import read_scene_header
+from sgsst_core.files.formats import read_scene_header
 
 
 def taken_over(path: Path) -> Any:

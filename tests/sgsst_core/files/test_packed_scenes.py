@@ -25,8 +25,13 @@ from plyfile import PlyData, PlyElement
 
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.scene_file import read_scene, write_packed, write_scene, write_stylized
-from sgsst_core.files.scene_headers import PackedForm, form_of_name, read_scene_header
+from sgsst_core.files.formats import EXTRA_FORMATS, format_of_name, read_scene_header
+from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
+from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.formats.splat import SPLAT
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
 from sgsst_core.quality.packed import measure_packed
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
@@ -37,7 +42,6 @@ from tests.small_scenes import cameras, wall
 
 #: Half a turn about x, from the axes of a PLY to those of SPZ.
 TURN = torch.tensor([1.0, -1.0, -1.0])
-FORMS: tuple[PackedForm, ...] = ("compressed.ply", "spz")
 
 
 def scene_of(data: gsply.GSData | None) -> Scene:
@@ -100,7 +104,7 @@ def test_compressed_ply_of_another_program_is_read_as_it_reads_it(tmp_path: Path
     path = tmp_path / "scene.ply"
     data = gsply_of(cloud(700, degree=degree))
     write_compressed(path, data.means, data.scales, data.quats, data.opacities, data.sh0, data.shN)
-    assert read_scene_header(path).form == "compressed.ply"
+    assert read_scene_header(path).format is COMPRESSED_PLY
     found, reference = read_scene(path), read_compressed(path)
     assert found.scene.sh_degree == degree
     # gsply places the first and last level of SH coefficients in the middle of their steps instead of at the ends.
@@ -118,22 +122,22 @@ def test_spz_of_another_program_is_read_as_it_reads_it_but_for_the_axes(
 ) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=degree)), version=version)
-    assert read_scene_header(path).form == "spz"
+    assert read_scene_header(path).format is SPZ
     found = read_scene(path)
     assert found.scene.sh_degree == degree
     assert_close(turned(found.scene), scene_of(read_spz(path)))
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("format", EXTRA_FORMATS)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_another_program_reads_what_is_written(tmp_path: Path, form: PackedForm, degree: int) -> None:
-    path = tmp_path / f"scene.{form}"
-    write_packed(path, cloud(700, degree=degree), form)
+def test_another_program_reads_what_is_written(tmp_path: Path, format: SceneFormat, degree: int) -> None:
+    path = tmp_path / f"scene.{format.name}"
+    write_scene(path, cloud(700, degree=degree), format)
     found = read_scene(path).scene
     assert found.sh_degree == degree
-    data = read_spz(path) if form == "spz" else read_compressed(path)
+    data = read_spz(path) if format is SPZ else read_compressed(path)
     assert data is not None
-    assert_close(turned(found) if form == "spz" else found, scene_of(data))
+    assert_close(turned(found) if format is SPZ else found, scene_of(data))
 
 
 # --- values by hand --------------------------------------------------------------------------------------------------
@@ -172,7 +176,7 @@ def test_splat_by_hand(tmp_path: Path) -> None:
     path.write_bytes(row * 3)
     found = read_scene(path)
     scene = found.scene
-    assert (found.form, len(scene), scene.sh_degree) == ("splat", 3, 0)
+    assert (found.format, len(scene), scene.sh_degree) == ("splat", 3, 0)
     assert scene.means[2].tolist() == [1, 2, 3]
     assert scene.scales[0].tolist() == pytest.approx([0, 1, np.log(0.5)])
     assert (0.5 + 0.28209479177387814 * scene.sh_dc[0]).tolist() == pytest.approx([0, 1, 0.2], abs=1e-6)
@@ -182,12 +186,12 @@ def test_splat_by_hand(tmp_path: Path) -> None:
 
 def test_full_and_no_opacity_are_finite_and_come_back(tmp_path: Path) -> None:
     scene = replace(wall(), opacities=torch.cat([torch.full((308,), 1e4), torch.full((308,), -1e4)]))
-    for form in FORMS:
-        path = tmp_path / f"scene.{form}"
-        write_packed(path, scene, form)
+    for format in EXTRA_FORMATS:
+        path = tmp_path / f"scene.{format.name}"
+        write_scene(path, scene, format)
         back = read_scene(path).scene
         assert sorted(set(back.opacities.sigmoid().tolist())) == pytest.approx([0.25 / 255, 1 - 0.25 / 255], rel=1e-4)
-        write_packed(path, back, form)
+        write_scene(path, back, format)
         assert torch.equal(read_scene(path).scene.opacities.sort().values, back.opacities.sort().values)
 
 
@@ -195,7 +199,7 @@ def test_bounds_without_colors(tmp_path: Path) -> None:
     """Compressed PLYs of older versions have colors between 0 and 1."""
     path = tmp_path / "scene.ply"
     scene = replace(wall(), sh_dc=torch.zeros(616, 3))
-    write_packed(path, scene, "compressed.ply")
+    write_scene(path, scene, COMPRESSED_PLY)
     ply = PlyData.read(str(path), mmap=False)
     kept = [name for name in ply["chunk"].data.dtype.names if name[-1] not in "rgb"]
     chunk = PlyElement.describe(np.array(ply["chunk"].data[kept].tolist(), [(name, "<f4") for name in kept]), "chunk")
@@ -208,30 +212,30 @@ def test_bounds_without_colors(tmp_path: Path) -> None:
 # --- what is written -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("form", "bound"), [("compressed.ply", 40), ("spz", 40)])
-def test_pictures_of_what_is_written_are_nearly_the_same(tmp_path: Path, form: PackedForm, bound: float) -> None:
+@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 40), (SPZ, 40)])
+def test_pictures_of_what_is_written_are_nearly_the_same(tmp_path: Path, format: SceneFormat, bound: float) -> None:
     scene = replace(cloud(2000, degree=3), opacities=torch.full((2000,), 2.0))
-    path = tmp_path / f"scene.{form}"
-    write_packed(path, scene, form)
+    path = tmp_path / f"scene.{format.name}"
+    write_scene(path, scene, format)
     loss = measure_packed(path, scene, [camera(), camera(140, 90)], near=0.01)
     assert loss.psnr is not None
     assert loss.psnr > bound
     assert loss.as_dict() == {
         "name": path.name,
-        "format": form,
+        "format": format.name,
         "bytes": path.stat().st_size,
         "views": ["test", "test"],
         "psnr_db": round(loss.psnr, 2),
     }
 
 
-@pytest.mark.parametrize(("form", "bound"), [("compressed.ply", 48), ("spz", 53)])
-def test_a_real_scene_loses_little(shared_data: Path, tmp_path: Path, form: PackedForm, bound: float) -> None:
+@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53)])
+def test_a_real_scene_loses_little(shared_data: Path, tmp_path: Path, format: SceneFormat, bound: float) -> None:
     """The plush toy has 47,974 Gaussians of degree 3, trained from photos."""
     folder = shared_data / "scenes" / "snowmiku_plush"
     scene = read_scene(next(folder.glob("*.ply"))).scene
     path = tmp_path / "plush"
-    write_packed(path, scene, form)
+    write_scene(path, scene, format)
     loss = measure_packed(path, scene, read_cameras(folder / "cameras.json"), near=0.01)
     assert loss.psnr is not None
     assert loss.psnr > bound
@@ -242,7 +246,7 @@ def test_the_loss_is_that_of_pictures(tmp_path: Path) -> None:
     """The PSNR of one view is computed by hand."""
     scene, view = wall(sh_degree=1), cameras(1)[0]
     path = tmp_path / "scene.spz"
-    write_packed(path, replace(scene, sh_dc=scene.sh_dc + 0.3), "spz")
+    write_scene(path, replace(scene, sh_dc=scene.sh_dc + 0.3), SPZ)
     back = read_scene(path).scene
     first, second = (
         make_rasterizer("cpu", each, near=0.01)
@@ -259,7 +263,7 @@ def test_neighbors_share_bounds(tmp_path: Path) -> None:
     scene = cloud(20_000)
     scene = scene.subset(torch.randperm(len(scene), generator=torch.Generator().manual_seed(1)))
     path = tmp_path / "scene.ply"
-    write_packed(path, scene, "compressed.ply")
+    write_scene(path, scene, COMPRESSED_PLY)
     back = read_scene(path).scene.means
     order, other = (each[:, 0].double().argsort() for each in (scene.means, back))
     extent = float(scene.means.max() - scene.means.min())
@@ -270,9 +274,9 @@ def test_neighbors_share_bounds(tmp_path: Path) -> None:
 def test_bands_that_are_zero_are_not_written(tmp_path: Path) -> None:
     scene = wall(sh_degree=3)
     held(scene.sh_rest)[:, 3:] = 0
-    for form in FORMS:
-        path = tmp_path / f"scene.{form}"
-        write_packed(path, scene, form)
+    for format in EXTRA_FORMATS:
+        path = tmp_path / f"scene.{format.name}"
+        write_scene(path, scene, format)
         assert read_scene(path).scene.sh_degree == 1
 
 
@@ -280,7 +284,7 @@ def test_a_position_that_spz_cannot_hold_is_an_error_and_leaves_nothing(tmp_path
     scene = wall()
     scene.means[5, 1] = -1e7
     with pytest.raises(OutputError, match=r"cannot hold a Gaussian 1e\+07 from the origin"):
-        write_packed(tmp_path / "scene.spz", scene, "spz")
+        write_scene(tmp_path / "scene.spz", scene, SPZ)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -298,32 +302,33 @@ def test_a_float_ply_is_what_it_was(tmp_path: Path) -> None:
     assert path.read_bytes() == other.read_bytes()
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_a_packed_scene_becomes_a_float_ply_with_the_new_colors(tmp_path: Path, form: PackedForm) -> None:
+@pytest.mark.parametrize("format", EXTRA_FORMATS)
+def test_a_packed_scene_becomes_a_float_ply_with_the_new_colors(tmp_path: Path, format: SceneFormat) -> None:
     packed, out = tmp_path / "scene.any", tmp_path / "out.ply"
-    write_packed(packed, wall(sh_degree=2), form)
+    write_scene(packed, wall(sh_degree=2), format)
     source = read_scene(packed)
     colors = torch.randn(616, 3, generator=torch.Generator().manual_seed(1))
     write_stylized(source, out, colors)
     found = read_scene(out)
-    assert found.form == "ply"
+    assert found.format == "ply"
     assert torch.equal(found.scene.sh_dc, colors)
     for name in ("means", "quats", "scales", "opacities", "sh_rest"):
         assert torch.equal(getattr(found.scene, name), getattr(source.scene, name)), name
 
 
 def test_names_tell_what_is_written() -> None:
-    assert form_of_name("a.ply") == form_of_name("a.PLY") == "ply"
-    assert form_of_name("a.b.compressed.ply") == "compressed.ply"
-    assert form_of_name("a.SPZ") == "spz"
-    assert form_of_name("a.splat") is form_of_name("ply") is None
+    assert format_of_name("a.ply") is format_of_name("a.PLY") is PLY
+    assert format_of_name("a.b.compressed.ply") is COMPRESSED_PLY
+    assert format_of_name("a.SPZ") is SPZ
+    assert format_of_name("a.splat") is SPLAT
+    assert format_of_name("ply") is None
 
 
 # --- files that lie --------------------------------------------------------------------------------------------------
 
 
-def packed(tmp_path: Path, form: PackedForm, degree: int = 1) -> bytes:
-    write_packed(tmp_path / "good", wall(sh_degree=degree), form)
+def packed(tmp_path: Path, format: SceneFormat, degree: int = 1) -> bytes:
+    write_scene(tmp_path / "good", wall(sh_degree=degree), format)
     return (tmp_path / "good").read_bytes()
 
 
@@ -365,14 +370,14 @@ def refused(tmp_path: Path, data: bytes, message: str, name: str = "scene.ply") 
     ],
 )
 def test_compressed_plys_that_lie(tmp_path: Path, change: Callable[[bytes], bytes], message: str) -> None:
-    data = packed(tmp_path, "compressed.ply")
+    data = packed(tmp_path, COMPRESSED_PLY)
     changed = change(data)
     assert changed != data
     refused(tmp_path, changed, message)
 
 
 def test_bounds_that_are_no_numbers(tmp_path: Path) -> None:
-    data = packed(tmp_path, "compressed.ply")
+    data = packed(tmp_path, COMPRESSED_PLY)
     start = data.index(b"end_header\n") + len(b"end_header\n")
     changed = data[:start] + struct.pack("<f", float("nan")) + data[start + 4 :]
     refused(tmp_path, changed, r"256 of 616 Gaussians hold NaN or infinite values: x \(256 NaN\).*--drop-invalid")
@@ -416,13 +421,13 @@ def test_spz_that_lies(tmp_path: Path, data: bytes, message: str) -> None:
 
 
 def test_spz_with_a_wrong_checksum_or_damaged_data(tmp_path: Path) -> None:
-    data = packed(tmp_path, "spz")
+    data = packed(tmp_path, SPZ)
     refused(tmp_path, data[:-5] + bytes([data[-5] ^ 1]) + data[-4:], "damaged: .*incorrect data check")
     refused(tmp_path, data[:200] + bytes(50) + data[250:], "the compressed data")
 
 
 def test_extensions_behind_the_data_are_passed_over(tmp_path: Path) -> None:
-    raw = bytearray(gzip.decompress(packed(tmp_path, "spz")))
+    raw = bytearray(gzip.decompress(packed(tmp_path, SPZ)))
     raw[14] = 2
     (tmp_path / "more").write_bytes(gzip.compress(bytes(raw) + bytes(1000)))
     first, second = (read_scene(tmp_path / name).scene for name in ("good", "more"))
@@ -453,7 +458,7 @@ def test_splats_that_lie(tmp_path: Path) -> None:
     "data", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + bytes(300), b"a text of words. " * 200, bytes(3200)]
 )
 def test_other_files(tmp_path: Path, data: bytes) -> None:
-    refused(tmp_path, data, "has no PLY header .*neither SPZ nor .splat.*Give a 3DGS scene as")
+    refused(tmp_path, data, "expected PLY, compressed PLY, SPZ or .splat")
 
 
 def ksplat() -> bytes:
@@ -483,7 +488,7 @@ def test_random_changes_never_break_a_reader(tmp_path: Path) -> None:
     path = tmp_path / "scene"
     row = struct.pack("<6f8B", 1, 2, 3, 1, 1, 1, 0, 255, 51, 128, 255, 128, 128, 128)
     write_spz(tmp_path / "four", gsply_of(wall(sh_degree=1)), version=4)
-    goods = [*(packed(tmp_path, form) for form in FORMS), row * 100, (tmp_path / "four").read_bytes()]
+    goods = [*(packed(tmp_path, format) for format in EXTRA_FORMATS), row * 100, (tmp_path / "four").read_bytes()]
     goods.append(zlib.decompress(goods[1], 31))
     for trial in range(400):
         data = bytearray(goods[trial % len(goods)])

@@ -367,8 +367,8 @@ GAUSSIAN = [f"property float {name}" for name in BASE]
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "no PLY header"),
-        (b"\x89PNG\r\n", "no PLY header"),
+        (b"", "expected PLY, compressed PLY"),
+        (b"\x89PNG\r\n", "expected PLY, compressed PLY"),
         (b"plywood", "no PLY header"),
         (b"ply\nformat ascii 1.0\nelement vertex 3\n", "no 'end_header'"),
         (b"ply\nelement vertex 3\nend_header\n", "line 2 .*element vertex 3"),

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files import scene_file
-from sgsst_core.files.scene_file import read_scene, write_packed, write_scene, write_stylized
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
 from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
@@ -121,7 +122,7 @@ def test_a_scene_of_degree_0_has_nothing_to_fade(tmp_path: Path) -> None:
 
 
 def test_packed_scenes_fade_into_their_ply(tmp_path: Path) -> None:
-    write_packed(tmp_path / "scene.spz", cloud(60, degree=1), "spz")
+    write_scene(tmp_path / "scene.spz", cloud(60, degree=1), SPZ)
     source = read_scene(tmp_path / "scene.spz")
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.25)
     assert torch.equal(held(read_scene(tmp_path / "out.ply").scene.sh_rest), held(source.scene.sh_rest) * 0.75)

@@ -19,6 +19,8 @@ from torch import Tensor
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files import scene_file
+from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.formats.scene_format import SceneHeader
 from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
 from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import Scene
@@ -224,10 +226,9 @@ def test_a_file_that_is_replaced_or_deleted_stays_readable(tmp_path: Path) -> No
 
 def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path)
-    check = scene_file._check_properties
 
-    def shrink(*arguments: object) -> int:
-        degree = check(*arguments)  # type: ignore[arg-type]
+    def shrink(scene: Path) -> SceneHeader:
+        header = read_scene_header(scene)
         opened = RowFile.__init__
 
         def late(self: RowFile, name: Path) -> None:
@@ -235,9 +236,9 @@ def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path: Path, monkeyp
             os.truncate(name, 4000)
 
         monkeypatch.setattr(RowFile, "__init__", late)
-        return degree
+        return header
 
-    monkeypatch.setattr(scene_file, "_check_properties", shrink)
+    monkeypatch.setattr(scene_file, "read_scene_header", shrink)
     with pytest.raises(SceneError, match="was changed"):
         read_scene(path, held_bytes=0)
 

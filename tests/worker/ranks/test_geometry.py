@@ -15,8 +15,9 @@ from torch import Tensor
 
 from sgsst_core.errors import SceneError, SceneTooLargeError
 from sgsst_core.files import scene_file
-from sgsst_core.files.scene_file import read_scene, write_packed, write_scene
-from sgsst_core.files.scene_headers import PACKED_FORMS, PackedForm
+from sgsst_core.files.formats import EXTRA_FORMATS
+from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.scene.gaussians import Scene
@@ -75,10 +76,10 @@ def test_one_rank_reads_and_all_have_the_same(tmp_path: Path, drop: bool) -> Non
 
 
 @linux
-@pytest.mark.parametrize("form", ["compressed.ply", "spz"])
-def test_a_packed_scene_is_read_once_too(tmp_path: Path, form: PackedForm) -> None:
+@pytest.mark.parametrize("format", EXTRA_FORMATS)
+def test_a_packed_scene_is_read_once_too(tmp_path: Path, format: SceneFormat) -> None:
     path = tmp_path / "scene"
-    write_packed(path, wall(sh_degree=1), form)
+    write_scene(path, wall(sh_degree=1), format)
     found = on_ranks(2, shared, path, False)
     assert [rank[0] for rank in found] == [digest(read_scene(path).scene)] * 2
     assert [rank[1] for rank in found] == [True, False]
@@ -87,8 +88,8 @@ def test_a_packed_scene_is_read_once_too(tmp_path: Path, form: PackedForm) -> No
 def test_the_room_that_a_packed_scene_needs_is_that_of_its_floats(tmp_path: Path) -> None:
     """The requirement follows from the header, before the scene is decompressed."""
     path = tmp_path / "scene"
-    for form in PACKED_FORMS:
-        write_packed(path, wall(sh_degree=3), form)
+    for format in EXTRA_FORMATS:
+        write_scene(path, wall(sh_degree=3), format)
         little = patch.object(geometry, "available_memory", return_value=616 * 4 * 59)
         with little, pytest.raises(SceneTooLargeError, match="616 Gaussians need"):
             read_shared_scene(path, ALONE)

@@ -1,0 +1,38 @@
+// @ts-check
+/** Scene formats that the service reads. The server fills in its registry. */
+
+/**
+ * @typedef {object} SceneFormat
+ * @property {string} suffix file name suffix, such as ".compressed.ply"
+ * @property {string} title
+ * @property {boolean} shown whether the viewer reads the format
+ * @property {number[]} magic first bytes of a file that the viewer does not read; empty if they vary
+ */
+
+/** @type {SceneFormat[]} */
+export const sceneFormats = /** @type {any} */ ("{{scene_formats}}");
+
+/** Titles of all formats: "PLY, compressed PLY, SPZ or .splat". */
+export const titles = sceneFormats.map(({ title }) => title).join(", ").replace(/, ([^,]*)$/, " or $1");
+
+/** Value of the attribute `accept` of a file input: the last part of each suffix. */
+export const accepted = [...new Set(sceneFormats.map(({ suffix }) => suffix.slice(suffix.lastIndexOf("."))))].join();
+
+/**
+ * Return the suffix of a scene file, by its name; "" for other files.
+ *
+ * @param {string} name
+ */
+export function sceneSuffix(name) {
+  const fitting = sceneFormats.map(({ suffix }) => suffix).filter((suffix) => name.toLowerCase().endsWith(suffix));
+  return fitting.reduce((longest, suffix) => (suffix.length > longest.length ? suffix : longest), "");
+}
+
+/**
+ * Return the format of a file that the service reads but the viewer does not.
+ *
+ * @param {Uint8Array} start first bytes of the file
+ */
+export function notShown(start) {
+  return sceneFormats.find(({ shown, magic }) => !shown && magic.length && magic.every((byte, i) => byte === start[i]));
+}

@@ -1,0 +1,120 @@
+"""PLY of 3DGS trainers: header check and writer. `scene_file` reads it.
+
+The properties are those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023): x y z,
+f_dc_0..2, f_rest_* (channel-major: all coefficients of red first), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
+from sgsst_core.files.formats.ply_header import PlyHeader, check_length, read_header
+from sgsst_core.files.formats.scene_format import Arrays, FileStart, SceneFormat, SceneHeader
+
+#: Properties of the scene's tensors; opacity and f_rest_* follow.
+PROPERTIES = {
+    "means": ("x", "y", "z"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+    "scales": ("scale_0", "scale_1", "scale_2"),
+    "sh_dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
+}
+_BLOCK_ROWS = 1 << 16
+
+
+@dataclass(frozen=True)
+class PlySceneHeader(SceneHeader):
+    """Header of a PLY."""
+
+    ply: PlyHeader
+
+
+def _matches(start: FileStart) -> bool:
+    return start.head.startswith(b"ply") and not COMPRESSED_PLY.matches(start)
+
+
+def _read_header(start: FileStart) -> PlySceneHeader:
+    header = read_header(start.path)
+    coefficients = _check_properties(start.path, header)
+    check_length(start.path, header)
+    return PlySceneHeader(PLY, header.vertex.count, coefficients, header)
+
+
+def _check_properties(path: Path, header: PlyHeader) -> int:
+    """Check that a PLY is a 3DGS scene before any data is read, and return its SH coefficients per channel."""
+    vertex = header.vertex if "vertex" in header.names else None
+    kinds = {prop.name: prop.kind for prop in vertex.properties if not prop.length_kind} if vertex else {}
+    missing = [name for names in (*PROPERTIES.values(), ("opacity",)) for name in names if name not in kinds]
+    if vertex is None or missing:
+        raise SceneError(f"{path}: is not a 3DGS scene but {_what_else(header)}; missing: {', '.join(missing)}.")
+    if vertex.count == 0:
+        raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
+    if vertex.has_lists:
+        name = next(prop.name for prop in vertex.properties if prop.length_kind)
+        raise SceneError(
+            f"{path}: vertex property {name!r} is a list, which 3DGS scenes do not have. Export without it."
+        )
+    for name in PROPERTIES["sh_dc"]:
+        if kinds[name][0] != "f":
+            raise SceneError(
+                f"{path}: {name} is stored as integers; new colors need float or double. Convert it first."
+            )
+    rest = [name for name in kinds if re.fullmatch(r"f_rest_\d+", name)]
+    if len(rest) not in (0, 9, 24, 45):
+        raise SceneError(
+            f"{path}: has {len(rest)} f_rest properties; SH degree 0, 1, 2, 3 have 0, 9, 24, 45. Export it again."
+        )
+    absent = [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in kinds]
+    if absent:
+        raise SceneError(
+            f"{path}: f_rest properties are not numbered 0 to {len(rest) - 1}; missing: {', '.join(absent)}."
+        )
+    return len(rest) // 3
+
+
+def _what_else(header: PlyHeader) -> str:
+    """Guess what a PLY without Gaussians contains, for the error message."""
+    vertex = header.vertex if "vertex" in header.names else None
+    names = {prop.name for prop in vertex.properties} if vertex else set()
+    if "face" in header.names:
+        return "a mesh (it has faces)"
+    if {"x", "y", "z"} <= names and not names & {"opacity", "scale_0", "rot_0", "f_dc_0"}:
+        return "a point cloud (train Gaussians on it first)"
+    return "something else" if vertex else "a PLY without vertices"
+
+
+def _write(output: BinaryIO, arrays: Arrays) -> None:
+    """Write a binary little-endian float32 PLY with the usual order of properties. Normals are 0."""
+    count, coefficients = arrays["sh_rest"].shape[:2]
+    names = [*PROPERTIES["means"], "nx", "ny", "nz", *PROPERTIES["sh_dc"]]
+    names += [*(f"f_rest_{i}" for i in range(3 * coefficients)), "opacity", *PROPERTIES["scales"], *PROPERTIES["quats"]]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property float {name}" for name in names]
+    output.write("\n".join([*lines, "end_header", ""]).encode())
+    for start in range(0, count, _BLOCK_ROWS):
+        block = {name: array[start : start + _BLOCK_ROWS] for name, array in arrays.items()}
+        rows = np.zeros((len(block["means"]), len(names)), "<f4")
+        rows[:, :3] = block["means"]
+        rows[:, 6:9] = block["sh_dc"]
+        rows[:, 9:-8] = block["sh_rest"].transpose(0, 2, 1).reshape(len(rows), -1)  # channel-major
+        rows[:, -8] = block["opacities"]
+        rows[:, -7:-4] = block["scales"]
+        rows[:, -4:] = block["quats"]
+        output.write(rows.data)
+
+
+PLY = SceneFormat(
+    name="ply",
+    title="PLY",
+    matches=_matches,
+    read_header=_read_header,
+    bytes_per_gaussian=248,
+    write=_write,
+    shown=True,
+)
