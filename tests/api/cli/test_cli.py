@@ -26,7 +26,7 @@ from plyfile import PlyData
 from api.cli.main import main
 from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
-from sgsst_core.files.formats import by_name
+from sgsst_core.files.formats import RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
@@ -185,7 +185,7 @@ def test_a_packed_result_never_takes_the_scenes_place(files: Files, capsys: pyte
     assert "(the PLY beside scene.spz): is the scene itself" in capsys.readouterr().err
     files.out = files.ply.with_suffix(".splat")
     assert main(files.stylize()) == 2
-    assert "does not end in .ply, .compressed.ply or .spz" in capsys.readouterr().err
+    assert f"does not end in {RESULT_SUFFIXES}" in capsys.readouterr().err
     assert files.ply.read_bytes() == before
 
 

@@ -1,0 +1,104 @@
+"""Scenes as files of all formats, and checks of files that must be refused."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.stored_harmonics import held
+from tests.small_scenes import wall
+
+#: Record of a .splat file.
+SPLAT_ROW = struct.pack("<6f8B", 1, 2, 3, 1, 1, 1, 0, 255, 51, 128, 255, 128, 128, 128)
+
+
+def scene_of(data: gsply.GSData | None) -> Scene:
+    assert data is not None
+    rest = np.zeros((len(data.means), 0, 3), np.float32) if data.shN is None else data.shN
+    arrays = data.means, data.quats, data.scales, data.opacities.reshape(-1), data.sh0, rest
+    return Scene(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+
+
+def gsply_of(scene: Scene) -> gsply.GSData:
+    arrays = {field.name: getattr(scene, field.name).numpy() for field in fields(scene)}
+    rest = arrays["sh_rest"]
+    return gsply.GSData.from_arrays(
+        means=arrays["means"],
+        scales=arrays["scales"],
+        quats=arrays["quats"] / np.linalg.norm(arrays["quats"], axis=1, keepdims=True),
+        opacities=arrays["opacities"],
+        sh0=arrays["sh_dc"],
+        shN=rest if rest.shape[1] else None,
+        format="ply",
+    )
+
+
+def assert_close(found: Scene, expected: Scene, *, opacities: float = 1.1e-3, others: float = 3e-6) -> None:
+    """Assert that scenes are equal up to rounding and the sign of quaternions, and that opacities are finite."""
+    for field in fields(Scene):
+        first, second = getattr(found, field.name).double(), getattr(expected, field.name).double()
+        tolerance = others
+        if field.name == "quats":
+            first, second = (torch.nn.functional.normalize(each, dim=1) for each in (first, second))
+            second = second * (first * second).sum(dim=1, keepdim=True).sign()
+        if field.name == "opacities":
+            assert bool(torch.isfinite(first).all())
+            first, second, tolerance = first.sigmoid(), second.sigmoid(), opacities
+        torch.testing.assert_close(first, second, rtol=tolerance, atol=tolerance)
+
+
+def encoded(tmp_path: Path, format: SceneFormat, degree: int = 1) -> bytes:
+    """Return the bytes of a small scene in a format."""
+    write_scene(tmp_path / "good", wall(sh_degree=degree), format)
+    return (tmp_path / "good").read_bytes()
+
+
+def refused(tmp_path: Path, data: bytes, message: str, name: str = "scene.ply") -> None:
+    """Assert that a file is refused with a message, without allocating much memory."""
+    path = tmp_path / name
+    path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(SceneError, match=message) as caught:
+            read_scene(path)
+        assert tracemalloc.get_traced_memory()[1] < 64e6
+    finally:
+        tracemalloc.stop()
+    assert str(path) in str(caught.value)
+
+
+def check_damage(path: Path, good: bytes, wrap: Callable[[bytes], bytes] = bytes, trials: int = 80) -> None:
+    """Assert that randomly damaged files give a `SceneError` or a scene of finite values.
+
+    Args:
+        path: File to write.
+        good: Bytes of a scene, of which some are changed, mostly in the header.
+        wrap: Conversion of the changed bytes to those of a file.
+        trials: Number of damaged files.
+    """
+    generator = np.random.default_rng(3)
+    for trial in range(trials):
+        data = bytearray(good)
+        for _ in range(generator.integers(1, 8)):
+            index = int(generator.integers(0, min(len(data), 1500) if generator.random() < 0.7 else len(data)))
+            data[index] = int(generator.integers(0, 256))
+        if generator.random() < 0.3:
+            del data[int(generator.integers(0, len(data))) :]
+        path.write_bytes(wrap(bytes(data)))
+        try:
+            scene = read_scene(path).scene
+        except SceneError:
+            continue
+        assert all(bool(torch.isfinite(held(getattr(scene, field.name))).all()) for field in fields(scene)), trial

@@ -1,0 +1,162 @@
+"""Tests of what holds for every scene format."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.formats import EXTRA_FORMATS, FORMATS, RESULT_FORMATS, TITLES, format_of_name, read_scene_header
+from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
+from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.scene_format import FileStart, SceneFormat
+from sgsst_core.files.formats.splat import SPLAT
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
+from sgsst_core.quality.packed import measure_packed
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.stored_harmonics import held
+from tests.sgsst_core.files.formats.samples import (
+    check_damage,
+    encoded,
+    refused,
+)
+from tests.sgsst_core.splat_scenes import camera, cloud
+from tests.small_scenes import cameras, wall
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
+def test_written_scene_is_read_back(tmp_path: Path, format: SceneFormat, degree: int) -> None:
+    scene, path = cloud(700, degree=degree), tmp_path / "scene.any"
+    write_scene(path, scene, format)
+    header, file = read_scene_header(path), read_scene(path)
+    assert (header.format, file.format) == (format, format.name)
+    assert (header.count, len(file.scene), file.scene.sh_degree) == (700, 700, degree)
+    order, other = (each.means[:, 0].double().argsort() for each in (scene, file.scene))
+    assert float((scene.means[order, 0] - file.scene.means[other, 0]).abs().max()) < 0.01
+
+
+@pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
+def test_content_matches_one_format(tmp_path: Path, format: SceneFormat) -> None:
+    data = encoded(tmp_path, format)
+    start = FileStart(tmp_path / "good", data[:8192], len(data))
+    assert [each for each in FORMATS if each.matches(start)] == [format]
+
+
+@pytest.mark.parametrize("format", EXTRA_FORMATS, ids=lambda format: format.name)
+def test_scene_of_any_format_becomes_a_ply_with_new_colors(tmp_path: Path, format: SceneFormat) -> None:
+    path, out = tmp_path / "scene.any", tmp_path / "out.ply"
+    write_scene(path, wall(sh_degree=2), format)
+    source = read_scene(path)
+    colors = torch.randn(616, 3, generator=torch.Generator().manual_seed(1))
+    write_stylized(source, out, colors)
+    found = read_scene(out)
+    assert found.format == "ply"
+    assert torch.equal(found.scene.sh_dc, colors)
+    for name in ("means", "quats", "scales", "opacities", "sh_rest"):
+        assert torch.equal(getattr(found.scene, name), getattr(source.scene, name)), name
+
+
+def test_sh_bands_of_zeros_are_omitted(tmp_path: Path) -> None:
+    scene = wall(sh_degree=3)
+    held(scene.sh_rest)[:, 3:] = 0
+    for format in EXTRA_FORMATS:
+        path = tmp_path / f"scene.{format.name}"
+        write_scene(path, scene, format)
+        assert read_scene(path).scene.sh_degree == 1
+
+
+@pytest.mark.parametrize("format", [COMPRESSED_PLY, SPZ], ids=lambda format: format.name)
+def test_opacities_of_0_and_1_are_finite_and_come_back(tmp_path: Path, format: SceneFormat) -> None:
+    scene = replace(wall(), opacities=torch.cat([torch.full((308,), 1e4), torch.full((308,), -1e4)]))
+    path = tmp_path / f"scene.{format.name}"
+    write_scene(path, scene, format)
+    back = read_scene(path).scene
+    assert sorted(set(back.opacities.sigmoid().tolist())) == pytest.approx([0.25 / 255, 1 - 0.25 / 255], rel=1e-4)
+    write_scene(path, back, format)
+    assert torch.equal(read_scene(path).scene.opacities.sort().values, back.opacities.sort().values)
+
+
+@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53)])
+def test_real_scene_loses_little(shared_data: Path, tmp_path: Path, format: SceneFormat, bound: float) -> None:
+    """The plush toy has 47,974 Gaussians of degree 3, trained from photos."""
+    folder = shared_data / "scenes" / "snowmiku_plush"
+    scene = read_scene(next(folder.glob("*.ply"))).scene
+    path = tmp_path / "plush"
+    write_scene(path, scene, format)
+    loss = measure_packed(path, scene, read_cameras(folder / "cameras.json"), near=0.01)
+    assert loss.psnr is not None
+    assert loss.psnr > bound
+    assert loss.size < 3e6
+
+
+@pytest.mark.parametrize("format", EXTRA_FORMATS, ids=lambda format: format.name)
+def test_compressed_scene_renders_nearly_the_same(tmp_path: Path, format: SceneFormat) -> None:
+    scene = replace(cloud(2000, degree=3), opacities=torch.full((2000,), 2.0))
+    path = tmp_path / f"scene.{format.name}"
+    write_scene(path, scene, format)
+    loss = measure_packed(path, scene, [camera(), camera(140, 90)], near=0.01)
+    assert loss.psnr is None or loss.psnr > 40
+    assert loss.as_dict() == {
+        "name": path.name,
+        "format": format.name,
+        "bytes": path.stat().st_size,
+        "views": ["test", "test"],
+        "psnr_db": loss.psnr and round(loss.psnr, 2),
+    }
+
+
+def test_loss_is_the_psnr_of_renders(tmp_path: Path) -> None:
+    """The PSNR of one view is computed by hand."""
+    scene, view = wall(sh_degree=1), cameras(1)[0]
+    path = tmp_path / "scene.spz"
+    write_scene(path, replace(scene, sh_dc=scene.sh_dc + 0.3), SPZ)
+    back = read_scene(path).scene
+    first, second = (
+        make_rasterizer("cpu", each, near=0.01)
+        .render(view_colors(each.sh_dc, rest_colors(each.sh_rest, each.means, view)), view)
+        .clamp(0, 1)
+        for each in (scene, back)
+    )
+    expected = -10 * torch.log10((first.double() - second.double()).square().mean())
+    assert measure_packed(path, scene, [view], near=0.01).psnr == pytest.approx(float(expected))
+
+
+def test_suffix_names_the_format() -> None:
+    assert format_of_name("a.ply") is format_of_name("a.PLY") is PLY
+    assert format_of_name("a.b.compressed.ply") is COMPRESSED_PLY
+    assert format_of_name("a.SPZ") is SPZ
+    assert format_of_name("a.splat") is SPLAT
+    assert format_of_name("ply") is None
+
+
+def test_page_shows_or_recognizes_every_format() -> None:
+    assert all(format.shown or format.magic for format in FORMATS)
+
+
+@pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
+def test_truncated_file_is_refused(tmp_path: Path, format: SceneFormat) -> None:
+    data = encoded(tmp_path, format)
+    for stop in [*range(1, 64), len(data) // 2, len(data) - 1]:
+        (tmp_path / "good").write_bytes(data[:stop])
+        with pytest.raises(SceneError):
+            read_scene(tmp_path / "good")
+
+
+@pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
+def test_random_damage_never_breaks_a_reader(tmp_path: Path, format: SceneFormat) -> None:
+    check_damage(tmp_path / "scene", encoded(tmp_path, format))
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + bytes(300), b"a text of words. " * 200, bytes(3200)]
+)
+def test_other_files_are_refused(tmp_path: Path, data: bytes) -> None:
+    refused(tmp_path, data, re.escape(f"expected {TITLES}"))

@@ -1,0 +1,172 @@
+"""Tests of SPZ, against gsply, values computed by hand and false headers."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import zstandard
+from gsply.spz import read_spz, write_spz
+
+from sgsst_core.errors import OutputError
+from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import basis
+from sgsst_core.scene.stored_harmonics import held
+from tests.sgsst_core.files.formats.samples import (
+    assert_close,
+    check_damage,
+    encoded,
+    gsply_of,
+    refused,
+    scene_of,
+)
+from tests.sgsst_core.splat_scenes import cloud
+from tests.small_scenes import wall
+
+#: Half a turn about x, from the axes of a PLY to those of SPZ.
+TURN = torch.tensor([1.0, -1.0, -1.0])
+
+
+def rotated(scene: Scene) -> Scene:
+    """Return the same Gaussians in SPZ's coordinate system, with SH coefficients fitted to give the same colors."""
+    turn = torch.diag(TURN.double())
+    directions = torch.nn.functional.normalize(
+        torch.randn(200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1
+    )
+    degree = scene.sh_degree
+    rest = held(scene.sh_rest)
+    if degree:
+        seen = basis(directions, degree)
+        there = basis(directions @ turn, degree)
+        matrix = torch.linalg.lstsq(there, seen).solution.float()
+        rest = torch.einsum("jk,nkc->njc", matrix, rest)
+    w, x, y, z = scene.quats.unbind(1)
+    return replace(scene, means=scene.means * TURN, quats=torch.stack([w, x, -y, -z], dim=1), sh_rest=rest)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_file_of_gsply_is_read_as_gsply_reads_it_but_for_the_axes(tmp_path: Path, degree: int, version: int) -> None:
+    path = tmp_path / "scene"
+    write_spz(path, gsply_of(cloud(700, degree=degree)), version=version)
+    assert read_scene_header(path).format is SPZ
+    found = read_scene(path)
+    assert found.scene.sh_degree == degree
+    assert_close(rotated(found.scene), scene_of(read_spz(path)))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gsply_reads_what_is_written_but_for_the_axes(tmp_path: Path, degree: int) -> None:
+    path = tmp_path / "scene"
+    write_scene(path, cloud(700, degree=degree), SPZ)
+    found = read_scene(path).scene
+    assert found.sh_degree == degree
+    assert_close(rotated(found), scene_of(read_spz(path)))
+
+
+def spz_bytes(version: int, count: int = 1, degree: int = 0, sections: bytes = b"", *, flags: int = 0) -> bytes:
+    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, 12, flags, 0) + sections)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_values_computed_by_hand(tmp_path: Path, version: int) -> None:
+    position = struct.pack("<3e", 1.5, -2, 0.25)
+    if version > 1:
+        position = b"".join(round(value * 4096).to_bytes(3, "little", signed=True) for value in (1.5, -2, 0.25))
+    # Half a turn about an axis between x and y: w = 0.6, x = 0, y = 0.8, z = 0, and the sign of y inverted.
+    rotation = bytes([128, 26, 128])
+    if version == 3:
+        packed = 1 << 30  # y is the largest; x, z and w follow
+        packed |= round(0.6 / 0.5**0.5 * 511)
+        rotation = struct.pack("<I", packed)
+    body = position + bytes([128]) + bytes([128, 0, 255]) + bytes([160, 176, 96]) + rotation
+    path = tmp_path / "scene"
+    path.write_bytes(spz_bytes(version, sections=body))
+    scene = read_scene(path).scene
+    assert scene.means.tolist() == [[1.5, 2, -0.25]]
+    assert scene.opacities.sigmoid().tolist() == pytest.approx([128 / 255])
+    assert scene.sh_dc[0].tolist() == pytest.approx([0.5 / 255 / 0.15, -0.5 / 0.15, 0.5 / 0.15], rel=1e-5)
+    assert scene.scales.tolist() == [[0, 1, -4]]
+    sign = 1 if version < 3 else -1
+    assert scene.quats[0].tolist() == pytest.approx([0.6, 0, sign * 0.8, 0], abs=0.01)
+
+
+def test_position_out_of_range_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
+    scene = wall()
+    scene.means[5, 1] = -1e7
+    with pytest.raises(OutputError, match=r"cannot hold a Gaussian 1e\+07 from the origin"):
+        write_scene(tmp_path / "scene.spz", scene, SPZ)
+    assert list(tmp_path.iterdir()) == []
+
+
+ROW = 20 + 9
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (spz_bytes(3, 616, 1, bytes(616 * ROW - 1)), "ends before all Gaussians"),
+        (spz_bytes(3, 616, 1, bytes(616 * ROW))[:-9], "ends before all Gaussians"),
+        (spz_bytes(3, 4_000_000_000, 3, bytes(1000)), "declares 4000000000 Gaussians, which take 260000000016 bytes"),
+        (spz_bytes(3, 616, 1, bytes(616 * ROW + (64 << 20))), "continues after all Gaussians"),
+        (spz_bytes(5, 616, 1, bytes(616 * ROW)), "version 5, which cannot be read.*splat-transform"),
+        (spz_bytes(3, 616, 4, bytes(100)), "SH degree 4; 0 to 3 can be read.*splat-transform"),
+        (spz_bytes(3, 0, 0), "holds no Gaussians"),
+        (gzip.compress(b"NGSP" + bytes(3)), "ends within its SPZ header"),
+        (gzip.compress(b"something else that was packed"), "a gzip file, but no SPZ"),
+        (b"\x1f\x8b" + bytes(100), "damaged gzip file"),
+        (b"NGSP" + bytes(5), "ends within its SPZ header"),
+        (b"NGSP" + struct.pack("<IIBBBBI", 4, 616, 1, 12, 0, 6, 32) + bytes(12), "6 streams, listed at byte 32"),
+        (b"NGSP" + struct.pack("<IIBBBBI", 4, 616, 1, 12, 0, 5, 32) + bytes(92), "5 streams"),
+        (
+            b"NGSP" + struct.pack("<IIBBBBI", 4, 616, 0, 12, 0, 5, 32) + bytes(12) + struct.pack("<10Q", *[9, 9] * 5),
+            "9 bytes that become 9; 5544 belong to 616 Gaussians",
+        ),
+        (
+            b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, 0, 5, 32) + bytes(12) + struct.pack("<10Q", *[2**60, 9] * 5),
+            "a stream of 1152921504606846976 bytes",
+        ),
+    ],
+)
+def test_false_header_is_refused(tmp_path: Path, data: bytes, message: str) -> None:
+    refused(tmp_path, data, message)
+
+
+def test_wrong_checksum_or_damaged_data(tmp_path: Path) -> None:
+    data = encoded(tmp_path, SPZ)
+    refused(tmp_path, data[:-5] + bytes([data[-5] ^ 1]) + data[-4:], "damaged: .*incorrect data check")
+    refused(tmp_path, data[:200] + bytes(50) + data[250:], "the compressed data")
+
+
+def test_extensions_behind_the_data_are_skipped(tmp_path: Path) -> None:
+    raw = bytearray(gzip.decompress(encoded(tmp_path, SPZ)))
+    raw[14] = 2
+    (tmp_path / "more").write_bytes(gzip.compress(bytes(raw) + bytes(1000)))
+    first, second = (read_scene(tmp_path / name).scene for name in ("good", "more"))
+    assert torch.equal(first.means, second.means)
+
+
+def test_false_streams_of_version_4_are_refused(tmp_path: Path) -> None:
+    """Streams are truncated, too long or damaged, behind a correct table."""
+    sections = [bytes(size) for size in (9, 1, 3, 3, 4)]
+    for index, wrong, message in ((0, bytes(8), "ends before"), (2, bytes(1 << 27), "continues"), (4, None, "damaged")):
+        bodies = [zstandard.compress(section) for section in sections]
+        bodies[index] = zstandard.compress(wrong) if wrong is not None else b"nonsense"
+        table = b"".join(struct.pack("<QQ", len(body), len(s)) for body, s in zip(bodies, sections, strict=True))
+        head = b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, 0, 5, 32) + bytes(12)
+        refused(tmp_path, head + table + b"".join(bodies), message)
+
+
+def test_random_damage_never_breaks_a_reader(tmp_path: Path) -> None:
+    """The damage is within the gzip stream, or in a file of version 4."""
+    check_damage(tmp_path / "scene", zlib.decompress(encoded(tmp_path, SPZ), 31), wrap=gzip.compress)
+    write_spz(tmp_path / "four", gsply_of(wall(sh_degree=1)), version=4)
+    check_damage(tmp_path / "scene", (tmp_path / "four").read_bytes())
