@@ -32,7 +32,8 @@ from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.tables import UploadRow
-from sgsst_core.files.formats import EXTRA_FORMATS
+from sgsst_core.files.formats import EXTRA_FORMATS, FORMATS
+from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.options import declared
 from tests.api.service import Service, check_documented, wait_for
@@ -327,8 +328,8 @@ def test_scenes_that_lie(client: httpx.Client, store: Store, files: Files, packe
     assert count_jobs(store) == before
 
 
-@pytest.mark.parametrize("what", ["compressed.ply", "spz", "splat"])
-def test_packed_scenes_are_told_by_their_content(
+@pytest.mark.parametrize("what", [format.name for format in FORMATS if format is not PLY])
+def test_compressed_scenes_are_detected_from_their_content(
     client: httpx.Client, store: Store, files: Files, packed: Files, what: str
 ) -> None:
     """The format is detected regardless of the file name, for files in the request and for tus uploads."""
