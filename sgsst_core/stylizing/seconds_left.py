@@ -1,8 +1,11 @@
-"""Estimate of the remaining time of a job, from its steps so far and the plan's predictions for later steps.
+"""Estimate of the remaining time of a job from its measured steps; for a phase without steps yet, from the plan.
 
 The first visit of a view in a phase takes longer than later ones, because its tile intersections, coverage and content
 features are computed then. Steps are therefore counted separately by phase, and first visits separately from others.
 After a resume, caches are empty, so every view has a first visit again.
+
+As long as a phase has no steps, or only steps with first visits, the plan's predictions replace what is unknown. They
+are scaled by the ratio of measured to predicted times, as far as that is known.
 """
 
 from __future__ import annotations
@@ -42,20 +45,44 @@ class _FirstVisits:
     prepared: float  # portion of `seconds` known to be spent on first visits
 
 
-class _Stage:
-    """Latest steps of a phase."""
+class _Phase:
+    """Predicted values and latest steps of a phase."""
 
-    def __init__(self) -> None:
-        self.known: deque[float] = deque(maxlen=_LATEST)
-        self.first: deque[_FirstVisits] = deque(maxlen=_LATEST)
+    def __init__(self, expected: ExpectedPhase) -> None:
+        self.expected = expected
+        self.visited: set[int] = set()
+        self.later = deque[float](maxlen=_LATEST)
+        self.first = deque[_FirstVisits](maxlen=_LATEST)
 
+    def add(self, views: Collection[int], seconds: float, prepared: float) -> None:
+        """Record a step."""
+        fresh = len(set(views) - self.visited)
+        self.visited.update(views)
+        if fresh:
+            self.first.append(_FirstVisits(seconds, fresh, prepared))
+        else:
+            self.later.append(seconds)
+
+    @property
     def seconds(self) -> list[float]:
-        """Return the time in seconds of each step."""
-        return [*self.known, *(step.seconds for step in self.first)]
+        """Time in seconds of each step."""
+        return [*self.later, *(step.seconds for step in self.first)]
 
-    def extra(self, known: float) -> float:
-        """Return the additional time in seconds of a first visit, given the time of a step without first visits."""
-        return max(median((step.seconds - known) / step.views for step in self.first), 0.0)
+    def later_seconds(self, ratio: float) -> float:
+        """Return the time in seconds of a step without first visits, once the phase has any step.
+
+        Args:
+            ratio: Ratio of measured to predicted times.
+        """
+        if self.later:
+            return median(self.later)
+        most = median(step.seconds - step.prepared for step in self.first)
+        return min(self.expected.seconds * ratio, most) if self.expected.seconds else most
+
+    def first_visit_seconds(self, ratio: float) -> float:
+        """Return the additional time in seconds of a first visit, once the phase has a step with one."""
+        later = self.later_seconds(ratio)
+        return max(median((step.seconds - later) / step.views for step in self.first), 0.0)
 
 
 class SecondsLeft:
@@ -73,23 +100,16 @@ class SecondsLeft:
         views: Collection[int],
         views_per_step: int = 1,
     ) -> None:
-        self._phases = phases
+        self._phases = {phase.stage: _Phase(phase) for phase in phases}
         self._views = frozenset(views)
         self._views_per_step = views_per_step
-        self._steps = {phase.stage: _Stage() for phase in phases}
-        self._visited: dict[str, set[int]] = {phase.stage: set() for phase in phases}
         #: Total seconds of steps, and of checkpoints and previews, which are assumed to stay in proportion to the
         #: steps.
         self._seconds = self._beside = 0.0
 
     def add_step(self, stage: str, views: Collection[int], seconds: float, prepared: float = 0.0) -> None:
         """Record a step. `prepared` is the portion of `seconds` known to be spent on first visits."""
-        fresh = len(set(views) - self._visited[stage])
-        self._visited[stage].update(views)
-        if fresh:
-            self._steps[stage].first.append(_FirstVisits(seconds, fresh, prepared))
-        else:
-            self._steps[stage].known.append(seconds)
+        self._phases[stage].add(views, seconds, prepared)
         self._seconds += seconds
 
     def resume(self) -> None:
@@ -97,7 +117,8 @@ class SecondsLeft:
 
         Their times are still used, but every view has a first visit again.
         """
-        self._visited = {phase.stage: set() for phase in self._phases}
+        for phase in self._phases.values():
+            phase.visited = set()
         self._seconds = self._beside = 0.0
 
     def add_beside(self, seconds: float) -> None:
@@ -114,47 +135,40 @@ class SecondsLeft:
             limit: Upper bound on the remaining step time in seconds; None for no bound.
         """
         seconds, start = 0.0, 0
-        for phase in self._phases:
-            steps = phase.steps - min(max(step - start, 0), phase.steps)
+        for phase in self._phases.values():
+            total = phase.expected.steps
+            steps = total - min(max(step - start, 0), total)
             if steps:
-                known, first = self._prices(phase)
+                later, first = self._prices(phase)
                 coming = queue if step >= start else ()
-                seconds += steps * known + self._first_visits(phase.stage, coming, steps) * first
-            start += phase.steps
+                seconds += steps * later + self._first_visits(phase, coming, steps) * first
+            start += total
         if limit is not None:
             seconds = min(seconds, max(limit, 0.0))
         beside = self._beside / self._seconds if self._seconds else 0.0
         return seconds * (1 + beside) + measuring
 
-    def _first_visits(self, stage: str, queue: Sequence[int], steps: int) -> float:
+    def _first_visits(self, phase: _Phase, queue: Sequence[int], steps: int) -> float:
         """Return the number of first visits in the next steps of a phase.
 
         Visits after those in the queue count with their probability, because their order is random.
         """
         visits = steps * self._views_per_step
-        unknown = self._views - self._visited[stage]
+        unknown = self._views - phase.visited
         soon = set(queue[:visits])
         later = min((visits - min(visits, len(queue))) / max(len(self._views), 1), 1.0)
         return len(unknown & soon) + len(unknown - soon) * later
 
-    def _prices(self, phase: ExpectedPhase) -> tuple[float, float]:
+    def _prices(self, phase: _Phase) -> tuple[float, float]:
         """Return the time in seconds of a step of a phase, and the additional time of each first visit."""
-        steps = self._steps[phase.stage]
-        if not steps.seconds():
-            ratio = self._ratio()
-            return phase.seconds * ratio or self._any_step(), phase.first_visit * self._first_ratio(ratio)
-        known = self._known(phase)
-        if steps.first:
-            return known, steps.extra(known)
-        return known, phase.first_visit * self._first_ratio(self._ratio())
-
-    def _known(self, phase: ExpectedPhase) -> float:
-        """Return the time in seconds of a step without first visits, for a phase that has already started."""
-        steps = self._steps[phase.stage]
-        if steps.known:
-            return median(steps.known)
-        most = median(step.seconds - step.prepared for step in steps.first)
-        return min(phase.seconds * self._ratio(), most) if phase.seconds else most
+        ratio, expected = self._ratio(), phase.expected
+        if phase.first:
+            return phase.later_seconds(ratio), phase.first_visit_seconds(ratio)
+        if phase.later:
+            return phase.later_seconds(ratio), expected.first_visit * self._first_visit_ratio(ratio)
+        every = [seconds for other in self._phases.values() for seconds in other.seconds]
+        later = expected.seconds * ratio or (median(every) if every else 0.0)
+        return later, expected.first_visit * self._first_visit_ratio(ratio)
 
     def _ratio(self) -> float:
         """Return the ratio of measured to predicted step times, from the latest phase with a step without first visits.
@@ -162,21 +176,14 @@ class SecondsLeft:
         If there is no such step yet, the ratio is 1. Predictions are based on measurements on this machine, whereas the
         additional time of first visits is only a guess.
         """
-        for phase in reversed(self._phases):
-            known = self._steps[phase.stage].known
-            if known and phase.seconds:
-                return median(known) / phase.seconds
+        for phase in reversed(self._phases.values()):
+            if phase.later and phase.expected.seconds:
+                return median(phase.later) / phase.expected.seconds
         return 1.0
 
-    def _first_ratio(self, otherwise: float) -> float:
-        """Return the ratio of measured to predicted first-visit times; `otherwise` if it is unknown."""
-        for phase in reversed(self._phases):
-            steps = self._steps[phase.stage]
-            if steps.first and phase.first_visit:
-                return steps.extra(self._known(phase)) / phase.first_visit
-        return otherwise
-
-    def _any_step(self) -> float:
-        """Return the median seconds of all steps so far, for phases without predictions."""
-        seconds = [seconds for steps in self._steps.values() for seconds in steps.seconds()]
-        return median(seconds) if seconds else 0.0
+    def _first_visit_ratio(self, ratio: float) -> float:
+        """Return the ratio of measured to predicted first-visit times; if unknown, that of step times (`ratio`)."""
+        for phase in reversed(self._phases.values()):
+            if phase.first and phase.expected.first_visit:
+                return phase.first_visit_seconds(ratio) / phase.expected.first_visit
+        return ratio
