@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--style", type=Path, required=True)
     parser.add_argument("--views", type=int, default=6)
     parser.add_argument("--measure", type=float, default=0.1)
-    parser.add_argument("--memory-limit", help="as of `sgsst stylize`")
+    parser.add_argument("--memory-limit", type=int, help="bytes")
     parser.add_argument("--name", default="plan_accuracy", help="of the file in benchmarks/results")
     parser.add_argument("--run", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -55,7 +55,7 @@ def _options(case: str, arguments: argparse.Namespace) -> tuple[str, list[str]]:
     options = ["--cameras", str(arguments.cameras), "--style", str(arguments.style), "--views", str(arguments.views)]
     options += ["--resolution", resolution, "--steps-coarse", str(coarse), "--steps-sos", str(sos), "--no-early-stop"]
     options += ["--measure", str(arguments.measure)]
-    options += ["--memory-limit", arguments.memory_limit] if arguments.memory_limit else []
+    options += ["--memory-limit", str(arguments.memory_limit)] if arguments.memory_limit else []
     return scene, options
 
 

@@ -108,12 +108,12 @@ def orbit(
     return cameras
 
 
-def share_out(count: int, elevations: Sequence[float]) -> list[int]:
+def cameras_per_ring(count: int, elevations: Sequence[float]) -> list[int]:
     """Distribute `count` cameras over the rings by circumference, at least one per ring if there are enough cameras."""
-    around = [math.cos(math.radians(elevation)) for elevation in elevations]
-    shares = [count * length / sum(around) for length in around]
-    counts = [max(1, math.floor(share)) for share in shares]
-    order = sorted(range(len(shares)), key=lambda ring: math.floor(shares[ring]) - shares[ring])
+    lengths = [math.cos(math.radians(elevation)) for elevation in elevations]
+    quotas = [count * length / sum(lengths) for length in lengths]
+    counts = [max(1, math.floor(quota)) for quota in quotas]
+    order = sorted(range(len(quotas)), key=lambda ring: math.floor(quotas[ring]) - quotas[ring])
     for ring in order:
         counts[ring] += sum(counts) < count
     while sum(counts) > count:  # more rings than cameras
@@ -127,14 +127,14 @@ def ring_directions(subject: Subject, count: int, up: Tensor, elevations: Sequen
     Every second ring is rotated by half the angle between its cameras.
     """
     start, side, _ = _level_frame(subject, up).T
-    found = []
-    for ring, (number, elevation) in enumerate(zip(share_out(count, elevations), elevations, strict=True)):
+    directions = []
+    for ring, (number, elevation) in enumerate(zip(cameras_per_ring(count, elevations), elevations, strict=True)):
         tilt = math.radians(elevation)
-        for place in range(number):
-            turn = 2 * math.pi * (place + 0.5 * (ring % 2)) / number
-            level = math.cos(turn) * start + math.sin(turn) * side
-            found.append(math.cos(tilt) * level + math.sin(tilt) * up)
-    return found
+        for index in range(number):
+            azimuth = 2 * math.pi * (index + 0.5 * (ring % 2)) / number
+            level = math.cos(azimuth) * start + math.sin(azimuth) * side
+            directions.append(math.cos(tilt) * level + math.sin(tilt) * up)
+    return directions
 
 
 def middle_of(subject: Subject, up: Tensor) -> Tensor:
@@ -200,8 +200,8 @@ def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: f
     origin = torch.zeros(3, dtype=torch.float64)
     distance = 0.0
     for direction in directions:
-        turned = look_at("", direction, origin, up, width=1, height=1, focal=1.0).world_to_camera[:3, :3]
-        x, y, z = (offsets @ turned.T).unbind(1)
+        rotation = look_at("", direction, origin, up, width=1, height=1, focal=1.0).world_to_camera[:3, :3]
+        x, y, z = (offsets @ rotation.T).unbind(1)
         # in view: |x| focal <= (distance + z) / 2, and the same for y; in front: distance + z >= near
         needed = (2 * _FOCAL * _MARGIN * torch.maximum(x.abs(), y.abs())).clamp_min(_NEAR_MARGIN * near)
         distance = max(distance, float((needed - z).max()))
@@ -215,10 +215,10 @@ def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: f
     for _ in range(5):
         pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
         local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
-        seen = local[local[:, 2] > near]
-        if not len(seen):
+        visible = local[local[:, 2] > near]
+        if not len(visible):
             break
-        slopes = (seen[:, :2] / seen[:, 2:]).clamp(-_WIDEST, _WIDEST)
+        slopes = (visible[:, :2] / visible[:, 2:]).clamp(-_WIDEST, _WIDEST)
         low, high = slopes.amin(0), slopes.amax(0)
         half = (float(slopes[:, 0].abs().amax()), float(slopes[:, 1].abs().amax()))
         aim = torch.cat([(low + high) / 2, torch.ones(1, dtype=torch.float64)])

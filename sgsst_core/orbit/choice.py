@@ -112,7 +112,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
         count = sum(max(_LEAST_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
     cameras = trial.cameras(count, elevations)
     radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())
-    hidden = [share < _SHOWS for ring in chosen for share in views[ring].subject]
+    hidden = [fraction < _SHOWS for ring in chosen for fraction in views[ring].subject]
     return Orbit(
         cameras,
         up,
@@ -123,54 +123,54 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
         left,
         subject.left_out,
         sum(hidden) / len(hidden),
-        trial.share_inside([view.areas for view in views]),
+        trial.hidden_fraction([view.areas for view in views]),
     )
 
 
-def orbit_decisions(made: Orbit, cameras: Sequence[Camera], uncovered: Sequence[float] | None) -> list[Decision]:
+def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence[float] | None) -> list[Decision]:
     """Return the plan's lines about an orbit.
 
     Args:
-        made: The orbit.
+        orbit: Chosen orbit.
         cameras: Its cameras at the sizes used for stylization.
         uncovered: Fraction of uncovered pixels of each view; None if unknown.
     """
-    decisions = [Decision("up", made.up.name, made.up.reason)]
-    angles = _listed([f"{angle:g}" for angle in made.elevations])
-    rings = f"{len(made.elevations)} rings" if len(made.elevations) > 1 else "a ring"
+    decisions = [Decision("up", orbit.up.name, orbit.up.reason)]
+    angles = _listed([f"{angle:g}" for angle in orbit.elevations])
+    rings = f"{len(orbit.elevations)} rings" if len(orbit.elevations) > 1 else "a ring"
     reason = "requested"
-    if len(made.tried) > 1:
-        others = f"rings at {min(made.tried):g} to {max(made.tried):g} degrees"
-        reason = f"they show {made.shown:.0%} of the surface that {others} show"
-        reason += f"; another ring would add {made.next:.1%}" if made.next is not None else ""
+    if len(orbit.tried) > 1:
+        others = f"rings at {min(orbit.tried):g} to {max(orbit.tried):g} degrees"
+        reason = f"they show {orbit.shown:.0%} of the surface that {others} show"
+        reason += f"; another ring would add {orbit.next:.1%}" if orbit.next is not None else ""
     views = f"{len(cameras)} view{'s' if len(cameras) > 1 else ''}"
     decisions.append(
-        Decision("cameras", f"{views} in {rings} at {angles} degrees, {made.radius:.3g} from the center", reason)
+        Decision("cameras", f"{views} in {rings} at {angles} degrees, {orbit.radius:.3g} from the center", reason)
     )
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     shapes = f"{sizes[0][0]}x{sizes[0][1]}"
     shapes += f" to {sizes[-1][0]}x{sizes[-1][1]}, {len(sizes)} shapes" if len(sizes) > 1 else ""
     if uncovered is not None:
-        covered = [1 - share for share in uncovered]
+        covered = [1 - fraction for fraction in uncovered]
         shown = f"the scene covers {sum(covered) / len(covered):.0%} of their pixels (at least {min(covered):.0%})"
         decisions.append(Decision("frames", shapes, f"fitted to the subject's shape; {shown}"))
-    return decisions + _doubts(made)
+    return decisions + _doubts(orbit)
 
 
-def _doubts(made: Orbit) -> list[Decision]:
+def _doubts(orbit: Orbit) -> list[Decision]:
     """Return warnings if an orbit may be unsuitable for this scene."""
-    found = []
+    warnings = []
     better = "the cameras of its capture (--cameras) would show it better"
-    if made.outside > _OUTSIDE:
-        decision = f"warning: {made.outside:.0%} of the scene lies outside the frames"
-        found.append(Decision("subject", decision, f"it is not a single object; {better}"))
-    if made.hidden:
-        decision = f"warning: in {made.hidden:.0%} of the views, other objects hide the subject"
-        found.append(Decision("subject", decision, f"the cameras stand outside of its surroundings; {better}"))
-    if made.inside > _INSIDE:
-        decision = f"warning: {made.inside:.0%} of the scene lies inside, hidden from all views around it"
-        found.append(Decision("subject", decision, f"it may be a room; {better}"))
-    return found
+    if orbit.outside > _OUTSIDE:
+        decision = f"warning: {orbit.outside:.0%} of the scene lies outside the frames"
+        warnings.append(Decision("subject", decision, f"it is not a single object; {better}"))
+    if orbit.hidden:
+        decision = f"warning: in {orbit.hidden:.0%} of the views, other objects hide the subject"
+        warnings.append(Decision("subject", decision, f"the cameras stand outside of its surroundings; {better}"))
+    if orbit.inside > _INSIDE:
+        decision = f"warning: {orbit.inside:.0%} of the scene lies inside, hidden from all views around it"
+        warnings.append(Decision("subject", decision, f"it may be a room; {better}"))
+    return warnings
 
 
 def _asked_up(direction: tuple[float, float, float]) -> Up:
@@ -210,12 +210,12 @@ class _Trial:
         axis, request = self._up.direction.tolist(), self._request
         return orbit(self._subject, count, up=axis, elevations=elevations, radius=request.radius, near=request.near)
 
-    def share_inside(self, areas: Sequence[Tensor]) -> float:
+    def hidden_fraction(self, areas: Sequence[Tensor]) -> float:
         """Return the fraction of the surface that is hidden from all rings, given the areas [n] that each shows."""
         lengths = self._scene.scales.double().clamp(-60, 60).exp().sort(dim=1).values
-        own = 2 * math.pi * torch.sigmoid(self._scene.opacities.double()) * lengths[:, 1] * lengths[:, 2]
+        surface = 2 * math.pi * torch.sigmoid(self._scene.opacities.double()) * lengths[:, 1] * lengths[:, 2]
         shown = torch.stack(list(areas)).amax(0)
-        return float(own[shown < _HARDLY * own].sum() / own.sum().clamp_min(1e-300))
+        return float(surface[shown < _HARDLY * surface].sum() / surface.sum().clamp_min(1e-300))
 
     def of_ring(self, elevation: float) -> _Ring:
         """Render the trial views of a ring."""
@@ -251,16 +251,16 @@ def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float, float
     """
     best_of_all = torch.stack(list(areas)).amax(0)
     areas = [(area / _ENOUGH).minimum(best_of_all) for area in areas]
-    whole = float(best_of_all.sum()) or 1.0
-    chosen, seen = [0], areas[0]
+    total = float(best_of_all.sum()) or 1.0
+    chosen, covered = [0], areas[0]
     while True:
         gains = {
-            ring: float((torch.maximum(seen, areas[ring]) - seen).sum()) / whole
+            ring: float((torch.maximum(covered, areas[ring]) - covered).sum()) / total
             for ring in range(len(areas))
             if ring not in chosen
         }
         best = max(gains, key=lambda ring: gains[ring], default=None)
         if best is None or gains[best] < _LITTLE or len(chosen) >= most:
-            return sorted(chosen), float(seen.sum()) / whole, gains[best] if best is not None else None
+            return sorted(chosen), float(covered.sum()) / total, gains[best] if best is not None else None
         chosen.append(best)
-        seen = torch.maximum(seen, areas[best])
+        covered = torch.maximum(covered, areas[best])

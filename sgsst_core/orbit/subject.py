@@ -76,30 +76,30 @@ def find_subject(scene: Scene) -> Subject:
     # makes the result defined for a scene whose Gaussians are all invisible
     weights = weights / weights.amax().clamp_min(1e-300) + 1e-12
     weights = weights / weights.sum()
-    kept = _without_strays(points, weights)
-    longest = quantile(ordered[:, 2][kept], weights[kept], _LARGEST)
-    turned = rotations(scene.quats[rows][kept].double()) * lengths[kept].clamp_max(longest)[:, None]
-    reach = (2 * (opacities[kept] / _VISIBLE).clamp_min(1).log()).sqrt()
-    hull = _hull(points[kept], turned, reach)
-    left_out = float(weights[~kept].sum())
-    points, weights = points[kept], weights[kept]
+    inside = _without_strays(points, weights)
+    longest = quantile(ordered[:, 2][inside], weights[inside], _LARGEST)
+    half_axes = rotations(scene.quats[rows][inside].double()) * lengths[inside].clamp_max(longest)[:, None]
+    reach = (2 * (opacities[inside] / _VISIBLE).clamp_min(1).log()).sqrt()
+    hull = _hull(points[inside], half_axes, reach)
+    left_out = float(weights[~inside].sum())
+    points, weights = points[inside], weights[inside]
     some = sampled_rows(len(points), _POINTS)
     return Subject(points[some], weights[some] / weights[some].sum(), hull, left_out)
 
 
-def quantile(values: Tensor, weights: Tensor, share: float) -> float:
-    """Return the smallest of `values` [P] at which the cumulative `weights` [P] reach the fraction `share`."""
+def quantile(values: Tensor, weights: Tensor, fraction: float) -> float:
+    """Return the smallest of `values` [P] at which the cumulative `weights` [P] reach `fraction` of their sum."""
     ordered, order = values.sort()
     running = weights[order].cumsum(0)
-    index = torch.searchsorted(running, share * running[-1])
+    index = torch.searchsorted(running, fraction * running[-1])
     return float(ordered[index.clamp(max=len(values) - 1)])
 
 
 def spread_directions(count: int) -> Tensor:
     """Return [count, 3] float64 unit vectors, evenly spread over the sphere (Fibonacci spiral, Gonzalez 2010)."""
-    place = torch.arange(count, dtype=torch.float64) + 0.5
-    height = 1 - 2 * place / count
-    angle = place * math.pi * (1 + math.sqrt(5))
+    order = torch.arange(count, dtype=torch.float64) + 0.5
+    height = 1 - 2 * order / count
+    angle = order * math.pi * (1 + math.sqrt(5))
     across = (1 - height**2).sqrt()
     return torch.stack([across * angle.cos(), across * angle.sin(), height], dim=1)
 
@@ -110,13 +110,13 @@ def _without_strays(points: Tensor, weights: Tensor) -> Tensor:
     distances = (points - middle).norm(dim=1)
     median = quantile(distances, weights, 0.5)
     reach = _REACH * median if median > 0 else quantile(distances, weights, 0.99)
-    kept: Tensor = distances <= reach
+    inside: Tensor = distances <= reach
     while True:  # each removal makes the grid finer, which may separate more pieces
-        rows = kept.nonzero()[:, 0]
-        whole = _pieces(points[rows], weights[rows])
-        if bool(whole.all()) or float(weights[rows[whole]].sum()) < _LEAST_LEFT * float(weights[rows].sum()):
-            return kept
-        kept[rows[~whole]] = False
+        rows = inside.nonzero()[:, 0]
+        connected = _pieces(points[rows], weights[rows])
+        if bool(connected.all()) or float(weights[rows[connected]].sum()) < _LEAST_LEFT * float(weights[rows].sum()):
+            return inside
+        inside[rows[~connected]] = False
 
 
 def _pieces(points: Tensor, weights: Tensor) -> Tensor:
@@ -126,8 +126,8 @@ def _pieces(points: Tensor, weights: Tensor) -> Tensor:
     cells = min(_CELLS, max(4, round(len(points) ** (1 / 3))))  # keeps random points connected
     if not side > 0:
         return torch.ones(len(points), dtype=torch.bool)
-    place = ((points - low) / side * cells).long().clamp_max(cells - 1)
-    flat = ((place[:, 0] * cells + place[:, 1]) * cells + place[:, 2]).numpy()
+    cell = ((points - low) / side * cells).long().clamp_max(cells - 1)
+    flat = ((cell[:, 0] * cells + cell[:, 1]) * cells + cell[:, 2]).numpy()
     held = np.bincount(flat, weights.numpy(), cells**3)
     touching = np.ones((3, 3, 3), dtype=bool)
     labels, _ = ndimage.label((held > _LEAST_CELL * held.sum()).reshape(cells, cells, cells), touching)
@@ -138,26 +138,26 @@ def _pieces(points: Tensor, weights: Tensor) -> Tensor:
     return torch.from_numpy(near.ravel()[flat])
 
 
-def _hull(points: Tensor, turned: Tensor, reach: Tensor) -> Tensor:
+def _hull(points: Tensor, half_axes: Tensor, reach: Tensor) -> Tensor:
     """Return the outermost points of ellipsoids in many directions, [D, 3].
 
     Args:
         points: [P, 3], centers.
-        turned: [P, 3, 3], half axes of one standard deviation as columns.
+        half_axes: [P, 3, 3], half axes of one standard deviation as columns.
         reach: [P], standard deviations from the center to the surface.
     """
-    largest = reach * turned.norm(dim=1).amax(1)
-    found = []
+    largest = reach * half_axes.norm(dim=1).amax(1)
+    hull = []
     # in batches, because each direction needs a value per Gaussian
     for directions in spread_directions(_DIRECTIONS).split(16):
         along = points @ directions.T
         # skip Gaussians that end before the center of another one in all of these directions
         rows = (along + largest[:, None] >= along.amax(0)).any(1).nonzero()[:, 0]
-        ends = torch.einsum("pij,di->pdj", turned[rows], directions)
+        ends = torch.einsum("pij,di->pdj", half_axes[rows], directions)
         widths = ends.norm(dim=2)
         best = (along[rows] + reach[rows, None] * widths).argmax(0)
         column = torch.arange(len(directions))
         outwards = ends[best, column] / widths[best, column].clamp_min(1e-300)[:, None]
         best = rows[best]
-        found.append(points[best] + reach[best, None] * torch.einsum("dij,dj->di", turned[best], outwards))
-    return torch.cat(found)
+        hull.append(points[best] + reach[best, None] * torch.einsum("dij,dj->di", half_axes[best], outwards))
+    return torch.cat(hull)

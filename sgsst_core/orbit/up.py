@@ -55,10 +55,10 @@ class Up:
     @property
     def name(self) -> str:
         """Axis such as "-y", or the three components of another direction."""
-        place = int(self.direction.abs().argmax())
-        sign = "-" if self.direction[place] < 0 else ""
-        if float(self.direction[place].abs()) > 1 - 1e-9:
-            return sign + "xyz"[place]
+        axis = int(self.direction.abs().argmax())
+        sign = "-" if self.direction[axis] < 0 else ""
+        if float(self.direction[axis].abs()) > 1 - 1e-9:
+            return sign + "xyz"[axis]
         return "(" + ", ".join(f"{value:.2f}" for value in self.direction.tolist()) + ")"
 
 
@@ -102,11 +102,11 @@ def _habit(direction: Tensor) -> float:
 def _snapped(direction: Tensor) -> Tensor:
     """Return the nearest world axis if it is close, else the direction itself."""
     direction = direction / direction.norm()
-    place = int(direction.abs().argmax())
-    if float(direction[place].abs()) < _SNAP:
+    largest = int(direction.abs().argmax())
+    if float(direction[largest].abs()) < _SNAP:
         return direction
     axis = torch.zeros(3, dtype=torch.float64)
-    axis[place] = direction[place].sign()
+    axis[largest] = direction[largest].sign()
     return axis
 
 
@@ -131,7 +131,7 @@ def _axes_of(points: Tensor, weights: Tensor) -> Tensor:
 
 def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Tensor | None:
     """Return up [3] from a flat layer at an end of an axis; None if there is none, or if layers disagree."""
-    found: list[tuple[float, Tensor]] = []
+    layers: list[tuple[float, Tensor]] = []
     for axis in candidates:
         for up in (axis, -axis):
             level = _levelled(subject, up)
@@ -139,11 +139,11 @@ def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Tensor | None:
                 continue
             under, over = _layer(subject, level)[1], _layer(subject, -level)[1]
             if under >= _GROUND and over <= _OTHER_END * under:
-                found.append((under, level))
-    if not found:
+                layers.append((under, level))
+    if not layers:
         return None
-    best = max(found, key=lambda pair: pair[0])[1]
-    return best if all(float(best @ up) > 0.9 for _, up in found) else None
+    best = max(layers, key=lambda pair: pair[0])[1]
+    return best if all(float(best @ up) > 0.9 for _, up in layers) else None
 
 
 def _levelled(subject: Subject, up: Tensor) -> Tensor | None:
@@ -172,10 +172,10 @@ def _layer(subject: Subject, up: Tensor) -> tuple[Tensor, float]:
     held = running[torch.searchsorted(ordered, starts + thickness)] - running[torch.searchsorted(ordered, starts)]
     start = float(starts[held.argmax()])
     rows = (heights >= start) & (heights <= start + thickness)
-    return rows, _share_under(subject.points, up, rows)
+    return rows, _covered_fraction(subject.points, up, rows)
 
 
-def _share_under(points: Tensor, up: Tensor, rows: Tensor) -> float:
+def _covered_fraction(points: Tensor, up: Tensor, rows: Tensor) -> float:
     """Return the fraction of the area of points [P, 3], seen from above, that the points `rows` ([P] bool) cover.
 
     Areas are counted in grid cells.
@@ -185,8 +185,8 @@ def _share_under(points: Tensor, up: Tensor, rows: Tensor) -> float:
     side = float((flat.amax(0) - low).amax())
     if not side > 0:
         return 0.0
-    place = ((flat - low) / side * _CELLS).long().clamp_max(_CELLS - 1)
-    cells = place[:, 0] * _CELLS + place[:, 1]
+    cell = ((flat - low) / side * _CELLS).long().clamp_max(_CELLS - 1)
+    cells = cell[:, 0] * _CELLS + cell[:, 1]
     return len(cells[rows].unique()) / len(cells.unique())
 
 
@@ -195,7 +195,7 @@ def _foot(subject: Subject, up: Tensor) -> float:
     heights = subject.points @ up
     flat = subject.points @ _across(up)
     # quantiles, so that a few strays do not count as a foot
-    low, high = (quantile(heights, subject.weights, share) for share in (0.001, 0.999))
+    low, high = (quantile(heights, subject.weights, fraction) for fraction in (0.001, 0.999))
     return _area(flat[heights <= low + _FOOT * (high - low)]) / max(_area(flat), 1e-300)
 
 

@@ -90,8 +90,8 @@ def equip(
         problems=problems,
     )
     name = rasterizer or uncached_rasterizer(device, problems)
-    whole = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
-    return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, ratio, whole, sh_degree)
+    of_scene = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
+    return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, ratio, of_scene, sh_degree)
 
 
 def common_device(collectives: Collectives) -> Device:

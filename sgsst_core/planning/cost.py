@@ -121,8 +121,8 @@ def pieces_of(size: Size, tiling: Tiling, region: Rectangle | None, *, coarsest:
 
 def _piece(size: Size, scale: int, region: Rectangle | None) -> Piece:
     scaled = (size[0] >> scale, size[1] >> scale)
-    part = Rectangle(0, 0, *scaled) if region is None else scaled_region(region, scale, scaled)
-    return Piece(scale, scaled, part)
+    rectangle = Rectangle(0, 0, *scaled) if region is None else scaled_region(region, scale, scaled)
+    return Piece(scale, scaled, rectangle)
 
 
 @dataclass(frozen=True)
@@ -226,9 +226,10 @@ def _matching_bytes(sizes: Sequence[Size], tiling: Tiling, channels: int, device
     """
     if not channels:
         return 0
-    scaled = {size: [(size[0] >> s, size[1] >> s) for s in tiling.scales(size)] for size in set(sizes)}
-    vectors = sum(_vectors(part) for parts in scaled.values() for part in parts)
-    positions = max(sum(h * w for h, w in parts) for parts in scaled.values()) // layer_stride(_MATCHED) ** 2
+    by_size = {size: [(size[0] >> scale, size[1] >> scale) for scale in tiling.scales(size)] for size in set(sizes)}
+    vectors = sum(_vectors(scaled) for scales in by_size.values() for scaled in scales)
+    largest = max(sum(height * width for height, width in scales) for scales in by_size.values())
+    positions = largest // layer_stride(_MATCHED) ** 2
     return vectors * channels * 4 + positions * MATCH_BYTES + working_bytes(channels, 4, device)
 
 
@@ -268,10 +269,10 @@ class ViewData:
 
     def cached_bytes(self, ranks: int = 1) -> float:
         """Return the final size in bytes of the data that each rank caches if `ranks` ranks divide every view."""
-        own = self.bytes / ranks
-        if own <= self.budget:
-            return own
-        return self.budget if self.views is None else self.budget // (own / self.views) * (own / self.views)
+        total = self.bytes / ranks
+        if total <= self.budget:
+            return total
+        return self.budget if self.views is None else self.budget // (total / self.views) * (total / self.views)
 
 
 @dataclass(frozen=True)

@@ -84,31 +84,31 @@ class Prices:
         return level.views * (self.setup + self.view) + moments * self.again(level)
 
 
-def allowed_seconds(share: float, steps: float) -> float:
-    """Return the seconds that all measurements may take: the fraction `share` of the steps' time, or a minimum."""
-    return max(LEAST_ALLOWED, share * steps)
+def allowed_seconds(fraction: float, steps: float) -> float:
+    """Return the seconds that all measurements may take: `fraction` of the steps' time, or a minimum."""
+    return max(LEAST_ALLOWED, fraction * steps)
 
 
-def novel_view_seconds(share: float, expected: Prediction) -> float:
+def novel_view_seconds(fraction: float, expected: Prediction) -> float:
     """Return the time in seconds that novel views may take.
 
-    This is the time allowed minus the time for the loss before and after; 0 if `share` is 0.
+    This is the time allowed minus the time for the loss before and after; 0 if `fraction` is 0.
     """
-    if not share:
+    if not fraction:
         return 0.0
-    return max(_PLANNED * allowed_seconds(share, expected.job - expected.measuring) - expected.losses, 0.0)
+    return max(_PLANNED * allowed_seconds(fraction, expected.job - expected.measuring) - expected.losses, 0.0)
 
 
-def choose_loss_views(share: float, steps: float, price: float, views: int) -> int:
+def choose_loss_views(fraction: float, steps: float, price: float, views: int) -> int:
     """Choose the number of views on which the loss is evaluated before and after.
 
     Args:
-        share: Fraction of the steps' time allowed for measurements.
+        fraction: Fraction of the steps' time allowed for measurements.
         steps: Time in seconds of all steps.
         price: Time in seconds to evaluate the loss of one view before and after.
         views: Number of views of the job.
     """
-    half = _PLANNED * allowed_seconds(share, steps) / 2
+    half = _PLANNED * allowed_seconds(fraction, steps) / 2
     return min(next((count for count in LOSS_VIEWS if min(count, views) * price <= half), LOSS_VIEWS[-1]), views)
 
 
@@ -121,7 +121,7 @@ def choose_level(prices: Prices, allowed: float, total: int, first: int = 0) -> 
         total: Number of steps of the run.
         first: Index of the first level to consider.
     """
-    for place in range(first, NOTHING):
-        if prices.of(LEVELS[place], len(LEVELS[place].moments(total))) <= allowed:
-            return place
+    for level in range(first, NOTHING):
+        if prices.of(LEVELS[level], len(LEVELS[level].moments(total))) <= allowed:
+            return level
     return NOTHING

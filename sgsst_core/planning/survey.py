@@ -47,16 +47,16 @@ class PlanningProgress:
 ShowPlanning = Callable[[PlanningProgress], None]
 
 
-def progress_of(own: int, total: int, ranks: int, seconds: float) -> PlanningProgress:
+def progress_of(surveyed: int, total: int, ranks: int, seconds: float) -> PlanningProgress:
     """Return the progress of all ranks, assuming that they are as fast as this one.
 
     Args:
-        own: Number of views that this rank has surveyed.
+        surveyed: Number of views that this rank has surveyed.
         total: Number of views that all ranks survey.
         ranks: Number of ranks.
         seconds: Seconds since the survey started.
     """
-    done = min(total, own * ranks)
+    done = min(total, surveyed * ranks)
     return PlanningProgress(done, total, seconds * (total - done) / done if done else None)
 
 
@@ -126,16 +126,16 @@ def survey_views(
     """
     weights = torch.zeros(len(scene), dtype=torch.float64)
     views: dict[int, _ViewSurvey] = {}
-    own = range(collectives.rank, len(cameras), collectives.size)
+    indices = range(collectives.rank, len(cameras), collectives.size)
     started = time.perf_counter()
-    for done, index in enumerate(own):
+    for done, index in enumerate(indices):
         if show:
             show(progress_of(done, len(cameras), collectives.size, time.perf_counter() - started))
         views[index] = _survey_view(cameras[index], rasterizer, weights)
     if show:
-        show(progress_of(len(own), len(cameras), collectives.size, time.perf_counter() - started))
-    for part in collectives.all_gather(views):
-        views |= part
+        show(progress_of(len(indices), len(cameras), collectives.size, time.perf_counter() - started))
+    for others in collectives.all_gather(views):
+        views |= others
     covered = [index for index in range(len(cameras)) if views[index].covered]
     if not covered:
         raise nothing_seen(len(cameras))
@@ -155,7 +155,7 @@ def _survey_view(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Vi
     uncovered = float((1 - coverage).sum(dtype=torch.float64))
     shown = 0
     if seen:
-        own = summed.cpu()
-        weights += own.double()
-        shown = int((own > 0).sum())
+        of_view = summed.cpu()
+        weights += of_view.double()
+        shown = int((of_view > 0).sum())
     return _ViewSurvey(covered_region(coverage), uncovered, coverage.numel(), seen, shown)

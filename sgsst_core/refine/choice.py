@@ -51,20 +51,20 @@ class Footprints:
 
     def add(self, camera: Camera, weights: Tensor) -> None:
         """Add a view, given weights [N] of `Rasterizer.survey` on the CPU."""
-        for part in (weights > 0).nonzero()[:, 0].split(_CHUNK):
-            lengths, reach = axes_in_view(self._scene, part, camera)
-            own = weights[part].double()
-            self.weights[part] += own
-            self._squares[part] += own[:, None] * lengths.square()
-            self.reach[part] = torch.maximum(self.reach[part], reach)
+        for rows in (weights > 0).nonzero()[:, 0].split(_CHUNK):
+            lengths, reach = axes_in_view(self._scene, rows, camera)
+            added = weights[rows].double()
+            self.weights[rows] += added
+            self._squares[rows] += added[:, None] * lengths.square()
+            self.reach[rows] = torch.maximum(self.reach[rows], reach)
 
     @property
-    def parts(self) -> tuple[Tensor, Tensor]:
+    def sums(self) -> tuple[Tensor, Tensor]:
         """Accumulated values to be reduced over ranks: [N, 4] by sum, and [N] by maximum."""
         return torch.cat([self.weights[:, None], self._squares], dim=1), self.reach
 
-    def take(self, sums: Tensor, reach: Tensor) -> None:
-        """Replace the accumulated values by the reduced ones of all ranks, in the format of `parts`."""
+    def replace(self, sums: Tensor, reach: Tensor) -> None:
+        """Replace the accumulated values by the reduced ones of all ranks, in the format of `sums`."""
         self.weights, self._squares, self.reach = sums[:, 0].contiguous(), sums[:, 1:].contiguous(), reach
 
     @property
@@ -91,16 +91,16 @@ def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Te
     return lengths.nan_to_num(torch.inf), reach.nan_to_num(torch.inf)
 
 
-def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, there_is: Tensor) -> Tensor:
+def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, magnitude: Tensor) -> Tensor:
     """Return the mask [N] bool of Gaussians that may be split.
 
     Args:
         footprints: Sizes in the views.
         splittable: [N] bool, see `can_be_split`.
         cancels: [N], portion of the gradient that cancels, summed over all views; see `disagreement`.
-        there_is: [N], total of the gradient's magnitude, summed over all views; see `disagreement`.
+        magnitude: [N], total of the gradient's magnitude, summed over all views; see `disagreement`.
     """
-    asked = cancels > _LEAST_DISAGREEMENT * there_is
+    asked = cancels > _LEAST_DISAGREEMENT * magnitude
     large = footprints.weights >= _LEAST_WEIGHT
     return splittable & asked & large & (footprints.reach <= _LARGEST_REACH)
 
@@ -134,25 +134,25 @@ def choose_pieces(
         Pieces [N, 3] uint8, and the size in pixels to which Gaussians were split; None if none is split.
     """
     rows = allowed.nonzero()[:, 0]
-    own, rest = lengths[rows], budget - (len(lengths) - len(rows))
-    found, size = torch.ones((len(rows), 3), dtype=torch.uint8), None
+    allowed_lengths, rest = lengths[rows], budget - (len(lengths) - len(rows))
+    chosen, size = torch.ones((len(rows), 3), dtype=torch.uint8), None
     for smaller in SIZES:
-        following = pieces_to(own, smaller)
-        following = torch.where((piece_counts(following) <= most[rows])[:, None], following, found)
-        more = piece_counts(following) - piece_counts(found)
-        room = rest - int(piece_counts(found).sum())
-        if int(more.sum()) <= room:
+        following = pieces_to(allowed_lengths, smaller)
+        following = torch.where((piece_counts(following) <= most[rows])[:, None], following, chosen)
+        more = piece_counts(following) - piece_counts(chosen)
+        capacity = rest - int(piece_counts(chosen).sum())
+        if int(more.sum()) <= capacity:
             size = smaller if bool((more > 0).any()) else size
-            found = following
+            chosen = following
             continue
         order = torch.argsort(cancels[rows] / more.clamp_min(1), descending=True, stable=True)
-        taken = order[more[order].cumsum(0) <= room]
+        taken = order[more[order].cumsum(0) <= capacity]
         taken = taken[more[taken] > 0]
-        found[taken] = following[taken]
+        chosen[taken] = following[taken]
         size = smaller if len(taken) else size
         break
     pieces = torch.ones((len(lengths), 3), dtype=torch.uint8)
-    pieces[rows] = found
+    pieces[rows] = chosen
     return pieces, size if bool((pieces > 1).any()) else None
 
 

@@ -95,8 +95,8 @@ class Refinement:
 
     def of(self, scene: Scene) -> Scene:
         """Return the refined scene."""
-        found = split(scene, self.pieces)
-        return found if self.sh_dc is None else replace(found, sh_dc=self.sh_dc)
+        refined = split(scene, self.pieces)
+        return refined if self.sh_dc is None else replace(refined, sh_dc=self.sh_dc)
 
 
 def piece_counts(pieces: Tensor) -> Tensor:
@@ -134,17 +134,17 @@ def split(scene: Scene, pieces: Tensor) -> Scene:
     if not len(parents):
         return scene
     if not bool(can_be_split(scene)[parents].all()):
-        raise ValueError("Gaussians of extreme size or place cannot be split")
+        raise ValueError("Gaussians of extreme size or position cannot be split")
     first = counts.cumsum(0) - counts
-    found = scene.subset(torch.repeat_interleave(counts))
+    result = scene.subset(torch.repeat_interleave(counts))
     ends = counts[parents].cumsum(0)
     start = 0
     while start < len(parents):
         before = int(ends[start - 1]) if start else 0
         stop = max(int(torch.searchsorted(ends, before + _CHUNK, right=True)), start + 1)
-        _place_children(scene, pieces, parents[start:stop], counts, first, found)
+        _place_children(scene, pieces, parents[start:stop], counts, first, result)
         start = stop
-    return found
+    return result
 
 
 def pieces_to(lengths: Tensor, size: Tensor | float) -> Tensor:
@@ -156,8 +156,8 @@ def pieces_to(lengths: Tensor, size: Tensor | float) -> Tensor:
     """
     numbers = torch.tensor([1, *range(3, MOST_PIECES + 1)], dtype=torch.uint8)
     ratios = torch.tensor([1.0, *(ratio_of(int(number)) for number in numbers[1:])], dtype=torch.float64)
-    place = torch.searchsorted(ratios, (lengths.double() / size).contiguous())
-    return numbers[place.clamp_max(len(numbers) - 1)]
+    index = torch.searchsorted(ratios, (lengths.double() / size).contiguous())
+    return numbers[index.clamp_max(len(numbers) - 1)]
 
 
 def ratio_of(number: int) -> float:
@@ -182,12 +182,12 @@ def mixture_error(division: AxisSplit) -> float:
 
     It is computed in closed form.
     """
-    own, both = 1 / division.ratio**2, 1 + 1 / division.ratio**2
+    child, both = 1 / division.ratio**2, 1 + 1 / division.ratio**2
     apart = division.offsets[:, None] - division.offsets
-    mixed = division.weights @ _normal(apart, 2 * own) @ division.weights
+    mixed = division.weights @ _normal(apart, 2 * child) @ division.weights
     crossed = division.weights @ _normal(division.offsets, both)
-    whole = _normal(np.zeros(1), 2.0)[0]
-    return float(np.sqrt(max(mixed - 2 * crossed + whole, 0.0) / whole))
+    parent = _normal(np.zeros(1), 2.0)[0]
+    return float(np.sqrt(max(mixed - 2 * crossed + parent, 0.0) / parent))
 
 
 def _normal(offsets: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
@@ -204,18 +204,18 @@ def _split_axis_at(number: int, ratio: float, distance: float) -> AxisSplit | No
     low, high = 0.0, 700 / squares.max()  # the variance decreases from that of equal weights
     for _ in range(100):
         middle = (low + high) / 2
-        weights = _shares(squares, middle)
+        weights = _normalized_weights(squares, middle)
         low, high = (middle, high) if weights @ squares > wanted else (low, middle)
     if abs(weights @ squares - wanted) > 1e-12:  # the solution was outside the bracket
         return None
     return AxisSplit(ratio, offsets, weights)
 
 
-def _shares(squares: NDArray[np.float64], slope: float) -> NDArray[np.float64]:
+def _normalized_weights(squares: NDArray[np.float64], slope: float) -> NDArray[np.float64]:
     """Return exp(-slope * squares), normalized to a sum of 1."""
     weights = np.exp(-slope * (squares - squares.min()))
-    shares: NDArray[np.float64] = weights / weights.sum()
-    return shares
+    normalized: NDArray[np.float64] = weights / weights.sum()
+    return normalized
 
 
 def _is_number_of_pieces(pieces: Tensor) -> Tensor:
@@ -225,33 +225,33 @@ def _is_number_of_pieces(pieces: Tensor) -> Tensor:
 @functools.cache
 def _tables() -> tuple[Tensor, Tensor, Tensor]:
     """Return tables indexed by piece count: child offsets [P + 1, P], log(w r) [P + 1, P] and log(r) [P + 1]."""
-    offsets, shares = torch.zeros(2, MOST_PIECES + 1, MOST_PIECES, dtype=torch.float64)
+    offsets, log_weights = torch.zeros(2, MOST_PIECES + 1, MOST_PIECES, dtype=torch.float64)
     ratios = torch.zeros(MOST_PIECES + 1, dtype=torch.float64)
     for number in (1, *range(3, MOST_PIECES + 1)):
         division = split_axis(number)
         offsets[number, :number] = torch.from_numpy(division.offsets)
-        shares[number, :number] = torch.from_numpy(np.log(division.weights * division.ratio))
+        log_weights[number, :number] = torch.from_numpy(np.log(division.weights * division.ratio))
         ratios[number] = np.log(division.ratio)
-    return offsets, shares, ratios
+    return offsets, log_weights, ratios
 
 
-def _place_children(scene: Scene, pieces: Tensor, rows: Tensor, counts: Tensor, first: Tensor, found: Scene) -> None:
+def _place_children(scene: Scene, pieces: Tensor, rows: Tensor, counts: Tensor, first: Tensor, result: Scene) -> None:
     """Write positions, sizes and opacities of the children of some Gaussians to the split scene."""
-    offsets, shares, ratios = _tables()
+    offsets, log_weights, ratios = _tables()
     parent = torch.repeat_interleave(rows, counts[rows])
     number = torch.arange(len(parent)) - torch.repeat_interleave(counts[rows].cumsum(0) - counts[rows], counts[rows])
     into = pieces[parent].long()
-    place = torch.stack(
+    position = torch.stack(
         (number % into[:, 0], number // into[:, 0] % into[:, 1], number // (into[:, 0] * into[:, 1])), 1
     )
     children = first[parent] + number
     sizes = scene.scales[rows].double().exp()
     axes = torch.repeat_interleave(rotations(scene.quats[rows].double()) * sizes[:, None, :], counts[rows], dim=0)
-    shift = torch.einsum("nij,nj->ni", axes, offsets[into, place])
-    found.means[children] = (scene.means[parent].double() + shift).float()
-    found.scales[children] = (scene.scales[parent].double() - ratios[into]).float()
+    shift = torch.einsum("nij,nj->ni", axes, offsets[into, position])
+    result.means[children] = (scene.means[parent].double() + shift).float()
+    result.scales[children] = (scene.scales[parent].double() - ratios[into]).float()
     # Logit of a product, computed from logarithms, so that the opacity neither vanishes for a faint parent nor reaches
     # 1 for an opaque one.
     logit = scene.opacities[parent].double()
-    log = torch.nn.functional.logsigmoid(logit) + shares[into, place].sum(dim=1)
-    found.opacities[children] = (log - torch.log(-torch.expm1(log))).float()
+    log = torch.nn.functional.logsigmoid(logit) + log_weights[into, position].sum(dim=1)
+    result.opacities[children] = (log - torch.log(-torch.expm1(log))).float()

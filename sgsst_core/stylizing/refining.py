@@ -83,8 +83,8 @@ def refine(
         return None
     fitted = fit_cameras(cameras, settings)
     planning_context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
-    kept = None if regions is None else regions.frozen
-    return _Refining(planning_context, StyleMixture.of(style), collectives, kept, show).run()
+    frozen = None if regions is None else regions.frozen
+    return _Refining(planning_context, StyleMixture.of(style), collectives, frozen, show).run()
 
 
 def refined(scene: Scene, refinement: Refinement | None) -> Scene:
@@ -116,7 +116,7 @@ class _Refining:
         planning_context: Planning context of the scene.
         style: Style of the job as given; styles of regions are not considered.
         collectives: Ranks of the job.
-        kept: [N] bool, frozen Gaussians, which are not split; None for none.
+        frozen: [N] bool, frozen Gaussians, which are not split; None for none.
         show: Progress callback.
     """
 
@@ -125,10 +125,10 @@ class _Refining:
         planning_context: PlanningContext,
         style: StyleMixture,
         collectives: Collectives,
-        kept: Tensor | None,
+        frozen: Tensor | None,
         show: ShowPlanning | None,
     ) -> None:
-        self._kept, self._show = kept, show
+        self._frozen, self._show = frozen, show
         self._planning_context, self._given, self._collectives = planning_context, style, collectives
         self._scene, self._settings = planning_context.scene, planning_context.settings
         self._rasterizer = planning_context.rasterizer
@@ -141,28 +141,28 @@ class _Refining:
         nothing = Refinement(torch.ones((count, 3), dtype=torch.uint8), 0, count)
         if not covered:
             return nothing
-        cancels, there_is = self._ask_the_loss(spread_evenly(covered, GRADIENT_VIEWS))
-        allowed = candidates(self._footprints, self._may_be_split(), cancels, there_is)
+        cancels, magnitude = self._gradient_disagreement(spread_evenly(covered, GRADIENT_VIEWS))
+        allowed = candidates(self._footprints, self._may_be_split(), cancels, magnitude)
         budget, lengths = math.floor(self._settings.refine * count), self._footprints.lengths
         most = most_children(self._footprints.weights)
         pieces, size = self._collectives.broadcast(lambda: choose_pieces(lengths, allowed, cancels, most, budget))
         chosen = int((piece_counts(pieces) > 1).sum())
         fitted = spread_evenly(covered, GRADIENT_VIEWS)
-        kept, change = self._as_far_as_the_picture_stays(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
-        counts = piece_counts(kept)
+        pieces, change = self._undo_until_images_are_preserved(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
+        counts = piece_counts(pieces)
         parents = int((counts > 1).sum())
         if change is None:
             return replace(nothing, taken_back=chosen)
         return Refinement(
-            kept, parents, int(counts.sum()), size, change.psnr, change.lowest, chosen - parents, change.sh_dc
+            pieces, parents, int(counts.sum()), size, change.psnr, change.lowest, chosen - parents, change.sh_dc
         )
 
     def _may_be_split(self) -> Tensor:
         """Return the mask [N] bool of Gaussians that may be split."""
         sane = can_be_split(self._scene)
-        return sane if self._kept is None else sane & ~self._kept
+        return sane if self._frozen is None else sane & ~self._frozen
 
-    def _as_far_as_the_picture_stays(
+    def _undo_until_images_are_preserved(
         self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]
     ) -> tuple[Tensor, _Change | None]:
         """Undo splits until the images of `views` are preserved. Return the remaining pieces, and the remaining change.
@@ -176,7 +176,7 @@ class _Refining:
             change = self._change(pieces, fitted, views)
             if change.lowest >= LEAST_PSNR:
                 return pieces, change
-            pieces = self._collectives.broadcast(partial(self._without_the_worst, pieces, change))
+            pieces = self._collectives.broadcast(partial(self._undo_the_worst, pieces, change))
         return torch.ones_like(pieces), None
 
     def _survey(self) -> list[int]:
@@ -188,17 +188,17 @@ class _Refining:
             if sees_something(coverage):
                 covered.append(index)
                 self._footprints.add(cameras[index], weights.cpu())
-        sums, reach = self._footprints.parts
+        sums, reach = self._footprints.sums
         every = torch.stack(collectives.all_gather(reach)).amax(dim=0) if collectives.size > 1 else reach
-        self._footprints.take(self._sum(sums), every)
-        return sorted(index for part in collectives.all_gather(covered) for index in part)
+        self._footprints.replace(self._sum(sums), every)
+        return sorted(index for views in collectives.all_gather(covered) for index in views)
 
-    def _ask_the_loss(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
+    def _gradient_disagreement(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return the sum over some views of the `disagreement` of the style loss gradient."""
         settings, cameras, total = self._settings, self._planning_context.cameras, self._footprints.weights
         device = self._planning_context.network.device
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
-        style = style.map(lambda picture: picture.to(device))
+        style = style.map(lambda image: image.to(device))
         scene = replace(self._scene, sh_dc=with_moments(self._scene.sh_dc, total, style))
         loss = SosLoss(
             self._planning_context.network,
@@ -210,7 +210,7 @@ class _Refining:
             scales=ScaleWeights(settings.scales),
         )
         targets: dict[tuple[int, int], dict[int, ScaleTarget]] = {}
-        found = torch.zeros((len(scene), 2), dtype=torch.float64)
+        sums = torch.zeros((len(scene), 2), dtype=torch.float64)
         for index in self._shown(views):
             camera = cameras[index]
             size = (camera.height, camera.width)
@@ -222,9 +222,9 @@ class _Refining:
             gradient = loss.evaluate(image, targets[size], ViewTarget(coverage=weights)).image_gradient
             assert gradient is not None
             gradient = gradient.to(self._rasterizer.device, self._rasterizer.dtype)
-            found += torch.stack(disagreement(self._rasterizer, camera, gradient), dim=1)
-        cancels, there_is = self._sum(found).unbind(1)
-        return cancels, there_is
+            sums += torch.stack(disagreement(self._rasterizer, camera, gradient), dim=1)
+        cancels, magnitude = self._sum(sums).unbind(1)
+        return cancels, magnitude
 
     def _change(self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]) -> _Change:
         """Return the effect of pieces [N, 3] on the unstylized image of `views`, with colors fitted to `fitted`."""
@@ -234,13 +234,13 @@ class _Refining:
         scene = self._fit(scene, rasterizer, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
         squared = torch.zeros(len(self._scene), dtype=torch.float64)
         errors: dict[int, float] = {}
-        for index in self._own(views):
+        for index in self._of_this_rank(views):
             camera = self._planning_context.cameras[index]
             before = render(self._scene, self._rasterizer, camera).clamp(0, 1)
             change = (render(scene, rasterizer, camera).clamp(0, 1) - before).square()
             errors[index] = float(change.mean(dtype=torch.float64))
             squared += self._rasterizer.color_gradient(change, camera).double().sum(dim=1).cpu()
-        every = [error for part in self._collectives.all_gather(errors) for error in part.values()]
+        every = [error for by_view in self._collectives.all_gather(errors) for error in by_view.values()]
         return _Change(psnr(sum(every) / len(every)), psnr(max(every)), scene.sh_dc, self._sum(squared))
 
     def _fit(self, scene: Scene, rasterizer: Rasterizer, children: Tensor, views: Sequence[int]) -> Scene:
@@ -253,7 +253,7 @@ class _Refining:
         children = children.to(self._rasterizer.device)
         for _ in range(_FITTING_STEPS):
             lacks = torch.zeros((len(scene), 4), dtype=torch.float64, device=self._rasterizer.device)
-            for index in self._own(views):
+            for index in self._of_this_rank(views):
                 camera = self._planning_context.cameras[index]
                 missing = render(self._scene, self._rasterizer, camera) - render(scene, rasterizer, camera)
                 lacks[:, :3] += rasterizer.color_gradient(missing, camera)
@@ -264,7 +264,7 @@ class _Refining:
             scene = replace(scene, sh_dc=scene.sh_dc + more)
         return scene
 
-    def _without_the_worst(self, pieces: Tensor, change: _Change) -> Tensor:
+    def _undo_the_worst(self, pieces: Tensor, change: _Change) -> Tensor:
         """Undo the splits that change the images most, up to a fraction of the total change."""
         parents = (piece_counts(pieces) > 1).nonzero()[:, 0]
         density = change.squared[parents] / self._footprints.weights[parents].clamp_min(1.0)
@@ -275,14 +275,14 @@ class _Refining:
         fewer[worst] = 1
         return fewer
 
-    def _own(self, views: Sequence[int]) -> Sequence[int]:
+    def _of_this_rank(self, views: Sequence[int]) -> Sequence[int]:
         """Return the views that this rank processes."""
         return views[self._collectives.rank :: self._collectives.size]
 
     def _shown(self, views: Sequence[int]) -> Iterator[int]:
         """Yield the views that this rank processes, one by one, and report progress."""
         started = time.perf_counter()
-        for done, index in enumerate(self._own(views)):
+        for done, index in enumerate(self._of_this_rank(views)):
             if self._show:
                 self._show(progress_of(done, len(views), self._collectives.size, time.perf_counter() - started))
             yield index
@@ -300,9 +300,9 @@ def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor)
     takes two passes of the rasterizer, for |g| and g. G-Style (Kovács, Hermosilla, Raidou 2024) also splits by gradient
     magnitudes, which it accumulates over steps.
     """
-    whole = rasterizer.color_gradient(image_gradient.abs(), camera).double()
+    total = rasterizer.color_gradient(image_gradient.abs(), camera).double()
     summed = rasterizer.color_gradient(image_gradient, camera).double().abs()
-    return (whole - summed).clamp_min(0).sum(dim=1).cpu(), whole.sum(dim=1).cpu()
+    return (total - summed).clamp_min(0).sum(dim=1).cpu(), total.sum(dim=1).cpu()
 
 
 def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
@@ -313,4 +313,4 @@ def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
 def spread_evenly(views: Sequence[int], most: int) -> list[int]:
     """Return at most `most` views, evenly spread and including the first."""
     count = min(most, len(views))
-    return [views[place * len(views) // count] for place in range(count)]
+    return [views[index * len(views) // count] for index in range(count)]

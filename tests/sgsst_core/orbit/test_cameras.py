@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.orbit.cameras import RESOLUTION, middle_of, orbit, share_out
+from sgsst_core.orbit.cameras import RESOLUTION, cameras_per_ring, middle_of, orbit
 from sgsst_core.orbit.subject import find_subject
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
@@ -47,7 +47,7 @@ def elevation(view: Camera, middle: Tensor, up: Tensor) -> float:
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (1, 0, 0), (0.3, -2, 0.9)])
 @pytest.mark.parametrize("size", [0.01, 1.0, 300.0])
 @pytest.mark.parametrize("shape", [None, (360, 480)])
-def test_the_whole_object_fills_every_frame(
+def test_every_frame_shows_the_whole_object_and_is_filled_by_it(
     up: tuple[float, float, float], size: float, shape: tuple[int, int] | None
 ) -> None:
     means = box((-0.5, -1.5, -0.3), (0.5, 1.5, 0.3), 3000) * size + torch.tensor([5.0, -7.0, 2.0]) * size
@@ -74,7 +74,7 @@ def test_the_whole_object_fills_every_frame(
         assert torch.allclose(places.amax(0) + places.amin(0), torch.ones(2, dtype=torch.float64), atol=0.03)
 
 
-def test_frames_are_of_few_shapes_that_follow_the_object() -> None:
+def test_frames_have_few_aspect_ratios_that_follow_the_object() -> None:
     standing = orbit(figure(), 12)
     assert all(view.height > 2 * view.width for view in standing)
     assert len({view.width for view in standing}) <= 4
@@ -82,7 +82,7 @@ def test_frames_are_of_few_shapes_that_follow_the_object() -> None:
     assert all(view.width > 2 * view.height for view in lying)
 
 
-def test_the_picture_ends_beyond_the_object() -> None:
+def test_frames_have_a_margin_around_the_object() -> None:
     """In a render, nothing is cut off, and the object fills most of its box's area."""
     scene = figure()
     rasterizer = make_rasterizer("cpu", scene)
@@ -93,19 +93,19 @@ def test_the_picture_ends_beyond_the_object() -> None:
         assert float(coverage.mean()) > 0.35
 
 
-def test_rings_share_the_cameras_by_their_circumference() -> None:
-    assert share_out(24, [10.0]) == [24]
-    assert share_out(24, [0.0, 60.0]) == [16, 8]
-    assert share_out(2, [0.0, 40.0, 70.0]) == [1, 1, 0]
-    assert share_out(5, [0.0, 80.0]) == [4, 1]
+def test_cameras_are_distributed_over_rings_by_circumference() -> None:
+    assert cameras_per_ring(24, [10.0]) == [24]
+    assert cameras_per_ring(24, [0.0, 60.0]) == [16, 8]
+    assert cameras_per_ring(2, [0.0, 40.0, 70.0]) == [1, 1, 0]
+    assert cameras_per_ring(5, [0.0, 80.0]) == [4, 1]
     middle, axis = middle_of(find_subject(figure()), torch.tensor(UP).double()), torch.tensor(UP, dtype=torch.float64)
     views = orbit(figure(), 24, up=UP, elevations=[10.0, 40.0, -20.0])
-    counts = share_out(24, [10.0, 40.0, -20.0])
+    counts = cameras_per_ring(24, [10.0, 40.0, -20.0])
     expected = [angle for angle, count in zip([10.0, 40.0, -20.0], counts, strict=True) for _ in range(count)]
     assert [elevation(view, middle, axis) for view in views] == pytest.approx(expected, abs=1e-6)
 
 
-def test_turning_the_scene_turns_the_cameras_and_enlarging_it_moves_them_away() -> None:
+def test_cameras_follow_rotation_and_scale_of_the_scene() -> None:
     scene, matrix = figure(), torch.from_numpy(TURN.as_matrix())
     before = orbit(scene, 9, up=UP, elevations=[10.0, 40.0])
     after = orbit(moved(scene, TURN, 3.0, (5, -2, 7)), 9, up=TURN.apply(UP).tolist(), elevations=[10.0, 40.0])
@@ -119,7 +119,7 @@ def test_turning_the_scene_turns_the_cameras_and_enlarging_it_moves_them_away() 
         assert new.fx == pytest.approx(old.fx, rel=0.02)
 
 
-def test_the_first_camera_looks_at_the_broad_side() -> None:
+def test_first_camera_faces_the_broad_side() -> None:
     scene = scene_of(box((-1, -1, -0.2), (1, 1, 0.2), 3000))
     turned = moved(scene, Rotation.from_euler("y", 37, degrees=True))
     offset = orbit(turned, 4)[0].center
@@ -127,7 +127,7 @@ def test_the_first_camera_looks_at_the_broad_side() -> None:
     assert abs(float(offset @ broad) / float(offset.norm())) > 0.97
 
 
-def test_a_radius_is_obeyed() -> None:
+def test_explicit_radius_is_used() -> None:
     scene = figure()
     middle = middle_of(find_subject(scene), torch.tensor(UP, dtype=torch.float64))
     for radius in (2.5, 40.0):
@@ -154,7 +154,7 @@ ODD = {
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_odd_scenes_have_cameras_that_see_them(name: str) -> None:
+def test_degenerate_scenes_have_cameras_that_see_them(name: str) -> None:
     scene = ODD[name]
     subject = find_subject(scene)
     seen = scene.means[subject.holds(scene.means)] if name == "a far outlier" else scene.means
@@ -180,7 +180,7 @@ def test_odd_scenes_have_cameras_that_see_them(name: str) -> None:
         {"radius": math.inf},
     ],
 )
-def test_an_orbit_without_sense_is_refused(wrong: dict[str, object]) -> None:
+def test_invalid_orbit_arguments_are_refused(wrong: dict[str, object]) -> None:
     arguments = {"count": 3} | wrong
     with pytest.raises(SettingsError):
         orbit(scene_of(torch.rand(9, 3)), **arguments)  # type: ignore[arg-type]
@@ -192,7 +192,7 @@ def fill(scene: Scene, views: list[Camera]) -> list[float]:
     return [float(rasterizer.coverage(resized(view, 256)).mean()) for view in views]
 
 
-def test_the_biker_fills_portraits(shared_data: Path) -> None:
+def test_biker_views_are_portraits_that_it_fills(shared_data: Path) -> None:
     scene = read_scene(shared_data / "scenes" / "biker" / "point_cloud.ply").scene
     views = orbit(scene, 8, elevations=[10.0, 40.0])
     shares = fill(scene, views)

@@ -43,7 +43,7 @@ def table() -> Scene:
     return joined(ground(4.0), scene_of(box((-0.5, -0.5, -0.5), (0.5, 0.0, 0.5))))
 
 
-def test_a_wide_flat_scene_is_seen_from_above_and_never_from_under_its_ground() -> None:
+def test_scene_with_ground_gets_views_from_above_and_none_from_below() -> None:
     made = make_orbit(table(), OrbitRequest(count=24))
     assert made.up.ground
     assert made.elevations[0] == 10
@@ -53,7 +53,7 @@ def test_a_wide_flat_scene_is_seen_from_above_and_never_from_under_its_ground() 
     assert len(made.cameras) == 24
 
 
-def test_a_pole_needs_no_views_from_above() -> None:
+def test_pole_gets_no_views_from_above() -> None:
     pole = scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01)
     made = make_orbit(pole, OrbitRequest(count=24))
     assert max(made.elevations) == 10
@@ -62,7 +62,7 @@ def test_a_pole_needs_no_views_from_above() -> None:
     assert made.next < 0.03
 
 
-def test_views_by_need_are_bounded_and_more_where_there_are_more_rings() -> None:
+def test_automatic_view_count_is_bounded_and_grows_with_the_rings() -> None:
     pole = make_orbit(scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01), OrbitRequest())
     wide = make_orbit(table(), OrbitRequest())
     for made in (pole, wide):
@@ -71,13 +71,13 @@ def test_views_by_need_are_bounded_and_more_where_there_are_more_rings() -> None
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 11])
-def test_few_views_are_one_ring(count: int) -> None:
+def test_few_views_form_one_ring(count: int) -> None:
     made = make_orbit(table(), OrbitRequest(count=count))
     assert len(made.cameras) == count
     assert made.elevations == (10,)
 
 
-def test_what_was_asked_for_is_obeyed() -> None:
+def test_requested_properties_are_used() -> None:
     scene = figure()
     made = make_orbit(scene, OrbitRequest(count=14, up=(0.0, 0.0, 1.0), elevation=35.0, radius=6.5))
     assert len(made.cameras) == 14
@@ -90,7 +90,7 @@ def test_what_was_asked_for_is_obeyed() -> None:
     assert decisions["cameras"].reason == "requested"
 
 
-def test_an_orbit_tells_why_it_is_as_it_is() -> None:
+def test_plan_lines_state_the_reasons_of_an_orbit() -> None:
     scene = figure()
     made = make_orbit(scene, OrbitRequest(count=24))
     decisions = told(scene, made)
@@ -109,7 +109,7 @@ def test_an_orbit_tells_why_it_is_as_it_is() -> None:
         (scene_of(box((-1, -1, -1), (1, 1, 1), 3000), 0.05), "lies inside"),
     ],
 )
-def test_a_room_is_no_subject_and_that_is_said(room: Scene, what: str) -> None:
+def test_plan_warns_that_a_room_is_not_a_single_object(room: Scene, what: str) -> None:
     scene = joined(scene_of(ball((0, 0, 0), 0.5, 5000), 0.05), room)
     made = make_orbit(scene, OrbitRequest(count=12))
     warning = told(scene, made)["subject"]
@@ -128,14 +128,14 @@ def test_a_room_is_no_subject_and_that_is_said(room: Scene, what: str) -> None:
         scene_of(torch.zeros(1, 3), torch.tensor([[1e-4, 2.0, 1e-4]])),
     ],
 )
-def test_what_is_hardly_a_scene_has_an_orbit(scene: Scene) -> None:
+def test_degenerate_scenes_have_an_automatic_orbit(scene: Scene) -> None:
     for request in (OrbitRequest(), OrbitRequest(count=3)):
         made = make_orbit(scene, request)
         assert all(bool(torch.isfinite(camera.world_to_camera).all()) for camera in made.cameras)
         assert 0 <= made.shown <= 1 + 1e-9
 
 
-def test_the_plan_begins_with_the_orbit(tiny_weights) -> None:  # type: ignore[no-untyped-def]
+def test_plan_starts_with_the_lines_about_the_orbit(tiny_weights) -> None:  # type: ignore[no-untyped-def]
     scene = figure()
     made = make_orbit(scene, OrbitRequest(count=3))
     cameras = [resized(camera, 64) for camera in made.cameras]
@@ -145,7 +145,7 @@ def test_the_plan_begins_with_the_orbit(tiny_weights) -> None:  # type: ignore[n
     assert "up" not in {decision.item for decision in without.decisions}
 
 
-def test_the_orbit_repeats() -> None:
+def test_automatic_orbits_are_deterministic() -> None:
     first, second = (make_orbit(figure(), OrbitRequest(count=12)) for _ in range(2))
     for one, other in itertools.zip_longest(first.cameras, second.cameras):
         assert torch.equal(one.world_to_camera, other.world_to_camera)

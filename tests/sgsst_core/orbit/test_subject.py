@@ -19,7 +19,7 @@ def extent(scene: object) -> torch.Tensor:
     return torch.stack([subject.hull.amin(0), subject.hull.amax(0)])
 
 
-def test_the_extent_of_a_box_is_its_own_and_that_of_its_gaussians() -> None:
+def test_extent_of_a_box_includes_the_extents_of_its_gaussians() -> None:
     reach = 0.02 * math.sqrt(2 * math.log(torch.sigmoid(torch.tensor(3.0)) / 0.03))
     corner = torch.tensor([0.5, 1.5, 0.3], dtype=torch.float64) + reach
     assert torch.allclose(extent(OBJECT), torch.stack([-corner, corner]), atol=0.01)
@@ -44,18 +44,18 @@ STRAYS = {
 
 
 @pytest.mark.parametrize("name", STRAYS)
-def test_strays_move_nothing(name: str) -> None:
+def test_stray_gaussians_do_not_change_the_subject(name: str) -> None:
     assert torch.allclose(extent(joined(OBJECT, STRAYS[name])), extent(OBJECT), atol=0.02)
 
 
-def test_a_thin_part_that_hangs_together_with_the_rest_is_kept() -> None:
+def test_connected_thin_part_belongs_to_the_subject() -> None:
     rod = torch.zeros(60, 3)
     rod[:, 1] = torch.linspace(-3.0, -1.5, 60)
     found = extent(joined(OBJECT, scene_of(rod, 0.01)))
     assert float(found[0, 1]) < -3.0
 
 
-def test_two_things_apart_are_both_kept() -> None:
+def test_two_separate_objects_both_belong_to_the_subject() -> None:
     other = scene_of(box((2.0, -0.5, -0.3), (3.0, 0.5, 0.3), 1500))
     assert float(extent(joined(OBJECT, other))[1, 0]) > 3.0
 
@@ -72,7 +72,7 @@ def test_two_things_apart_are_both_kept() -> None:
         scene_of(torch.rand(50, 3) * 1e-15, 1e-20),
     ],
 )
-def test_what_is_hardly_a_scene_has_a_finite_extent_that_holds_it(scene: object) -> None:
+def test_degenerate_scenes_have_a_finite_extent_that_contains_them(scene: object) -> None:
     subject = find_subject(scene)  # type: ignore[arg-type]
     assert bool(torch.isfinite(subject.hull).all())
     assert bool(torch.isfinite(subject.weights).all())
@@ -86,7 +86,7 @@ def test_a_zero_quaternion_counts_as_no_rotation() -> None:
     assert torch.allclose(extent(scene), extent(OBJECT))
 
 
-def test_large_scenes_are_looked_at_by_a_sample() -> None:
+def test_subject_of_a_large_scene_is_estimated_from_a_sample() -> None:
     scene = figure()
     times = -(-150_000 // len(scene))
     many = joined(*[scene] * times)

@@ -33,7 +33,7 @@ def lamp() -> Scene:
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_a_ground_says_it_whichever_way_the_scene_is_turned(turn: Rotation) -> None:
+def test_up_follows_from_the_ground_for_any_rotation(turn: Rotation) -> None:
     up = found(moved(lamp(), turn, 3.0, (5, -2, 7)))
     assert degrees(up, turn) < 1.5
     assert up.ground
@@ -42,7 +42,7 @@ def test_a_ground_says_it_whichever_way_the_scene_is_turned(turn: Rotation) -> N
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_who_stands_has_feet_below(turn: Rotation) -> None:
+def test_standing_subject_has_its_foot_below(turn: Rotation) -> None:
     up = found(moved(figure(), turn, 0.2))
     assert degrees(up, turn) < 5
     assert up.sure
@@ -50,7 +50,7 @@ def test_who_stands_has_feet_below(turn: Rotation) -> None:
     assert "times as tall as wide" in up.reason
 
 
-def test_what_lies_on_its_wheels_does_not_stand_on_its_nose() -> None:
+def test_long_subject_on_wheels_lies_instead_of_standing() -> None:
     wheels = [box((x, -0.3, z), (x + 0.6, 0.0, z + 0.2), 300) for x in (-1.9, 1.3) for z in (-0.8, 0.6)]
     body = ball((0, 0, 0), 1.0, 3000) * torch.tensor([2.2, 0.5, 0.8]) + torch.tensor([0.0, -0.7, 0.0])
     up = found(scene_of(torch.cat([*wheels, body])))
@@ -69,7 +69,7 @@ def test_what_lies_on_its_wheels_does_not_stand_on_its_nose() -> None:
         joined(*(scene_of(part) for part in (box((-1, -1, -1), (1, 1, 1), 4000), ball((0, 0, 0), 3.9, 1500)))),
     ],
 )
-def test_where_nothing_shows_it_habit_says_so(scene: Scene) -> None:
+def test_up_is_conventional_without_evidence(scene: Scene) -> None:
     up = found(scene)
     assert up.name == "-y"
     assert not up.sure
@@ -77,7 +77,7 @@ def test_where_nothing_shows_it_habit_says_so(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(("along", "name"), [(0, "x"), (1, "-y"), (2, "z")])
-def test_a_stick_stands_along_itself_by_habit(along: int, name: str) -> None:
+def test_stick_stands_along_its_axis_in_the_conventional_sense(along: int, name: str) -> None:
     points = torch.zeros(400, 3)
     points[:, along] = torch.linspace(-1, 1, 400)
     up = found(scene_of(points))
@@ -86,7 +86,7 @@ def test_a_stick_stands_along_itself_by_habit(along: int, name: str) -> None:
     assert "both ends are alike" in up.reason
 
 
-def test_a_slant_keeps_its_numbers_and_what_is_near_an_axis_becomes_it() -> None:
+def test_up_snaps_to_a_close_world_axis_only() -> None:
     assert found(moved(figure(), Rotation.from_euler("x", 6, degrees=True))).name == "-y"
     slanted = found(moved(figure(), Rotation.from_euler("x", 30, degrees=True)))
     assert slanted.name.startswith("(")

@@ -61,7 +61,7 @@ def line(plan: Plan, item: str) -> Decision | None:
     return next((decision for decision in plan.decisions if decision.item == item), None)
 
 
-def said(plan: Plan, item: str) -> str:
+def text_of(plan: Plan, item: str) -> str:
     found = line(plan, item)
     assert found is not None, [decision.item for decision in plan.decisions]
     return f"{found.decision}: {found.reason}"
@@ -70,14 +70,14 @@ def said(plan: Plan, item: str) -> str:
 # --- the scene -----------------------------------------------------------------------------------------------------
 
 
-def test_unseen_gaussians_are_left_out_unless_they_are_kept() -> None:
+def test_unseen_gaussians_are_left_out_unless_requested() -> None:
     plan = plan_of(probe())
     assert plan.seen.tolist() == plan.optimized.tolist() == [False, True, True, True, True, True]
-    assert said(plan, "unseen Gaussians").startswith(
+    assert text_of(plan, "unseen Gaussians").startswith(
         "1 of 6 are neither rendered nor optimized; they follow their neigh"
     )
     assert line(plan, "unseen Gaussians").bytes == OPTIMIZER_BYTES  # type: ignore[union-attr]
-    assert "they keep their colors" in said(plan_of(probe(), unseen="freeze"), "unseen Gaussians")
+    assert "they keep their colors" in text_of(plan_of(probe(), unseen="freeze"), "unseen Gaussians")
     everything = plan_of(probe(), keep=("unseen",))
     assert everything.seen.all()
     assert not everything.optimized.all()
@@ -95,7 +95,7 @@ def test_unseen_gaussians_are_left_out_unless_they_are_kept() -> None:
 )
 def test_spherical_harmonics(degree: int, used: int, keep: tuple[Any, ...], expected: str | None) -> None:
     plan = plan_of(probe(sh_degree=degree, used_degree=used), keep=keep)
-    assert (said(plan, "spherical harmonics") if expected else line(plan, "spherical harmonics")) == expected
+    assert (text_of(plan, "spherical harmonics") if expected else line(plan, "spherical harmonics")) == expected
 
 
 # --- views ---------------------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ def test_spherical_harmonics(degree: int, used: int, keep: tuple[Any, ...], expe
 def test_blind_views_are_skipped() -> None:
     plan = plan_of(probe(covered=[0, 1, 3]))
     assert plan.covered == (0, 1, 3)
-    assert said(plan, "views") == "1 of 4 are skipped: they see no Gaussian"
+    assert text_of(plan, "views") == "1 of 4 are skipped: they see no Gaussian"
     assert line(plan_of(probe()), "views") is None
 
 
@@ -133,7 +133,7 @@ def test_position_weights_are_for_views_with_an_empty_background(share: float, w
         (0.0, {"training_background": "random", "warm_start": True}, "random", True),
     ],
 )
-def test_what_is_behind_a_scan_and_what_its_colors_begin_with(
+def test_training_background_and_start_follow_coverage_and_settings(
     share: float, values: dict[str, Any], training_background: str, warm: bool
 ) -> None:
     plan = plan_of(probe(uncovered_share=share), **values)
@@ -147,7 +147,7 @@ def test_what_is_behind_a_scan_and_what_its_colors_begin_with(
             assert ("50.0% of the views' pixels are uncovered" in found.reason) is (setting not in values and scan)
 
 
-def test_drawn_background_costs_a_pass_for_content_and_the_early_end() -> None:
+def test_random_background_costs_a_content_pass_and_disables_early_stop() -> None:
     """Content features are recomputed for the new background at every visit, from cached images if they fit."""
     drawn, fixed = (
         plan_of(probe(uncovered_share=0.5), training_background=kind, early_stop=True)
@@ -158,20 +158,20 @@ def test_drawn_background_costs_a_pass_for_content_and_the_early_end() -> None:
     pixels = HEIGHT * WIDTH * (1 + 1 / 4)
     assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 1e-6, rel=0.01)
     assert drawn.prediction.first_visit < fixed.prediction.first_visit
-    assert "0.6 s per step" in said(drawn, "training_background")
-    assert said(drawn, "early stop").startswith("none: all steps are run: losses on different backgrounds")
+    assert "0.6 s per step" in text_of(drawn, "training_background")
+    assert text_of(drawn, "early stop").startswith("none: all steps are run: losses on different backgrounds")
     without = plan_of(probe(uncovered_share=0.5), training_background="random", content_weight=0.0)
-    assert "per step" not in said(without, "training_background")
+    assert "per step" not in text_of(without, "training_background")
     uncached = plan_of(probe(uncovered_share=0.5), training_background="random", keep=("content",))
     assert uncached.prediction is not None
     assert uncached.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # also a render of the content
     assert drawn.prediction.first_visit - uncached.prediction.first_visit == pytest.approx(0.15)
 
 
-def test_uncovered_pixels_do_not_go_through_the_network() -> None:
+def test_uncovered_pixels_skip_the_network() -> None:
     scan = probe(uncovered_share=0.5, regions=[Rectangle(160, 160, 320, 320)] * VIEWS)
     plan, kept = plan_of(scan), plan_of(scan, keep=("uncovered",))
-    assert "of the pixels skip the network: 50.0% of" in said(plan, "uncovered pixels")
+    assert "of the pixels skip the network: 50.0% of" in text_of(plan, "uncovered pixels")
     assert line(kept, "uncovered pixels") is None
     assert plan.prediction is not None
     assert kept.prediction is not None
@@ -184,26 +184,28 @@ def test_uncovered_pixels_do_not_go_through_the_network() -> None:
 def test_partition_and_second_forward_follow_from_the_memory() -> None:
     roomy = plan_of(probe())
     assert (
-        said(roomy, "partition")
+        text_of(roomy, "partition")
         == "none: the network takes each view as a whole: it fits in the 5.0 GB for activations"
     )
-    assert said(roomy, "second forward").startswith("none: activations are cached")
+    assert text_of(roomy, "second forward").startswith("none: activations are cached")
     tight = plan_of(probe(memory_limit=GIGABYTE))
-    assert said(tight, "partition").startswith("up to ")
-    assert "of the pixels fit in the 0.5 GB for activations" in said(tight, "second forward")
+    assert text_of(tight, "partition").startswith("up to ")
+    assert "of the pixels fit in the 0.5 GB for activations" in text_of(tight, "second forward")
     again = plan_of(probe(), keep=("activations",))
-    assert said(again, "second forward").startswith("for 100% of the pixels")
+    assert text_of(again, "second forward").startswith("for 100% of the pixels")
     assert roomy.prediction is not None
     assert again.prediction is not None
     assert roomy.prediction.seconds < again.prediction.seconds
 
 
 def test_memory_is_shared_by_the_ranks_of_a_machine() -> None:
-    assert said(plan_of(probe(sharing=5)), "partition") == said(plan_of(probe(memory_limit=2 * GIGABYTE)), "partition")
+    assert text_of(plan_of(probe(sharing=5)), "partition") == text_of(
+        plan_of(probe(memory_limit=2 * GIGABYTE)), "partition"
+    )
     assert plan_of(probe(sharing=5)).memory_limit == 10 * GIGABYTE
 
 
-def test_matching_features_is_in_seconds_and_memory() -> None:
+def test_prediction_includes_time_and_memory_of_feature_matching() -> None:
     """Matching adds to the network's passes; without it, the plan does not mention or count it."""
     search, rate, channels = 1e-9, probe().network.rate, 48
     positions = [(600 >> scale) // 4 * ((800 >> scale) // 4) for scale in (0, 1)]
@@ -221,14 +223,14 @@ def test_matching_features_is_in_seconds_and_memory() -> None:
         more = found.prediction.peak_bytes - plain.prediction.peak_bytes
         assert vectors + 16 * sum(positions) < more < vectors + 16 * sum(positions) + (16 << 20)
         assert line(plain, "style loss") is None
-        assert said(found, "style loss").startswith(
+        assert text_of(found, "style loss").startswith(
             "the distance of relu3 features to the nearest of at most 8,192 style"
         )
-        assert said(found, "network layers").startswith("up to relu4_2")
+        assert text_of(found, "network layers").startswith("up to relu4_2")
 
 
 def test_content_is_left_out_without_weight() -> None:
-    assert said(plan_of(probe(content_bytes=0), content_weight=0), "content").endswith("its weight is 0")
+    assert text_of(plan_of(probe(content_bytes=0), content_weight=0), "content").endswith("its weight is 0")
     assert line(plan_of(probe()), "content") is None
 
 
@@ -252,12 +254,12 @@ def test_content_is_left_out_without_weight() -> None:
         ),
     ],
 )
-def test_another_precision_where_it_is_asked_for_and_faster(
+def test_lower_precision_is_used_if_requested_and_faster(
     asked: str, ratio: float | None, precision: str, text: str | None
 ) -> None:
     plan = plan_of(probe(precision_ratio=ratio), precision=asked)
     assert plan.precision == precision
-    assert (said(plan, "precision") if text else line(plan, "precision")) == text
+    assert (text_of(plan, "precision") if text else line(plan, "precision")) == text
 
 
 @pytest.mark.parametrize(
@@ -270,7 +272,7 @@ def test_another_precision_where_it_is_asked_for_and_faster(
         ("cpu", "off", LEAST_PASSES, False),
     ],
 )
-def test_algorithms_are_tried_where_sizes_come_back(device: str, weights: str, steps: int, search: bool) -> None:
+def test_cudnn_benchmarks_algorithms_if_sizes_recur_often(device: str, weights: str, steps: int, search: bool) -> None:
     found = probe(device=device, raster=RasterCost(0.01))
     plan = plan_of(found, steps_coarse=0, steps_sos=steps, position_weights=weights)
     assert plan.search is search
@@ -317,7 +319,7 @@ CAPTURED = LaunchCost(seconds=0.010, replayed=0.006, capture=0.040)
         ),
     ],
 )
-def test_the_loss_is_captured_where_that_saves_time(
+def test_loss_is_captured_as_a_graph_if_that_saves_time(
     changes: dict[str, Any], values: dict[str, Any], reason: str | None
 ) -> None:
     found = probe(**{"device": "cuda", "raster": RasterCost(0.01), "launches": CAPTURED, **changes})
@@ -335,13 +337,13 @@ def test_the_loss_is_captured_where_that_saves_time(
         assert decision.seconds is None
 
 
-def test_on_a_cpu_nothing_is_captured_and_nothing_is_said_of_it() -> None:
+def test_no_graph_is_captured_or_mentioned_on_a_cpu() -> None:
     plan = plan_of(probe(launches=CAPTURED), steps_sos=400)
     assert not plan.graphs
     assert line(plan, "launches") is None
 
 
-def test_a_graph_has_memory_of_its_own() -> None:
+def test_graph_needs_memory_in_addition() -> None:
     """Its activations add to those of the same work without a graph."""
     found = probe(device="cuda", raster=RasterCost(0.01), launches=CAPTURED)
     plans = [plan_of(found, steps_coarse=0, steps_sos=400, keep=keep) for keep in ((), ("launches",))]
@@ -352,7 +354,7 @@ def test_a_graph_has_memory_of_its_own() -> None:
     assert peaks[0] - peaks[1] == int(HEIGHT * WIDTH * 3500.0)  # pixels of one scale: 3000 bytes kept, 500 for work
 
 
-def test_the_measured_error_of_a_precision_is_said() -> None:
+def test_precision_line_states_the_measured_error() -> None:
     measured = probe(precision_ratio=2.0, gradient_error=Difference(0.1234, 0.98765))
     error = line(plan_of(measured, precision="bfloat16"), "precision").error  # type: ignore[union-attr]
     assert error.startswith("the first view's pixel gradient has a relative error of 0.12 (cosine 0.98765)")
@@ -363,14 +365,14 @@ def test_the_measured_error_of_a_precision_is_said() -> None:
 # --- the rasterizer ------------------------------------------------------------------------------------------------
 
 
-def test_on_the_cpu_weights_are_kept_where_they_pay() -> None:
+def test_weights_are_cached_on_a_cpu_if_that_pays_off() -> None:
     kept, once = plan_of(probe()), plan_of(probe(), steps_coarse=0, steps_sos=4 * VIEWS)
     assert (kept.rasterizer, kept.cached_weights) == ("cached", "float32")
-    assert said(kept, "blend weights") == (
+    assert text_of(kept, "blend weights") == (
         "all cached in float32: they take 1.00 GB for all views; 2.5 GB are available for blend weights"
     )
     assert (once.rasterizer, once.cached_weights) == ("cpu", "none")
-    assert said(once, "blend weights") == "recomputed in every step: a view is visited 4.0 times"
+    assert text_of(once, "blend weights") == "recomputed in every step: a view is visited 4.0 times"
     assert line(kept, "rasterizer") is line(once, "rasterizer") is None
     assert kept.prediction is not None
     assert plan_of(probe(), cached_weights="none").prediction.seconds == pytest.approx(  # type: ignore[union-attr]
@@ -389,21 +391,21 @@ def test_on_the_cpu_weights_are_kept_where_they_pay() -> None:
         ({"keep": ("blend-weights",)}, "none"),
     ],
 )
-def test_weights_that_do_not_fit(values: dict[str, Any], form: str) -> None:
+def test_weights_that_do_not_fit_are_cached_in_half_precision(values: dict[str, Any], form: str) -> None:
     plan = plan_of(probe(raster=RasterCost(0.3, None, 6 * GIGABYTE, 3 * GIGABYTE)), **values)
     assert plan.cached_weights == form
     assert plan.rasterizer == ("cpu" if form == "none" else "cached")
-    assert ("% of the views' cached" in said(plan, "blend weights")) is (form != "none")
+    assert ("% of the views' cached" in text_of(plan, "blend weights")) is (form != "none")
 
 
-def test_half_precision_where_only_that_fits() -> None:
+def test_half_precision_is_used_if_only_that_fits() -> None:
     plan = plan_of(probe(raster=RasterCost(0.3, None, 3 * GIGABYTE, 2 * GIGABYTE)))
     assert plan.cached_weights == "half"
-    assert said(plan, "blend weights").startswith("all cached in half precision: they take 2.00 GB")
+    assert text_of(plan, "blend weights").startswith("all cached in half precision: they take 2.00 GB")
     assert "1/2048" in line(plan, "blend weights").error  # type: ignore[union-attr]
 
 
-def test_on_a_gpu_the_first_rasterizer_that_works_renders() -> None:
+def test_first_working_rasterizer_is_chosen_on_a_gpu() -> None:
     assert uncached_rasterizer("cuda", {}) == "triton"
     assert uncached_rasterizer("cuda", {"triton": "no driver"}) == "cuda"
     assert uncached_rasterizer("cuda", {"triton": "no driver", "cuda": "no kernels"}) == "cpu"
@@ -418,11 +420,11 @@ def on_a_gpu(raster: RasterCost, **changes: Any) -> Probe:
 FASTER = RasterCost(0.01, 0.004, GIGABYTE, GIGABYTE // 2, 0.012)
 
 
-def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
+def test_weights_are_cached_on_a_gpu_if_measured_to_pay_off() -> None:
     kept, once = plan_of(on_a_gpu(FASTER)), plan_of(on_a_gpu(FASTER), steps_coarse=0, steps_sos=VIEWS)
     assert (kept.rasterizer, kept.uncached, kept.cached_weights) == ("cached", "triton", "float32")
-    assert said(kept, "rasterizer") == "Triton on the GPU, with cached blend weights: Triton works here"
-    assert said(kept, "blend weights") == (
+    assert text_of(kept, "rasterizer") == "Triton on the GPU, with cached blend weights: Triton works here"
+    assert text_of(kept, "blend weights") == (
         "all cached in float32: they take 1.00 GB for all views; 2.5 GB are available for blend weights; measured per "
         "view: 4 ms cached, 10 ms recomputed"
     )
@@ -431,8 +433,8 @@ def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
     assert once.prediction is not None
     assert once.prediction.seconds == pytest.approx(kept.prediction.seconds + 0.006)
     assert (once.rasterizer, once.uncached, once.cached_weights) == ("triton", "triton", "none")
-    assert said(once, "rasterizer") == "Triton on the GPU: Triton works here"
-    assert said(once, "blend weights") == (
+    assert text_of(once, "rasterizer") == "Triton on the GPU: Triton works here"
+    assert text_of(once, "blend weights") == (
         "recomputed in every step: a view is visited 1.0 times, but caching pays off from 2.0 visits; measured per "
         "view: 4 ms cached, 10 ms recomputed"
     )
@@ -448,69 +450,69 @@ def test_on_a_gpu_weights_are_kept_where_that_was_measured_to_pay() -> None:
         (RasterCost(0.01, None, 40 * GIGABYTE, 20 * GIGABYTE), "the weights of one view do not fit"),
     ],
 )
-def test_on_a_gpu_weights_are_not_kept_where_they_do_not_pay(raster: RasterCost, reason: str) -> None:
+def test_weights_are_not_cached_on_a_gpu_if_that_does_not_pay_off(raster: RasterCost, reason: str) -> None:
     plan, asked_for = plan_of(on_a_gpu(raster)), plan_of(on_a_gpu(raster), cached_weights="half")
     assert (plan.rasterizer, plan.cached_weights) == ("triton", "none")
-    assert said(plan, "blend weights") == f"recomputed in every step: {reason}"
+    assert text_of(plan, "blend weights") == f"recomputed in every step: {reason}"
     assert (asked_for.rasterizer, asked_for.uncached, asked_for.cached_weights) == ("cached", "triton", "half")
 
 
-def test_on_a_gpu_half_precision_where_only_that_fits() -> None:
+def test_half_precision_is_used_on_a_gpu_if_only_that_fits() -> None:
     plan = plan_of(on_a_gpu(replace(FASTER, bytes=4 * GIGABYTE, half_bytes=2 * GIGABYTE)))
     assert plan.cached_weights == "half"
     assert "1/2048" in line(plan, "blend weights").error  # type: ignore[union-attr]
     most = plan_of(on_a_gpu(replace(FASTER, bytes=10 * GIGABYTE, half_bytes=5 * GIGABYTE)))
-    assert said(most, "blend weights").startswith("50% of the views' cached in half precision")
+    assert text_of(most, "blend weights").startswith("50% of the views' cached in half precision")
 
 
-def test_gsplat_keeps_no_weights() -> None:
+def test_gsplat_caches_no_weights() -> None:
     second = probe(device="cuda", rasterizer="cuda", raster=RasterCost(0.01), problems={"triton": "no driver"})
     for plan in (plan_of(second), plan_of(second, cached_weights="float32")):
         assert (plan.rasterizer, plan.uncached, plan.cached_weights) == ("cuda", "cuda", "none")
         expected = "gsplat on the GPU: Triton cannot be used: no driver; gsplat works here"
-        assert said(plan, "rasterizer") == expected
-        assert said(plan, "blend weights") == "recomputed in every step: gsplat cannot cache them"
+        assert text_of(plan, "rasterizer") == expected
+        assert text_of(plan, "blend weights") == "recomputed in every step: gsplat cannot cache them"
 
 
-def test_on_a_gpu_without_a_rasterizer_weights_are_kept_on_the_cpu() -> None:
+def test_weights_are_cached_on_the_cpu_if_no_gpu_rasterizer_works() -> None:
     broken = probe(device="cuda", problems={"triton": "no driver", "cuda": "no kernels"})
     plan, once = plan_of(broken), plan_of(broken, cached_weights="none")
     why = "Triton cannot be used: no driver; gsplat cannot be used: no kernels"
     assert (plan.rasterizer, plan.uncached, plan.cached_weights) == ("cached", "cpu", "float32")
-    assert said(plan, "rasterizer") == f"on the CPU, with cached blend weights: {why}"
+    assert text_of(plan, "rasterizer") == f"on the CPU, with cached blend weights: {why}"
     assert (once.rasterizer, once.cached_weights) == ("cpu", "none")
-    assert said(once, "rasterizer") == f"on the CPU: {why}"
+    assert text_of(once, "rasterizer") == f"on the CPU: {why}"
 
 
-def test_the_reason_for_no_cached_weights_may_be_a_wish() -> None:
+def test_reason_for_uncached_weights_may_be_the_request() -> None:
     for values in ({"cached_weights": "none"}, {"keep": ("blend-weights",)}):
-        assert said(plan_of(probe(), **values), "blend weights").endswith("in every step: requested")
-        assert said(plan_of(on_a_gpu(FASTER), **values), "blend weights").endswith("in every step: requested")
+        assert text_of(plan_of(probe(), **values), "blend weights").endswith("in every step: requested")
+        assert text_of(plan_of(on_a_gpu(FASTER), **values), "blend weights").endswith("in every step: requested")
 
 
 # --- the schedule --------------------------------------------------------------------------------------------------
 
 
-def test_phase_1_is_left_out_where_views_have_one_scale() -> None:
+def test_phase_1_is_skipped_if_views_have_one_scale() -> None:
     assert plan_of(probe()).steps_coarse == 40
-    assert said(plan_of(probe()), "scales") == "2: the shorter side is halved until it is at most 511 pixels"
+    assert text_of(plan_of(probe()), "scales") == "2: the shorter side is halved until it is at most 511 pixels"
     small = probe(sizes=((300, 400),) * VIEWS, regions=[Rectangle(0, 0, 300, 400)] * VIEWS)
     assert plan_of(small).steps_coarse == 0
-    assert said(plan_of(small), "phase 1").startswith("its 40 steps are skipped")
+    assert text_of(plan_of(small), "phase 1").startswith("its 40 steps are skipped")
     assert plan_of(small, preset="paper").steps_coarse == 40
     mixed = probe(sizes=((300, 400), *((HEIGHT, WIDTH),) * 3))
-    assert said(plan_of(mixed), "scales").startswith("1 to 2")
+    assert text_of(plan_of(mixed), "scales").startswith("1 to 2")
 
 
-def test_early_stop_is_told_where_it_is_on() -> None:
-    assert "than 0.5% below" in said(plan_of(probe()), "early stop")
+def test_plan_mentions_early_stop_only_if_it_is_on() -> None:
+    assert "than 0.5% below" in text_of(plan_of(probe()), "early stop")
     assert line(plan_of(probe(), early_stop=False), "early stop") is None
 
 
 # --- ranks ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_gradient_is_expected_to_travel_for_what_views_show() -> None:
+def test_gradients_of_shown_gaussians_alone_are_communicated() -> None:
     def communication(**values: Any) -> float:
         found = plan_of(probe(ranks=2, link=Link(1e3, 1e-3), **values), keep=("ranks",)).prediction
         assert found is not None
@@ -522,10 +524,10 @@ def test_a_gradient_is_expected_to_travel_for_what_views_show() -> None:
 def test_ranks_take_part_as_the_link_allows() -> None:
     fast = plan_of(probe(ranks=4, link=Link(1e12, 1e-9)))
     assert fast.ranks == 4
-    assert said(fast, "ranks").startswith("all 4 take part, ")
+    assert text_of(fast, "ranks").startswith("all 4 take part, ")
     slow = plan_of(probe(ranks=4, link=Link(1e5, 1.0)))
     assert slow.ranks == 1
-    assert "would only add communication" in said(slow, "ranks")
+    assert "would only add communication" in text_of(slow, "ranks")
     assert plan_of(probe(ranks=4, link=Link(1e5, 1.0)), keep=("ranks",)).ranks == 4
     assert line(plan_of(probe()), "ranks") is None
     assert fast.prediction is not None
@@ -555,7 +557,7 @@ def test_measuring_takes_memory_but_changes_no_decision() -> None:
     assert (plain.measured, measured.measured) == (False, True)
 
 
-def test_a_gpu_holds_what_is_computed_with() -> None:
+def test_computed_data_count_as_gpu_memory() -> None:
     """The totals of process and GPU equal those of a process without a GPU, plus what only the GPU needs."""
     own = 2 * GIGABYTE
     for ranks in (1, 2):
@@ -586,7 +588,7 @@ def test_the_same_probe_gives_the_same_plan() -> None:
             assert values[0] == values[1], field.name
 
 
-def test_nothing_changes_a_plan() -> None:
+def test_plans_are_immutable() -> None:
     plan = plan_of(probe())
     for field in dataclasses.fields(Plan):
         with pytest.raises(FrozenInstanceError):
@@ -596,7 +598,7 @@ def test_nothing_changes_a_plan() -> None:
     hash((plan.decisions, plan.covered, plan.prediction))  # hashable, so nothing in them can change
 
 
-def test_decisions_come_in_the_order_in_which_people_read_them() -> None:
+def test_decisions_have_a_fixed_order() -> None:
     found = probe(
         covered=[0, 1, 2],
         used_degree=0,

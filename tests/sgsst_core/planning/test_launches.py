@@ -35,7 +35,7 @@ def counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counts]:
         yield found
 
 
-def test_both_ways_are_timed(counts: Counts, tiny_weights: BackboneWeights) -> None:
+def test_launches_are_timed_with_and_without_a_graph(counts: Counts, tiny_weights: BackboneWeights) -> None:
     loss = SosLoss(FeatureNetwork(tiny_weights, device="cuda"), coarsest=16)
     counts.clear()
     found = launch_cost(loss, SIZE)
@@ -47,7 +47,7 @@ def test_both_ways_are_timed(counts: Counts, tiny_weights: BackboneWeights) -> N
     assert LAUNCH_RUNS + 1 in replays  # including the run after the capture
 
 
-def test_what_cannot_be_timed_has_a_reason(
+def test_launch_cost_without_graph_states_the_problem(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     network = FeatureNetwork(tiny_weights, device="cuda")
@@ -66,9 +66,7 @@ def test_what_cannot_be_timed_has_a_reason(
         assert launch_cost(SosLoss(network), SIZE).problem == "RuntimeError: not here"
 
 
-def test_a_job_measures_where_views_come_often_and_follows_its_plan(
-    counts: Counts, tiny_weights: BackboneWeights
-) -> None:
+def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_weights: BackboneWeights) -> None:
     for steps, keep in ((LEAST_GRAPH_VISITS, ()), (LEAST_GRAPH_VISITS, ("launches",)), (LEAST_GRAPH_VISITS - 1, ())):
         settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16, keep=keep)
         stylizer = Stylizer.planned(

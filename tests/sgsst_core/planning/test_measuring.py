@@ -21,7 +21,7 @@ from sgsst_core.planning.measuring import (
 )
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.settings import make_settings
-from tests.sgsst_core.planning.test_decide import probe, said
+from tests.sgsst_core.planning.test_decide import probe, text_of
 
 #: Cost for 4 million Gaussians: every first visit of a view takes long.
 SLOW = RasterCost(2.0, 1.0, 10**9, 10**9 // 2, first_seconds=5.0)
@@ -39,7 +39,7 @@ def expected(plan: Plan) -> Prediction:
 
 
 @pytest.mark.parametrize("total", [1, 2, 3, 24, 300, 20_000])
-def test_every_level_but_the_last_measures_the_end_and_no_more_than_the_one_before(total: int) -> None:
+def test_levels_measure_the_end_and_never_more_than_the_level_before(total: int) -> None:
     prices = Prices(3.0, 0.5, 0.25)
     costs = [prices.of(level, len(level.moments(total))) for level in LEVELS]
     assert all(level.moments(total)[-1] == total for level in LEVELS[:NOTHING])
@@ -51,7 +51,7 @@ def test_every_level_but_the_last_measures_the_end_and_no_more_than_the_one_befo
         assert poorer.views <= richer.views
 
 
-def test_the_first_level_that_is_allowed_is_taken() -> None:
+def test_first_allowed_level_is_chosen() -> None:
     """Over 300 steps, a view costs 1 s to prepare and 0.5 s per moment and for the judgment, and a moment 0.25 s."""
     prices = Prices(1.0, 0.5, 0.25)
     costs = [21.75, 15.0, 8.0, 5.5, 3.0, 2.25, 0.0]
@@ -62,7 +62,7 @@ def test_the_first_level_that_is_allowed_is_taken() -> None:
     assert choose_level(prices, 1e9, 300, first=3) == 3  # the plan's level is the minimum
 
 
-def test_small_jobs_are_measured_for_half_a_minute_and_others_for_their_share() -> None:
+def test_measuring_may_take_half_a_minute_or_its_fraction_of_the_steps() -> None:
     steps = Prediction(1.0, 1.0, 0, losses=3.0, measuring=50.0, job=1050.0)
     assert novel_view_seconds(0.1, steps) == 80.0 - 3.0
     assert novel_view_seconds(0.001, steps) == 0.8 * LEAST_ALLOWED - 3.0
@@ -70,7 +70,7 @@ def test_small_jobs_are_measured_for_half_a_minute_and_others_for_their_share() 
     assert novel_view_seconds(0.0, steps) == 0.0
 
 
-def test_the_loss_has_half_of_what_is_allowed_and_one_view_at_least() -> None:
+def test_loss_gets_half_of_the_allowed_time_and_at_least_one_view() -> None:
     for steps, price, found in ((0.0, 3.0, 4), (0.0, 3.01, 2), (0.0, 6.0, 2), (0.0, 6.01, 1), (0.0, 1e9, 1)):
         assert choose_loss_views(0.1, steps, price, 97) == found
     assert choose_loss_views(0.1, 3000.0, 6.01, 97) == 4
@@ -78,39 +78,39 @@ def test_the_loss_has_half_of_what_is_allowed_and_one_view_at_least() -> None:
     assert choose_loss_views(0.0, 3000.0, 3.0, 97) == 4
 
 
-def test_a_target_is_a_share_of_the_loss_on_the_same_views_whatever_they_take() -> None:
+def test_target_loss_fixes_the_loss_views_regardless_of_timings() -> None:
     assert plan_of(VERY_SLOW, steps_sos=4).loss_views == 1
     assert plan_of(VERY_SLOW, steps_sos=4, target_loss=0.1).loss_views == 4
 
 
-def test_views_that_no_step_has_visited_make_the_loss_dearer() -> None:
+def test_unvisited_views_make_the_loss_more_expensive() -> None:
     """Two steps visit two of four views."""
     all_, half = (expected(plan_of(RasterCost(0.1, first_seconds=0.4), steps_sos=steps)) for steps in (4, 2))
     assert all_.losses == 2 * all_.evaluation
     assert half.losses == pytest.approx(2 * half.evaluation + 4 * half.first_visit / 2)
 
 
-def test_a_plan_keeps_to_the_share_where_a_level_does() -> None:
+def test_planned_measuring_stays_within_the_allowed_time() -> None:
     for steps in (16, 200, 2000, 20_000):
         plan = plan_of(SLOW, steps_sos=steps)
         found = expected(plan)
         allowed = max(LEAST_ALLOWED, 0.1 * (found.job - found.measuring))
         assert found.measuring <= allowed
-        assert f"{found.measuring:.2g} s in addition to" in said(plan, "measuring")
+        assert f"{found.measuring:.2g} s in addition to" in text_of(plan, "measuring")
     assert [plan_of(SLOW, steps_sos=steps).measuring for steps in (16, 20_000)] == [NOTHING, 0]
-    assert said(plan_of(SLOW), "measuring").startswith("the loss before and after on 4 views only: about ")
+    assert text_of(plan_of(SLOW), "measuring").startswith("the loss before and after on 4 views only: about ")
     least = expected(plan_of(VERY_SLOW, steps_sos=4))
     assert least.measuring == least.losses > LEAST_ALLOWED
-    assert "at 7 moments up to 4 novel views" in said(plan_of(RasterCost(0.01), steps_sos=300), "measuring")
+    assert "at 7 moments up to 4 novel views" in text_of(plan_of(RasterCost(0.01), steps_sos=300), "measuring")
 
 
-def test_nothing_is_measured_without_a_share() -> None:
+def test_zero_fraction_measures_no_novel_views() -> None:
     plan = plan_of(SLOW, measure=0.0)
-    assert said(plan, "measuring").startswith("the loss before and after on 4 views only: requested")
+    assert text_of(plan, "measuring").startswith("the loss before and after on 4 views only: requested")
     assert expected(plan).measuring == expected(plan).losses == 2 * expected(plan).evaluation > 0
 
 
-def test_a_job_is_its_steps_its_first_visits_and_measuring() -> None:
+def test_job_time_adds_steps_first_visits_and_measuring() -> None:
     """All four views are visited in each phase.
 
     The first visits compute cached weights and use the survey's intersections.
@@ -127,6 +127,6 @@ def test_a_job_is_its_steps_its_first_visits_and_measuring() -> None:
     assert limited.job - limited.measuring == pytest.approx(5.0)
 
 
-def test_an_iteration_takes_as_long_as_its_views() -> None:
+def test_iteration_time_is_proportional_to_its_views() -> None:
     one, three = (expected(plan_of(SLOW, views_per_step=views)) for views in (1, 3))
     assert (three.seconds, three.seconds_coarse) == pytest.approx((3 * one.seconds, 3 * one.seconds_coarse))

@@ -24,7 +24,7 @@ from tests.sgsst_core.planning.test_view_costs import plan_of as plan_of_raster
 ROOM = 10 * GIGABYTE // 4
 
 
-def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
+def test_memory_grows_with_gaussians_and_cached_data_of_views() -> None:
     """Five of six Gaussians are rendered, from a copy of the scene of degree 3.
 
     Its intersections replace those of the survey.
@@ -37,7 +37,7 @@ def test_memory_grows_with_the_gaussians_and_what_is_kept_of_views() -> None:
     assert expected(HUGE).peak_bytes - plain == 5 * SHAPE_BYTES, "what does not fit is built anew, and not kept"
 
 
-def test_tile_intersections_of_held_out_views_take_what_the_jobs_leave() -> None:
+def test_intersections_of_novel_views_get_the_remaining_budget() -> None:
     plain = expected(LARGE).peak_bytes
     for steps in (40, 400, 4000):
         for size in (10**8, 10**9):
@@ -51,7 +51,7 @@ def test_tile_intersections_of_held_out_views_take_what_the_jobs_leave() -> None
             assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + isects + gaussians + warps + built
 
 
-def test_views_that_no_step_comes_to_take_nothing() -> None:
+def test_unvisited_views_take_no_memory() -> None:
     """A single step visits one of four views, so it needs a quarter of the memory for content and for colors."""
     every, one = expected(LARGE, keep=("unseen",)), expected(LARGE, steps_sos=1, keep=("unseen",))
     without = [expected(LARGE, steps_sos=steps, keep=("unseen", "content")) for steps in (40, 1)]
@@ -61,7 +61,7 @@ def test_views_that_no_step_comes_to_take_nothing() -> None:
     assert every.peak_bytes - one.peak_bytes == colors + content * 3 // 4
 
 
-def test_weights_take_the_room_of_the_surveys_lists() -> None:
+def test_weights_replace_the_tile_intersections_of_the_survey() -> None:
     """Weights and intersections share one budget.
 
     Intersections of views whose weights do not fit may take another sixteenth of the memory.
@@ -75,7 +75,7 @@ def test_weights_take_the_room_of_the_surveys_lists() -> None:
     assert rises == [10**9 - isects, ROOM - isects, ROOM + 300_000_000 - isects]
 
 
-def test_the_largest_of_what_comes_and_goes_counts() -> None:
+def test_largest_temporary_allocation_counts() -> None:
     """With many Gaussians, the peak is the computation of a view's intersections, or the final neighbor search."""
     few = expected(LARGE)
     many = plan_of(probe(gaussians=10**8, used_degree=0, held_degree=0)).prediction
@@ -83,7 +83,7 @@ def test_the_largest_of_what_comes_and_goes_counts() -> None:
     assert many.peak_bytes - few.peak_bytes > 10**8 * min(BUILDING_BYTES, SEARCH_BYTES) - 10 * GIGABYTE
 
 
-def test_the_reference_computes_in_float32() -> None:
+def test_float32_reference_needs_memory_of_its_own() -> None:
     """If the job is not in float32, its activations and view contents are needed a second time."""
     found = probe(precision_ratio=2.0)
     rises = []

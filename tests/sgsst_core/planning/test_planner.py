@@ -73,7 +73,7 @@ def test_each_item_alone_changes_nothing(tiny_weights: BackboneWeights, item: It
     assert (other.plan.cached_weights == "none") == (item == "blend-weights")
 
 
-def test_blend_weights_are_kept_as_memory_and_visits_allow(tiny_weights: BackboneWeights) -> None:
+def test_blend_weights_are_cached_as_memory_and_visits_allow(tiny_weights: BackboneWeights) -> None:
     scene, views = wall(), cameras(3)
     assert make(scene, views, tiny_weights, steps_sos=14).plan.cached_weights == "none"  # fewer than 5 visits per view
     lean = make(scene, views, tiny_weights, steps_sos=30)
@@ -86,7 +86,7 @@ def test_blend_weights_are_kept_as_memory_and_visits_allow(tiny_weights: Backbon
     assert "1/2048" in decision.error
 
 
-def test_rendering_without_unseen_gaussians_is_bitwise_the_same(tiny_weights: BackboneWeights) -> None:
+def test_rendering_without_unseen_gaussians_is_bit_identical(tiny_weights: BackboneWeights) -> None:
     scene, views = behind(wall(sh_degree=2), 100), cameras(3)
     lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
     assert len(lean.sh_dc) < len(full.sh_dc) == len(scene)
@@ -142,7 +142,7 @@ def test_unseen_gaussians_follow_their_seen_neighbors() -> None:
     assert neighbors_change(means, change, torch.ones(4, dtype=torch.float64)).shape == (0, 3)
 
 
-def test_unseen_gaussians_follow_the_same_neighbors_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neighbors_of_unseen_gaussians_do_not_depend_on_the_chunk_size(monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(3)
     means, change = torch.randn(400, 3, generator=generator), torch.randn(400, 3, generator=generator)
     weights = torch.rand(400, generator=generator).double() * (torch.arange(400) % 4 > 0)

@@ -29,7 +29,7 @@ def error_of(network: FeatureNetwork, weights: BackboneWeights, side: int = 384)
     return gradient_error(replace(context, network=network), cameras(1)[0], side)
 
 
-def test_ten_bits_have_an_error_of_a_thousandth_but_for_flips(vgg16_weights: BackboneWeights) -> None:
+def test_tf32_gradient_error_is_a_thousandth_without_flipped_decisions(vgg16_weights: BackboneWeights) -> None:
     """Most of the error of a lower precision comes from flipped ReLU and max-pool decisions.
 
     The number of flips is proportional to the rounding error, so the gradient error is proportional to its square root.
@@ -47,7 +47,7 @@ def test_ten_bits_have_an_error_of_a_thousandth_but_for_flips(vgg16_weights: Bac
     assert 0.95 < bfloat16.cosine < flipping.cosine < deciding.cosine <= 1
 
 
-def test_float32_is_not_compared_and_tf32_is_float32_on_a_processor(tiny_weights: BackboneWeights) -> None:
+def test_float32_has_no_gradient_error_and_tf32_on_a_cpu_is_float32(tiny_weights: BackboneWeights) -> None:
     assert error_of(FeatureNetwork(tiny_weights), tiny_weights) is None
     assert error_of(FeatureNetwork(tiny_weights, tf32=True), tiny_weights) == Difference(0.0, pytest.approx(1.0))  # type: ignore[arg-type]
 
@@ -61,7 +61,7 @@ def test_rounding_is_to_nearest_and_even() -> None:
 # --- what it gains -------------------------------------------------------------------------------------------------
 
 
-def test_a_processor_is_timed_for_what_it_has() -> None:
+def test_convolutions_are_timed_in_available_precisions() -> None:
     assert convolution_ratio("bfloat16", "cpu") > 0
     assert precision_ratio("bfloat16", "cpu", ALONE) is not None
     assert precision_ratio("float32", "cpu", ALONE) is precision_ratio("tf32", "cpu", ALONE) is None
@@ -93,7 +93,7 @@ def test_repetitions_take_long_enough(least: float, runs: list[int]) -> None:
     assert made == runs
 
 
-def test_tf32_on_a_processor_is_the_same_job(tiny_weights: BackboneWeights) -> None:
+def test_tf32_on_a_cpu_gives_the_float32_job(tiny_weights: BackboneWeights) -> None:
     asked, plain = (
         Stylizer.planned(ball(300), cameras(2), style(), make_settings(precision=name), weights=tiny_weights)
         for name in ("tf32", "float32")

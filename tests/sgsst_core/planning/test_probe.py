@@ -36,7 +36,7 @@ def equipped(weights: BackboneWeights, scene: Scene, **values: Any) -> PlanningC
     return equip(scene, cameras(3), make_settings(**values), weights, ALONE)
 
 
-def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
+def test_probe_contains_the_measured_facts(tiny_weights: BackboneWeights) -> None:
     scene = replace(wall(), sh_rest=torch.zeros(len(wall()), 15, 3))
     planning_context = equipped(tiny_weights, scene, memory_limit=10**9)
     probe = measure(planning_context, survey_views(scene, planning_context.cameras, planning_context.rasterizer), FREE)
@@ -61,7 +61,7 @@ def test_a_probe_holds_what_there_is(tiny_weights: BackboneWeights) -> None:
     assert probe.process_bytes > 10**7
 
 
-def test_matching_features_is_measured_apart(tiny_weights: BackboneWeights) -> None:
+def test_feature_matching_is_timed_separately(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     survey = survey_views(scene, cameras(3), make_rasterizer("cpu", scene))
     plain, nnfm, mixed = (
@@ -74,7 +74,7 @@ def test_matching_features_is_measured_apart(tiny_weights: BackboneWeights) -> N
     assert (mixed.vector_channels, mixed.deepest) == (48, "relu5_1")
 
 
-def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: BackboneWeights) -> None:
+def test_synthetic_images_are_as_large_as_the_device_needs(tiny_weights: BackboneWeights) -> None:
     """On a GPU, images are as large as the memory for their activations allows.
 
     `measure_rate` also limits them to the size of the views.
@@ -88,7 +88,7 @@ def test_pictures_for_measuring_are_as_large_as_the_device_needs(tiny_weights: B
         assert (_side(planning_context, loss), _side(on_gpu, loss)) == (on_cpu, with_gpu)
 
 
-def test_the_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first run is a warm-up; two runs with gradient and two without follow."""
     taken = iter([1.0, 5.0, 3.0, 4.0, 2.0])
 
@@ -102,7 +102,7 @@ def test_the_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, mo
     assert next(taken, None) is None
 
 
-def test_the_survey_counts_what_a_view_shows() -> None:
+def test_survey_counts_the_gaussians_that_a_view_shows() -> None:
     scene, views = wall(), [*cameras(2), blind_camera()]
     rasterizer = make_rasterizer("reference", scene)
     ones = torch.ones(views[0].height, views[0].width, 3)
@@ -111,7 +111,7 @@ def test_the_survey_counts_what_a_view_shows() -> None:
     assert 0 < sum(counts) < 2 * len(scene)
 
 
-def test_the_survey_tells_how_far_it_is() -> None:
+def test_survey_reports_its_progress() -> None:
     scene, told = wall(), list[PlanningProgress]()
     survey_views(scene, cameras(3), make_rasterizer("cpu", scene), show=told.append)
     assert [(progress.done, progress.total) for progress in told] == [(0, 3), (1, 3), (2, 3), (3, 3)]
@@ -122,7 +122,7 @@ def test_the_survey_tells_how_far_it_is() -> None:
     assert [progress.fraction for progress in told] == [0, 1 / 3, 2 / 3, 1]
 
 
-def test_the_other_ranks_are_taken_to_be_as_far() -> None:
+def test_progress_assumes_that_other_ranks_are_as_fast() -> None:
     assert progress_of(0, 5, 2, 0.1) == PlanningProgress(0, 5, None)
     assert progress_of(2, 5, 2, 4.0) == PlanningProgress(4, 5, 1.0)
     assert progress_of(3, 5, 2, 6.0) == PlanningProgress(5, 5, 0.0)
@@ -134,7 +134,7 @@ def test_a_plan_needs_cameras_that_see_something(tiny_weights: BackboneWeights) 
             make_plan(wall(), views, make_settings(), weights=tiny_weights)
 
 
-def test_an_earlier_survey_takes_the_place_of_a_look(tiny_weights: BackboneWeights) -> None:
+def test_earlier_survey_is_reused(tiny_weights: BackboneWeights) -> None:
     scene, settings, told = wall(), make_settings(), list[PlanningProgress]()
     first, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
     second, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights, survey=first.survey, show=told.append)
@@ -143,26 +143,26 @@ def test_an_earlier_survey_takes_the_place_of_a_look(tiny_weights: BackboneWeigh
     assert torch.equal(second.seen, first.seen)
 
 
-@pytest.mark.parametrize("kept", ["none", "float32"])
-def test_what_was_built_for_the_whole_scene_is_handed_on(tiny_weights: BackboneWeights, kept: str) -> None:
-    """The probe passes on the network, and the tile intersections unless pruning changes their Gaussian indices."""
-    for scene, handed_on in ((ball(), True), (wall(), False)):
-        settings = make_settings(cached_weights=kept)
+@pytest.mark.parametrize("cached", ["none", "float32"])
+def test_job_reuses_objects_of_the_planning_context(tiny_weights: BackboneWeights, cached: str) -> None:
+    """The probe passes on the network, and the tile intersections if every Gaussian is rendered."""
+    for scene, reused in ((ball(), True), (wall(), False)):
+        settings = make_settings(cached_weights=cached)
         plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)
         inputs = (plan, scene, cameras(2), style(), settings)
         used, fresh = (
-            Stylizer(*inputs, weights=tiny_weights, planning_context=shop) for shop in (planning_context, None)
+            Stylizer(*inputs, weights=tiny_weights, planning_context=context) for context in (planning_context, None)
         )
-        assert bool(plan.seen.all()) is handed_on
+        assert bool(plan.seen.all()) is reused
         assert used.network is planning_context.network
         rasterizer = used.views.rasterizer
         own = rasterizer if isinstance(rasterizer, CpuRasterizer) else rasterizer.uncached  # type: ignore[attr-defined]
-        assert (own is planning_context.rasterizer) is handed_on
+        assert (own is planning_context.rasterizer) is reused
         assert used.run_step().loss == fresh.run_step().loss
         assert torch.equal(used.sh_dc, fresh.sh_dc)
 
 
-def test_a_rasterizer_that_is_named_is_measured_and_used(tiny_weights: BackboneWeights) -> None:
+def test_requested_rasterizer_is_measured_and_used(tiny_weights: BackboneWeights) -> None:
     settings = make_settings(cached_weights="none")
     stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights, rasterizer="reference")
     assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == "reference"

@@ -21,18 +21,18 @@ def work(height: int = 720, width: int = 1280, scales: int = 2) -> IterationWork
     return IterationWork(pieces, halo=64, pixel=1e-6, raster=0.1, fixed=0.01, gaussians=50_000)
 
 
-def test_one_rank_tells_nobody_anything() -> None:
+def test_one_rank_has_no_communication() -> None:
     assert work().communication(1, SLOW) == 0
     assert work().seconds(1, SLOW) == pytest.approx(1e-6 * 1.25 * 720 * 1280 + 0.11)
 
 
-def test_links_are_counted_as_rings_move_bytes() -> None:
+def test_link_times_follow_from_ring_algorithms() -> None:
     link = Link(bandwidth=1e9, latency=1e-4)
     assert link.all_gather(4_000_000, 4) == pytest.approx(3 * (1e-4 + 1e-3))
     assert link.all_reduce(4_000_000, 4) == pytest.approx(2 * link.all_gather(4_000_000, 4))
 
 
-def test_a_gradient_travels_for_what_the_view_shows() -> None:
+def test_gradients_of_gaussians_that_the_view_shows_are_communicated() -> None:
     def sent(shown: float | None) -> float:
         return replace(work(), shown=shown).communication(4, SLOW)
 
@@ -41,7 +41,7 @@ def test_a_gradient_travels_for_what_the_view_shows() -> None:
     assert sent(None) - sent(20_000) == pytest.approx(saved)
 
 
-def test_bytes_that_are_sent_are_those_that_ranks_wait_for_but_for_statistics_of_other_scales() -> None:
+def test_ranks_wait_for_the_sent_bytes_except_statistics_of_other_scales() -> None:
     one_scale = replace(work(scales=1), shown=20_000)
     link = Link(1e6, 0.0)
     for ranks in (2, 3, 4):
@@ -51,14 +51,14 @@ def test_bytes_that_are_sent_are_those_that_ranks_wait_for_but_for_statistics_of
     assert set(work().sent(1).values()) == {0}
 
 
-def test_groups_add_up_whole_gradients() -> None:
+def test_groups_sum_complete_gradients() -> None:
     """The model cannot know which Gaussians the views of a step show together."""
     phases = [(0, [work()]), (10, [replace(work(), shown=1)])]
     found = choose_ranks(phases, 2, 2, SLOW)
     assert found.seconds[2] - found.seconds[1] / 2 == pytest.approx(10 * SLOW.all_reduce(12 * 50_000, 2))
 
 
-def test_a_free_link_makes_every_rank_worth_it_and_a_slow_one_none() -> None:
+def test_free_link_uses_all_ranks_and_slow_link_one() -> None:
     phases = [(10, [work()]), (20, [work()])]
     free = choose_ranks(phases, 1, 4, FREE)
     assert free.ranks == 4
@@ -69,26 +69,26 @@ def test_a_free_link_makes_every_rank_worth_it_and_a_slow_one_none() -> None:
     assert slow.speed_up == 1
 
 
-def test_further_ranks_must_be_worth_it() -> None:
+def test_additional_ranks_must_save_time() -> None:
     """For a view that is all halo, more ranks only speed up the rasterizer."""
     small = replace(work(40, 40, 1), raster=1e-6)
     assert choose_ranks([(0, [small]), (10, [small])], 1, 8, FREE).ranks == 1
 
 
-def test_groups_take_views_side_by_side() -> None:
+def test_groups_process_views_in_parallel() -> None:
     """Two views per step on two ranks need no halos, so they are twice as fast apart from the sum of colors."""
     phases = [(0, [work()]), (10, [work()])]
     found = choose_ranks(phases, 2, 2, FREE)
     assert found.speed_up == pytest.approx(2.0)
 
 
-def test_many_ranks_are_looked_at_in_steps() -> None:
+def test_large_numbers_of_ranks_are_tried_in_increasing_steps() -> None:
     found = choose_ranks([(0, [work()]), (1, [work()])], 1, 64, FREE)
     assert {1, 2, 3, 4, 8, 64} <= set(found.seconds)
     assert len(found.seconds) < 25
 
 
-def test_what_does_not_fit_the_memory_goes_forward_twice() -> None:
+def test_pixels_that_do_not_fit_pass_forward_twice() -> None:
     """Two ranks on one machine have half of its memory each, and cache the activations of all scales."""
     pixels = 1.25 * 720 * 1280
     roomy = replace(work(), forward=1e-6, held=2 * pixels, working=0.1, sharing=2)

@@ -25,7 +25,7 @@ from sgsst_core.settings import make_settings
 from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
 
 
-def test_axes_in_a_view_add_up_to_the_projected_covariance() -> None:
+def test_projected_axes_add_up_to_the_projected_covariance() -> None:
     scene, view = cloud(300), camera(pose=turned_pose())
     found = project(scene, view)
     rows = torch.from_numpy(found.gaussians).long()
@@ -45,7 +45,7 @@ def test_axes_in_a_view_add_up_to_the_projected_covariance() -> None:
     assert torch.allclose(reach, scene.scales[rows[inside]].double().exp().amax(dim=1) / depth)
 
 
-def test_footprints_are_means_over_what_views_show() -> None:
+def test_footprints_are_means_weighted_by_visibility() -> None:
     scene, views = cloud(200), [camera(pose=turned_pose()), camera(40, 30, focal=30.0)]
     rasterizer, prints = CpuRasterizer(scene), Footprints(scene)
     weights = [rasterizer.survey(view)[1] for view in views]
@@ -62,13 +62,13 @@ def test_footprints_are_means_over_what_views_show() -> None:
     assert torch.allclose(prints.lengths[both], (squares / total[both, None]).sqrt())
     assert bool((prints.lengths[total == 0] == 0).all())
     other = Footprints(scene)
-    other.take(*prints.parts)
+    other.replace(*prints.sums)
     assert torch.equal(other.lengths, prints.lengths)
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.floats(1, 16), st.floats(0.1, 300))
-def test_there_are_never_more_than_the_budget(seed: int, factor: float, largest: float) -> None:
+def test_chosen_pieces_never_exceed_the_budget(seed: int, factor: float, largest: float) -> None:
     generator = torch.Generator().manual_seed(seed)
     count = 50
     lengths = largest * torch.rand(count, 3, generator=generator, dtype=torch.float64) ** 3
@@ -87,7 +87,7 @@ def test_there_are_never_more_than_the_budget(seed: int, factor: float, largest:
     assert same == size
 
 
-def test_where_the_budget_ends_those_that_disagree_most_go_first() -> None:
+def test_gaussians_that_disagree_most_are_split_first_within_the_budget() -> None:
     lengths = torch.tensor([[10.0, 0.1, 0.1]], dtype=torch.float64).repeat(6, 1)
     weights = torch.full((6,), 1e4, dtype=torch.float64)
     cancels = torch.tensor([1.0, 5.0, 2.0, 0.5, 4.0, 3.0], dtype=torch.float64)
@@ -103,19 +103,19 @@ def test_where_the_budget_ends_those_that_disagree_most_go_first() -> None:
     assert size is None
 
 
-def test_what_hardly_shows_or_has_one_color_or_is_close_is_not_cut() -> None:
+def test_faint_uniform_or_close_gaussians_are_not_candidates() -> None:
     prints = Footprints(cloud(5))
     prints.weights = torch.tensor([100.0, 1.0, 100.0, 100.0, 100.0], dtype=torch.float64)
     prints.reach = torch.tensor([0.1, 0.1, 1.9, 0.1, 0.1], dtype=torch.float64)
-    there_is = torch.ones(5, dtype=torch.float64)
+    magnitude = torch.ones(5, dtype=torch.float64)
     cancels = torch.tensor([0.9, 0.9, 0.9, 0.01, 0.9], dtype=torch.float64)
     splittable = torch.tensor([True, True, True, True, False])
-    assert candidates(prints, splittable, cancels, there_is).tolist() == [True, False, False, False, False]
+    assert candidates(prints, splittable, cancels, magnitude).tolist() == [True, False, False, False, False]
     assert not candidates(prints, splittable, torch.zeros(5), torch.zeros(5)).any(), "no gradient asks for anything"
 
 
 @pytest.mark.parametrize("taken_back", [0, 7])
-def test_a_plan_tells_what_was_cut_and_what_that_costs(taken_back: int) -> None:
+def test_plan_line_states_splits_and_their_image_error(taken_back: int) -> None:
     pieces = torch.ones(1000, 3, dtype=torch.uint8)
     pieces[:10, 0] = 5
     made = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, taken_back)

@@ -54,7 +54,7 @@ def mixtures(children: Scene, parents: Tensor, count: int) -> tuple[Tensor, Tens
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_an_axis_in_pieces_has_its_variance_and_nearly_its_density(number: int) -> None:
+def test_split_axis_has_the_parents_variance_and_nearly_its_density(number: int) -> None:
     division = split_axis(number)
     assert len(division.offsets) == len(division.weights) == number
     assert division.weights.sum() == pytest.approx(1, abs=1e-14)
@@ -75,9 +75,7 @@ def test_an_axis_in_pieces_has_its_variance_and_nearly_its_density(number: int) 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**31), st.lists(st.sampled_from(NUMBERS[:8]), min_size=3, max_size=3), st.floats(-8, 2))
-def test_the_mixture_of_the_children_has_mean_and_covariance_of_the_parent(
-    seed: int, numbers: list[int], log_scale: float
-) -> None:
+def test_children_have_the_parents_mean_and_covariance(seed: int, numbers: list[int], log_scale: float) -> None:
     scene = cloud(30, seed=seed, log_scale=log_scale)
     pieces = torch.tensor(numbers, dtype=torch.uint8).repeat(30, 1)
     pieces[::3] = 1
@@ -92,7 +90,7 @@ def test_the_mixture_of_the_children_has_mean_and_covariance_of_the_parent(
     assert bool((apart < 1e-5 * size + 10 * rounding * size.sqrt() + rounding**2).all())
 
 
-def test_what_is_not_cut_and_all_that_is_no_shape_is_the_parents_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unsplit_gaussians_and_inherited_properties_are_bit_identical(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_CHUNK", 50)
     scene = cloud(40, degree=2)
     pieces = torch.ones(40, 3, dtype=torch.uint8)
@@ -110,7 +108,7 @@ def test_what_is_not_cut_and_all_that_is_no_shape_is_the_parents_to_the_bit(monk
     assert split(scene, torch.ones(40, 3, dtype=torch.uint8)) is scene
 
 
-def test_extreme_gaussians_have_finite_children_or_stay_whole() -> None:
+def test_extreme_gaussians_have_finite_children_or_are_not_split() -> None:
     """Cases are needles, points, huge and coincident Gaussians, and opacities of 0 and 1."""
     count = 9
     scene = replace(
@@ -148,13 +146,13 @@ def test_extreme_gaussians_have_finite_children_or_stay_whole() -> None:
 
 
 @pytest.mark.parametrize("pieces", [[[2, 1, 1]], [[0, 1, 1]], [[33, 1, 1]], [[1, 1, 1], [1, 1, 1]]])
-def test_other_numbers_of_pieces_are_refused(pieces: list[list[int]]) -> None:
+def test_invalid_piece_counts_are_refused(pieces: list[list[int]]) -> None:
     with pytest.raises(ValueError, match="pieces must be"):
         split(single((0, 0, 3)), torch.tensor(pieces, dtype=torch.uint8))
 
 
 @pytest.mark.parametrize(("opacity", "least"), [(0.1, 45.0), (0.4, 40.0), (0.7, 33.0)])
-def test_a_gaussian_in_pieces_looks_as_before(opacity: float, least: float) -> None:
+def test_split_gaussian_looks_like_its_parent(opacity: float, least: float) -> None:
     """A single white Gaussian on black is the hardest case, because nothing around it hides a change."""
     scene = single((0.1, 0, 4.0), opacity=opacity, scales=(0.5, 0.3, 0.02), quat=(0.9, 0.1, 0.1, 0.3))
     pieces = torch.tensor([[6, 4, 1]], dtype=torch.uint8)
@@ -165,7 +163,7 @@ def test_a_gaussian_in_pieces_looks_as_before(opacity: float, least: float) -> N
     assert -10 * math.log10(error) > least
 
 
-def test_lengths_are_cut_to_a_size_with_the_fewest_pieces() -> None:
+def test_lengths_are_split_to_a_size_with_the_fewest_pieces() -> None:
     lengths = torch.tensor([[1.0, 5.0, 0.0], [3.0, 1e9, torch.inf], [2.0, 2.0 + 1e-9, 4.0]], dtype=torch.float64)
     pieces = pieces_to(lengths, 2.0)
     assert pieces.dtype == torch.uint8
@@ -180,7 +178,7 @@ def test_lengths_are_cut_to_a_size_with_the_fewest_pieces() -> None:
         assert fewer is None or length / ratio_of(fewer) > 2.0
 
 
-def test_harmonics_that_stay_in_the_file_are_the_parents(tmp_path: Path) -> None:
+def test_children_inherit_harmonics_that_stay_in_the_file(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene.ply", cloud(300, degree=3))
     pieces = torch.ones(300, 3, dtype=torch.uint8)
     pieces[::7, 1] = 3

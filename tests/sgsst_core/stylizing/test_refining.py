@@ -55,12 +55,12 @@ def made(weights: BackboneWeights, factor: float, scene: Scene | None = None) ->
     return found
 
 
-def test_disagreement_is_what_cancels_pixel_by_pixel() -> None:
+def test_disagreement_is_the_gradient_that_cancels_between_pixels() -> None:
     scene, view = cloud(60), camera(20, 14, focal=18.0)
     generator = torch.Generator().manual_seed(0)
     gradient = torch.randn(14, 20, 3, generator=generator, dtype=torch.float64)
     reference = ReferenceRasterizer(scene)
-    cancels, there_is = disagreement(reference, view, gradient)
+    cancels, magnitude = disagreement(reference, view, gradient)
     operator = []  # blend weights [pixels, N], pixel by pixel
     for pixel in range(14 * 20):
         one = torch.zeros(14 * 20, 3, dtype=torch.float64)
@@ -68,16 +68,16 @@ def test_disagreement_is_what_cancels_pixel_by_pixel() -> None:
         operator.append(reference.color_gradient(one.reshape(14, 20, 3), view)[:, 0])
     weights, flat = torch.stack(operator), gradient.reshape(-1, 3)
     whole, summed = weights.T @ flat.abs(), (weights.T @ flat).abs()
-    assert torch.allclose(there_is, whole.sum(dim=1), atol=1e-12)
+    assert torch.allclose(magnitude, whole.sum(dim=1), atol=1e-12)
     assert torch.allclose(cancels, (whole - summed).sum(dim=1), atol=1e-12)
     fast = disagreement(CpuRasterizer(scene), view, gradient.float())
-    assert torch.allclose(fast[0], cancels, atol=1e-4 * float(there_is.max()))
+    assert torch.allclose(fast[0], cancels, atol=1e-4 * float(magnitude.max()))
     uniform = disagreement(reference, view, torch.full((14, 20, 3), -0.3, dtype=torch.float64))
     assert torch.allclose(uniform[0], torch.zeros(60, dtype=torch.float64), atol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [1.2, 2.0, 4.0])
-def test_large_gaussians_are_cut_within_the_budget_and_the_picture_stays(
+def test_large_gaussians_are_split_within_the_budget_and_images_are_preserved(
     tiny_weights: BackboneWeights, factor: float
 ) -> None:
     scene = large_wall()
@@ -97,13 +97,13 @@ def test_large_gaussians_are_cut_within_the_budget_and_the_picture_stays(
     assert psnr(sum(errors) / len(errors)) == pytest.approx(found.psnr, abs=0.01)
 
 
-def test_the_same_comes_out_every_time(tiny_weights: BackboneWeights) -> None:
+def test_refinement_is_deterministic(tiny_weights: BackboneWeights) -> None:
     first, second = made(tiny_weights, 2.0), made(tiny_weights, 2.0)
     assert torch.equal(first.pieces, second.pieces)
     assert first.psnr == second.psnr
 
 
-def test_nothing_is_cut_where_nothing_is_large(tiny_weights: BackboneWeights) -> None:
+def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights) -> None:
     small = replace(wall(), scales=torch.full_like(wall().scales, -5.0))
     found = made(tiny_weights, 8.0, small)
     assert (found.split, found.gaussians, found.taken_back) == (0, len(small), 0)
@@ -111,7 +111,7 @@ def test_nothing_is_cut_where_nothing_is_large(tiny_weights: BackboneWeights) ->
     assert refined(small, found) is small
 
 
-def test_nothing_is_cut_that_would_change_the_picture(
+def test_splits_that_would_change_the_image_are_undone(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An impossible bound undoes all splits, and no bound undoes none."""
@@ -126,19 +126,19 @@ def test_nothing_is_cut_that_would_change_the_picture(
     assert loose.split == found.taken_back
 
 
-def test_one_is_off_and_leaves_a_run_as_it_was(tiny_weights: BackboneWeights) -> None:
+def test_factor_of_one_turns_refinement_off(tiny_weights: BackboneWeights) -> None:
     scene = large_wall()
     assert refine(scene, cameras(), style(), settings(refine=1), weights=tiny_weights) is None
     assert refined(scene, None) is scene
 
 
-def test_a_blind_job_is_told_by_the_plan(tiny_weights: BackboneWeights) -> None:
+def test_cameras_that_see_nothing_are_refused_by_the_plan(tiny_weights: BackboneWeights) -> None:
     found = refine(ball(), [blind_camera()], style(), settings(refine=2), weights=tiny_weights)
     assert found is not None
     assert found.split == 0
 
 
-def test_a_stylizer_goes_on_with_the_refined_scene(tiny_weights: BackboneWeights) -> None:
+def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> None:
     scene = large_wall()
     stylizer = Stylizer.planned(scene, cameras(), style(), settings(refine=3), weights=tiny_weights)
     made = stylizer.plan.refinement
@@ -154,7 +154,7 @@ def test_a_stylizer_goes_on_with_the_refined_scene(tiny_weights: BackboneWeights
     assert float(children.std(dim=0).max()) > 0.01, "children have colors of their own"
 
 
-def test_somebody_who_waits_is_shown_how_far_it_is(tiny_weights: BackboneWeights) -> None:
+def test_refinement_reports_its_progress(tiny_weights: BackboneWeights) -> None:
     told: list[tuple[int, int]] = []
     refine(
         large_wall(),
@@ -173,7 +173,7 @@ def test_views_are_spread_evenly() -> None:
     assert spread_evenly([], 4) == []
 
 
-def test_footprints_and_pictures_are_those_of_the_fast_rasterizer() -> None:
+def test_footprints_agree_with_the_fast_rasterizer() -> None:
     scene, camera = wall(sh_degree=1), cameras()[1]
     slow, fast = ReferenceRasterizer(scene), CpuRasterizer(scene)
     assert torch.allclose(render(scene, slow, camera).float(), render(scene, fast, camera), atol=1e-5)

@@ -58,7 +58,7 @@ def session(
 
 @pytest.mark.parametrize("start", [0, 7, 30, 40])
 @pytest.mark.parametrize("views_per_step", [1, 3])
-def test_where_steps_take_what_was_expected_nothing_is_off(start: int, views_per_step: int) -> None:
+def test_estimate_is_exact_if_steps_take_the_predicted_time(start: int, views_per_step: int) -> None:
     """The prediction is exact in both phases, also after resuming in the middle of a phase."""
     told = session([COARSE, SOS], [COARSE, SOS], start, views_per_step)
     assert len(told) == 90 - start
@@ -68,7 +68,7 @@ def test_where_steps_take_what_was_expected_nothing_is_off(start: int, views_per
 
 @pytest.mark.parametrize("factor", [0.25, 1.0, 4.0])
 @pytest.mark.parametrize("start", [0, 40])
-def test_another_machine_than_expected_is_noticed_when_views_come_again(factor: float, start: int) -> None:
+def test_predictions_are_scaled_once_views_are_visited_again(factor: float, start: int) -> None:
     slower = [replace(p, seconds=p.seconds * factor, first_visit=p.first_visit * factor) for p in (COARSE, SOS)]
     for entry in session(slower, [COARSE, SOS], start)[0 if start else VIEWS :]:
         assert entry.left == pytest.approx(entry.truth, rel=1e-12), entry
@@ -76,7 +76,7 @@ def test_another_machine_than_expected_is_noticed_when_views_come_again(factor: 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("known", "first"), [(1.0, 4.0), (1.25, 0.25), (0.8, 0.0), (1.25, 6.0)])
-def test_after_five_steps_of_the_last_phase_a_quarter_is_not_missed(known: float, first: float, seed: int) -> None:
+def test_estimate_is_within_a_quarter_after_five_steps_of_the_last_phase(known: float, first: float, seed: int) -> None:
     """Steps and first visits are off by different factors, and the first five steps are all first visits."""
     real = [replace(p, seconds=p.seconds * known, first_visit=p.first_visit * first) for p in (COARSE, SOS)]
     for start in (0, 40):
@@ -85,7 +85,7 @@ def test_after_five_steps_of_the_last_phase_a_quarter_is_not_missed(known: float
                 assert entry.left == pytest.approx(entry.truth, rel=0.25), entry
 
 
-def test_without_expectations_the_steps_themselves_tell() -> None:
+def test_estimate_without_predictions_uses_the_measured_steps() -> None:
     nothing = [ExpectedPhase(phase.stage, phase.steps) for phase in (COARSE, SOS)]
     told = session([COARSE, SOS], nothing)
     assert all(entry.left > 0 for entry in told[:-1])
@@ -93,7 +93,7 @@ def test_without_expectations_the_steps_themselves_tell() -> None:
     assert all(entry.left == entry.truth for entry in later)
 
 
-def test_an_unfinished_round_is_a_mean() -> None:
+def test_first_visits_after_this_round_count_with_their_probability() -> None:
     """Four steps are left: two of this round and two of the 12 of the next one.
 
     Three views are new, one of them in this round.
@@ -106,7 +106,7 @@ def test_an_unfinished_round_is_a_mean() -> None:
     assert pace.left(16, [9, 0]) == 4 * 1.0 + (1 + 2 * 2 / 12) * 6.0
 
 
-def test_measuring_checkpoints_and_the_time_limit() -> None:
+def test_estimate_includes_measuring_checkpoints_and_time_limit() -> None:
     """Checkpoints keep taking a quarter of the steps' time; the time limit applies to steps alone."""
     pace = SecondsLeft([ExpectedPhase("sos", 10)], [0])
     pace.add_step("sos", [0], 3.0)
