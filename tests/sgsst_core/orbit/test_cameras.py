@@ -114,15 +114,15 @@ def test_cameras_follow_rotation_and_scale_of_the_scene() -> None:
     for old, new in zip(before, after, strict=True):
         assert (new.width, new.height) == (old.width, old.height)
         assert float((3 * matrix @ old.center + shift - new.center).norm()) < 0.01 * size
-        turned = old.world_to_camera[:3, :3] @ matrix.T
-        assert torch.allclose(turned, new.world_to_camera[:3, :3], atol=0.02)
+        rotated = old.world_to_camera[:3, :3] @ matrix.T
+        assert torch.allclose(rotated, new.world_to_camera[:3, :3], atol=0.02)
         assert new.fx == pytest.approx(old.fx, rel=0.02)
 
 
 def test_first_camera_faces_the_broad_side() -> None:
     scene = scene_of(box((-1, -1, -0.2), (1, 1, 0.2), 3000))
-    turned = moved(scene, Rotation.from_euler("y", 37, degrees=True))
-    offset = orbit(turned, 4)[0].center
+    rotated = moved(scene, Rotation.from_euler("y", 37, degrees=True))
+    offset = orbit(rotated, 4)[0].center
     broad = torch.from_numpy(Rotation.from_euler("y", 37, degrees=True).apply([0, 0, 1]))
     assert abs(float(offset @ broad) / float(offset.norm())) > 0.97
 

@@ -23,19 +23,19 @@ from sgsst_core.settings import make_settings
 from tests.sgsst_core.orbit.objects import ball, box, figure, ground, joined, scene_of
 
 
-def elevations(scene: Scene, made: Orbit) -> list[float]:
+def elevations(scene: Scene, orbit: Orbit) -> list[float]:
     """Return the elevation of each camera above the horizon, in degrees."""
-    up = made.up.direction
+    up = orbit.up.direction
     middle = middle_of(find_subject(scene), up)
-    offsets = [camera.center - middle for camera in made.cameras]
+    offsets = [camera.center - middle for camera in orbit.cameras]
     return [math.degrees(math.asin(float(offset @ up / offset.norm()))) for offset in offsets]
 
 
-def told(scene: Scene, made: Orbit) -> dict[str, Decision]:
+def plan_lines(scene: Scene, orbit: Orbit) -> dict[str, Decision]:
     """Return the plan's decisions about an orbit by item."""
-    cameras = [resized(camera, 64) for camera in made.cameras]
+    cameras = [resized(camera, 64) for camera in orbit.cameras]
     survey = survey_views(scene, cameras, make_rasterizer("cpu", scene))
-    return {decision.item: decision for decision in orbit_decisions(made, cameras, survey.uncovered)}
+    return {decision.item: decision for decision in orbit_decisions(orbit, cameras, survey.uncovered)}
 
 
 def table() -> Scene:
@@ -44,47 +44,47 @@ def table() -> Scene:
 
 
 def test_scene_with_ground_gets_views_from_above_and_none_from_below() -> None:
-    made = make_orbit(table(), OrbitRequest(count=24))
-    assert made.up.ground
-    assert made.elevations[0] == 10
-    assert max(made.elevations) >= 40
-    assert min(made.tried) > 0
-    assert made.shown > 0.9
-    assert len(made.cameras) == 24
+    orbit = make_orbit(table(), OrbitRequest(count=24))
+    assert orbit.up.ground
+    assert orbit.elevations[0] == 10
+    assert max(orbit.elevations) >= 40
+    assert min(orbit.tried) > 0
+    assert orbit.shown > 0.9
+    assert len(orbit.cameras) == 24
 
 
 def test_pole_gets_no_views_from_above() -> None:
     pole = scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01)
-    made = make_orbit(pole, OrbitRequest(count=24))
-    assert max(made.elevations) == 10
-    assert max(made.tried) == 70
-    assert made.next is not None
-    assert made.next < 0.03
+    orbit = make_orbit(pole, OrbitRequest(count=24))
+    assert max(orbit.elevations) == 10
+    assert max(orbit.tried) == 70
+    assert orbit.next is not None
+    assert orbit.next < 0.03
 
 
 def test_automatic_view_count_is_bounded_and_grows_with_the_rings() -> None:
     pole = make_orbit(scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01), OrbitRequest())
     wide = make_orbit(table(), OrbitRequest())
-    for made in (pole, wide):
-        assert 16 * len(made.elevations) / 3 < len(made.cameras) <= 16 * len(made.elevations)
+    for orbit in (pole, wide):
+        assert 16 * len(orbit.elevations) / 3 < len(orbit.cameras) <= 16 * len(orbit.elevations)
     assert len({camera.name for camera in wide.cameras}) == len(wide.cameras)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 11])
 def test_few_views_form_one_ring(count: int) -> None:
-    made = make_orbit(table(), OrbitRequest(count=count))
-    assert len(made.cameras) == count
-    assert made.elevations == (10,)
+    orbit = make_orbit(table(), OrbitRequest(count=count))
+    assert len(orbit.cameras) == count
+    assert orbit.elevations == (10,)
 
 
 def test_requested_properties_are_used() -> None:
     scene = figure()
-    made = make_orbit(scene, OrbitRequest(count=14, up=(0.0, 0.0, 1.0), elevation=35.0, radius=6.5))
-    assert len(made.cameras) == 14
-    assert made.up.direction.tolist() == [0, 0, 1]
-    assert elevations(scene, made) == pytest.approx([35.0] * 14)
-    assert made.radius == pytest.approx(6.5)
-    decisions = told(scene, made)
+    orbit = make_orbit(scene, OrbitRequest(count=14, up=(0.0, 0.0, 1.0), elevation=35.0, radius=6.5))
+    assert len(orbit.cameras) == 14
+    assert orbit.up.direction.tolist() == [0, 0, 1]
+    assert elevations(scene, orbit) == pytest.approx([35.0] * 14)
+    assert orbit.radius == pytest.approx(6.5)
+    decisions = plan_lines(scene, orbit)
     assert (decisions["up"].decision, decisions["up"].reason) == ("z", "requested")
     assert decisions["cameras"].decision == "14 views in a ring at 35 degrees, 6.5 from the center"
     assert decisions["cameras"].reason == "requested"
@@ -92,12 +92,12 @@ def test_requested_properties_are_used() -> None:
 
 def test_plan_lines_state_the_reasons_of_an_orbit() -> None:
     scene = figure()
-    made = make_orbit(scene, OrbitRequest(count=24))
-    decisions = told(scene, made)
+    orbit = make_orbit(scene, OrbitRequest(count=24))
+    decisions = plan_lines(scene, orbit)
     assert decisions["up"].decision == "-y"
     assert "times as tall as wide" in decisions["up"].reason
-    assert decisions["cameras"].decision.startswith(f"24 views in {len(made.elevations)} rings at 10")
-    assert f"{made.shown:.0%} of the surface" in decisions["cameras"].reason
+    assert decisions["cameras"].decision.startswith(f"24 views in {len(orbit.elevations)} rings at 10")
+    assert f"{orbit.shown:.0%} of the surface" in decisions["cameras"].reason
     assert "% of their pixels" in decisions["frames"].reason
     assert "subject" not in decisions
 
@@ -111,12 +111,12 @@ def test_plan_lines_state_the_reasons_of_an_orbit() -> None:
 )
 def test_plan_warns_that_a_room_is_not_a_single_object(room: Scene, what: str) -> None:
     scene = joined(scene_of(ball((0, 0, 0), 0.5, 5000), 0.05), room)
-    made = make_orbit(scene, OrbitRequest(count=12))
-    warning = told(scene, made)["subject"]
+    orbit = make_orbit(scene, OrbitRequest(count=12))
+    warning = plan_lines(scene, orbit)["subject"]
     assert warning.decision.startswith("warning: ")
     assert what in warning.decision
     assert "--cameras" in warning.reason
-    assert len(made.cameras) == 12
+    assert len(orbit.cameras) == 12
 
 
 @pytest.mark.parametrize(
@@ -130,16 +130,16 @@ def test_plan_warns_that_a_room_is_not_a_single_object(room: Scene, what: str) -
 )
 def test_degenerate_scenes_have_an_automatic_orbit(scene: Scene) -> None:
     for request in (OrbitRequest(), OrbitRequest(count=3)):
-        made = make_orbit(scene, request)
-        assert all(bool(torch.isfinite(camera.world_to_camera).all()) for camera in made.cameras)
-        assert 0 <= made.shown <= 1 + 1e-9
+        orbit = make_orbit(scene, request)
+        assert all(bool(torch.isfinite(camera.world_to_camera).all()) for camera in orbit.cameras)
+        assert 0 <= orbit.shown <= 1 + 1e-9
 
 
 def test_plan_starts_with_the_lines_about_the_orbit(tiny_weights) -> None:  # type: ignore[no-untyped-def]
     scene = figure()
-    made = make_orbit(scene, OrbitRequest(count=3))
-    cameras = [resized(camera, 64) for camera in made.cameras]
-    plan, _ = make_plan(scene, cameras, make_settings(), weights=tiny_weights, orbit=made)
+    orbit = make_orbit(scene, OrbitRequest(count=3))
+    cameras = [resized(camera, 64) for camera in orbit.cameras]
+    plan, _ = make_plan(scene, cameras, make_settings(), weights=tiny_weights, orbit=orbit)
     assert [decision.item for decision in plan.decisions[:3]] == ["up", "cameras", "frames"]
     without, _ = make_plan(scene, cameras, make_settings(), weights=tiny_weights)
     assert "up" not in {decision.item for decision in without.decisions}
@@ -155,9 +155,9 @@ def test_automatic_orbits_are_deterministic() -> None:
 @pytest.mark.parametrize(("name", "reason"), [("biker", "foot"), ("playbot_synthetic_sh2", "flat layer")])
 def test_real_object_scans_stand_upright(shared_data: Path, name: str, reason: str) -> None:
     scene = read_scene(shared_data / "scenes" / name / "point_cloud.ply").scene
-    made = make_orbit(scene, OrbitRequest(count=12))
-    assert made.up.name == "-y"
-    assert made.up.sure
-    assert reason in made.up.reason
-    assert made.outside < 0.01
-    assert made.hidden == 0
+    orbit = make_orbit(scene, OrbitRequest(count=12))
+    assert orbit.up.name == "-y"
+    assert orbit.up.sure
+    assert reason in orbit.up.reason
+    assert orbit.outside < 0.01
+    assert orbit.hidden == 0

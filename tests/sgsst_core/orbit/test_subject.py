@@ -96,7 +96,7 @@ def test_subject_of_a_large_scene_is_estimated_from_a_sample() -> None:
 
 def test_weighted_quantiles_and_directions() -> None:
     values, weights = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([1.0, 1.0, 2.0])
-    assert [quantile(values, weights, share) for share in (0.0, 0.25, 0.5, 0.75, 1.0)] == [1, 1, 2, 2, 3]
+    assert [quantile(values, weights, fraction) for fraction in (0.0, 0.25, 0.5, 0.75, 1.0)] == [1, 1, 2, 2, 3]
     directions = spread_directions(300)
     assert torch.allclose(directions.norm(dim=1), torch.ones(300, dtype=torch.float64))
     nearest = (directions @ directions.T - 2 * torch.eye(300)).amax(1).clamp(max=1).acos()

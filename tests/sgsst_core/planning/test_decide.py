@@ -109,17 +109,17 @@ def test_blind_views_are_skipped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "wanted", "weighted"),
+    ("uncovered", "wanted", "weighted"),
     [(0.3, "auto", True), (0.001, "auto", False), (0.3, "off", False), (0.0, "on", True)],
 )
-def test_position_weights_are_for_views_with_an_empty_background(share: float, wanted: str, weighted: bool) -> None:
-    plan = plan_of(probe(uncovered_share=share), position_weights=wanted)
+def test_position_weights_are_for_views_with_an_empty_background(uncovered: float, wanted: str, weighted: bool) -> None:
+    plan = plan_of(probe(uncovered_share=uncovered), position_weights=wanted)
     assert plan.weighted is weighted
     assert (line(plan, "position weights") is not None) is weighted
 
 
 @pytest.mark.parametrize(
-    ("share", "values", "training_background", "warm"),
+    ("uncovered", "values", "training_background", "warm"),
     [
         (0.0, {}, "background", True),
         (0.05, {}, "background", True),  # room with holes
@@ -134,16 +134,16 @@ def test_position_weights_are_for_views_with_an_empty_background(share: float, w
     ],
 )
 def test_training_background_and_start_follow_coverage_and_settings(
-    share: float, values: dict[str, Any], training_background: str, warm: bool
+    uncovered: float, values: dict[str, Any], training_background: str, warm: bool
 ) -> None:
-    plan = plan_of(probe(uncovered_share=share), **values)
+    plan = plan_of(probe(uncovered_share=uncovered), **values)
     assert (plan.training_background, plan.warm_start) == (training_background, warm)
     behind, start = line(plan, "training_background"), line(plan, "start")
     assert (behind is not None, start is not None) == (training_background != "background", warm)
     for found, setting in ((behind, "training_background"), (start, "warm_start")):
         if found:
             assert ("requested" in found.reason) is (setting in values)
-            scan = share == 0.5 and "position_weights" not in values
+            scan = uncovered == 0.5 and "position_weights" not in values
             assert ("50.0% of the views' pixels are uncovered" in found.reason) is (setting not in values and scan)
 
 
@@ -170,12 +170,12 @@ def test_random_background_costs_a_content_pass_and_disables_early_stop() -> Non
 
 def test_uncovered_pixels_skip_the_network() -> None:
     scan = probe(uncovered_share=0.5, regions=[Rectangle(160, 160, 320, 320)] * VIEWS)
-    plan, kept = plan_of(scan), plan_of(scan, keep=("uncovered",))
+    plan, everything = plan_of(scan), plan_of(scan, keep=("uncovered",))
     assert "of the pixels skip the network: 50.0% of" in text_of(plan, "uncovered pixels")
-    assert line(kept, "uncovered pixels") is None
+    assert line(everything, "uncovered pixels") is None
     assert plan.prediction is not None
-    assert kept.prediction is not None
-    assert plan.prediction.seconds < kept.prediction.seconds
+    assert everything.prediction is not None
+    assert plan.prediction.seconds < everything.prediction.seconds
 
 
 # --- the network ---------------------------------------------------------------------------------------------------
@@ -351,7 +351,7 @@ def test_graph_needs_memory_in_addition() -> None:
     peaks = [plan.prediction.device_bytes for plan in plans if plan.prediction]
     assert peaks[0] is not None
     assert peaks[1] is not None
-    assert peaks[0] - peaks[1] == int(HEIGHT * WIDTH * 3500.0)  # pixels of one scale: 3000 bytes kept, 500 for work
+    assert peaks[0] - peaks[1] == int(HEIGHT * WIDTH * 3500.0)  # pixels of one scale: 3000 bytes held, 500 for work
 
 
 def test_precision_line_states_the_measured_error() -> None:
@@ -366,17 +366,17 @@ def test_precision_line_states_the_measured_error() -> None:
 
 
 def test_weights_are_cached_on_a_cpu_if_that_pays_off() -> None:
-    kept, once = plan_of(probe()), plan_of(probe(), steps_coarse=0, steps_sos=4 * VIEWS)
-    assert (kept.rasterizer, kept.cached_weights) == ("cached", "float32")
-    assert text_of(kept, "blend weights") == (
+    cached, once = plan_of(probe()), plan_of(probe(), steps_coarse=0, steps_sos=4 * VIEWS)
+    assert (cached.rasterizer, cached.cached_weights) == ("cached", "float32")
+    assert text_of(cached, "blend weights") == (
         "all cached in float32: they take 1.00 GB for all views; 2.5 GB are available for blend weights"
     )
     assert (once.rasterizer, once.cached_weights) == ("cpu", "none")
     assert text_of(once, "blend weights") == "recomputed in every step: a view is visited 4.0 times"
-    assert line(kept, "rasterizer") is line(once, "rasterizer") is None
-    assert kept.prediction is not None
+    assert line(cached, "rasterizer") is line(once, "rasterizer") is None
+    assert cached.prediction is not None
     assert plan_of(probe(), cached_weights="none").prediction.seconds == pytest.approx(  # type: ignore[union-attr]
-        kept.prediction.seconds + 0.2
+        cached.prediction.seconds + 0.2
     )
 
 
@@ -421,17 +421,17 @@ FASTER = RasterCost(0.01, 0.004, GIGABYTE, GIGABYTE // 2, 0.012)
 
 
 def test_weights_are_cached_on_a_gpu_if_measured_to_pay_off() -> None:
-    kept, once = plan_of(on_a_gpu(FASTER)), plan_of(on_a_gpu(FASTER), steps_coarse=0, steps_sos=VIEWS)
-    assert (kept.rasterizer, kept.uncached, kept.cached_weights) == ("cached", "triton", "float32")
-    assert text_of(kept, "rasterizer") == "Triton on the GPU, with cached blend weights: Triton works here"
-    assert text_of(kept, "blend weights") == (
+    cached, once = plan_of(on_a_gpu(FASTER)), plan_of(on_a_gpu(FASTER), steps_coarse=0, steps_sos=VIEWS)
+    assert (cached.rasterizer, cached.uncached, cached.cached_weights) == ("cached", "triton", "float32")
+    assert text_of(cached, "rasterizer") == "Triton on the GPU, with cached blend weights: Triton works here"
+    assert text_of(cached, "blend weights") == (
         "all cached in float32: they take 1.00 GB for all views; 2.5 GB are available for blend weights; measured per "
         "view: 4 ms cached, 10 ms recomputed"
     )
-    assert line(kept, "blend weights").seconds == pytest.approx(0.006)  # type: ignore[union-attr]
-    assert kept.prediction is not None
+    assert line(cached, "blend weights").seconds == pytest.approx(0.006)  # type: ignore[union-attr]
+    assert cached.prediction is not None
     assert once.prediction is not None
-    assert once.prediction.seconds == pytest.approx(kept.prediction.seconds + 0.006)
+    assert once.prediction.seconds == pytest.approx(cached.prediction.seconds + 0.006)
     assert (once.rasterizer, once.uncached, once.cached_weights) == ("triton", "triton", "none")
     assert text_of(once, "rasterizer") == "Triton on the GPU: Triton works here"
     assert text_of(once, "blend weights") == (

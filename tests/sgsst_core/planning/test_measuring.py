@@ -56,9 +56,9 @@ def test_first_allowed_level_is_chosen() -> None:
     prices = Prices(1.0, 0.5, 0.25)
     costs = [21.75, 15.0, 8.0, 5.5, 3.0, 2.25, 0.0]
     assert [prices.of(level, len(level.moments(300))) for level in LEVELS] == costs
-    for place, cost in enumerate(costs):
-        assert choose_level(prices, cost, 300) == place
-        assert choose_level(prices, cost - 0.01, 300) == min(place + 1, NOTHING)
+    for level, cost in enumerate(costs):
+        assert choose_level(prices, cost, 300) == level
+        assert choose_level(prices, cost - 0.01, 300) == min(level + 1, NOTHING)
     assert choose_level(prices, 1e9, 300, first=3) == 3  # the plan's level is the minimum
 
 
@@ -118,11 +118,11 @@ def test_job_time_adds_steps_first_visits_and_measuring() -> None:
     found = expected(plan_of(SLOW))
     steps = 8 * found.seconds_coarse + 16 * found.seconds + found.style
     assert found.job == pytest.approx(steps + 4 * (found.first_visit_coarse + found.first_visit) + found.measuring)
-    cut = 0.25 * SLOW.first_seconds
-    assert found.first_visit_coarse > cut + SLOW.seconds
+    restricted = 0.25 * SLOW.first_seconds
+    assert found.first_visit_coarse > restricted + SLOW.seconds
     assert 0 < found.first_visit < found.first_visit_coarse
     alone = expected(plan_of(SLOW, steps_coarse=0))
-    assert alone.first_visit == pytest.approx(cut + found.first_visit)
+    assert alone.first_visit == pytest.approx(restricted + found.first_visit)
     limited = expected(plan_of(SLOW, max_seconds=5.0))
     assert limited.job - limited.measuring == pytest.approx(5.0)
 

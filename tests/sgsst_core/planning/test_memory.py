@@ -21,7 +21,7 @@ from tests.sgsst_core.planning.test_view_costs import HUGE, LARGE, expected
 from tests.sgsst_core.planning.test_view_costs import plan_of as plan_of_raster
 
 #: Budget in bytes for tile intersections and weights.
-ROOM = 10 * GIGABYTE // 4
+BUDGET = 10 * GIGABYTE // 4
 
 
 def test_memory_grows_with_gaussians_and_cached_data_of_views() -> None:
@@ -30,11 +30,11 @@ def test_memory_grows_with_gaussians_and_cached_data_of_views() -> None:
     Its intersections replace those of the survey.
     """
     plain = expected(LARGE).peak_bytes
-    whole = expected(LARGE, keep=("unseen",)).peak_bytes
+    complete = expected(LARGE, keep=("unseen",)).peak_bytes
     own = OPTIMIZER_BYTES + 12 + 12 * VIEWS
-    assert plain - whole == 5 * (own + gaussian_bytes(3)) - 6 * (own + SHAPE_BYTES)
+    assert plain - complete == 5 * (own + gaussian_bytes(3)) - 6 * (own + SHAPE_BYTES)
     assert gaussian_bytes(3) == 4 * 59
-    assert expected(HUGE).peak_bytes - plain == 5 * SHAPE_BYTES, "what does not fit is built anew, and not kept"
+    assert expected(HUGE).peak_bytes - plain == 5 * SHAPE_BYTES, "uncached data are recomputed"
 
 
 def test_intersections_of_novel_views_get_the_remaining_budget() -> None:
@@ -43,10 +43,10 @@ def test_intersections_of_novel_views_get_the_remaining_budget() -> None:
         for size in (10**8, 10**9):
             plan = plan_of_raster(replace(LARGE, intersection_bytes=size), measured=True, steps_sos=steps)
             views = LEVELS[plan.measuring].views
-            isects = min((VIEWS + 4 * views) * size, ROOM) - min(VIEWS * size, ROOM)
+            isects = min((VIEWS + 4 * views) * size, BUDGET) - min(VIEWS * size, BUDGET)
             gaussians = 6 * (SHAPE_BYTES + 12 * 4 * views) if views else 0
             warps = min(views * HEIGHT * WIDTH * 80, 10 * GIGABYTE // 32)
-            built = 5 * SHAPE_BYTES if VIEWS * size > ROOM else 0
+            built = 5 * SHAPE_BYTES if VIEWS * size > BUDGET else 0
             assert plan.prediction is not None
             assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + isects + gaussians + warps + built
 
@@ -66,13 +66,15 @@ def test_weights_replace_the_tile_intersections_of_the_survey() -> None:
 
     Intersections of views whose weights do not fit may take another sixteenth of the memory.
     """
-    kept = [RasterCost(0.3, 0.1, size, size, intersection_bytes=10**8) for size in (10**9, ROOM, 4 * ROOM)]
-    peaks = [plan_of(probe(raster=raster), cached_weights="float32").prediction for raster in kept]
-    base = plan_of(probe(raster=replace(kept[0], bytes=0, intersection_bytes=0)), cached_weights="float32").prediction
+    rasters = [RasterCost(0.3, 0.1, size, size, intersection_bytes=10**8) for size in (10**9, BUDGET, 4 * BUDGET)]
+    peaks = [plan_of(probe(raster=raster), cached_weights="float32").prediction for raster in rasters]
+    base = plan_of(
+        probe(raster=replace(rasters[0], bytes=0, intersection_bytes=0)), cached_weights="float32"
+    ).prediction
     assert base is not None
     rises = [found.peak_bytes - base.peak_bytes for found in peaks if found is not None]
     isects = VIEWS * 10**8
-    assert rises == [10**9 - isects, ROOM - isects, ROOM + 300_000_000 - isects]
+    assert rises == [10**9 - isects, BUDGET - isects, BUDGET + 300_000_000 - isects]
 
 
 def test_largest_temporary_allocation_counts() -> None:

@@ -83,14 +83,14 @@ def test_tf32_needs_every_rank_to_have_it(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize(("least", "runs"), [(0.0, [1, 1]), (1.0, [1, 1]), (5.0, [1, 1, 2, 4, 8])])
 def test_repetitions_take_long_enough(least: float, runs: list[int]) -> None:
     """Each simulated run takes a second; the first one takes ten seconds, because it prepares."""
-    made: list[int] = []
+    counts: list[int] = []
 
     def run(times: int) -> float:
-        made.append(times)
-        return float(times) if made[1:] else 10.0
+        counts.append(times)
+        return float(times) if counts[1:] else 10.0
 
     assert seconds_of(run, least) == 1.0
-    assert made == runs
+    assert counts == runs
 
 
 def test_tf32_on_a_cpu_gives_the_float32_job(tiny_weights: BackboneWeights) -> None:

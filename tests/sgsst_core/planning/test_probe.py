@@ -112,14 +112,14 @@ def test_survey_counts_the_gaussians_that_a_view_shows() -> None:
 
 
 def test_survey_reports_its_progress() -> None:
-    scene, told = wall(), list[PlanningProgress]()
-    survey_views(scene, cameras(3), make_rasterizer("cpu", scene), show=told.append)
-    assert [(progress.done, progress.total) for progress in told] == [(0, 3), (1, 3), (2, 3), (3, 3)]
-    assert told[0].seconds_left is None
-    assert all(progress.seconds_left is not None for progress in told[1:])
-    assert told[1].seconds_left > 0  # type: ignore[operator]
-    assert told[-1].seconds_left == 0
-    assert [progress.fraction for progress in told] == [0, 1 / 3, 2 / 3, 1]
+    scene, reports = wall(), list[PlanningProgress]()
+    survey_views(scene, cameras(3), make_rasterizer("cpu", scene), show=reports.append)
+    assert [(progress.done, progress.total) for progress in reports] == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert reports[0].seconds_left is None
+    assert all(progress.seconds_left is not None for progress in reports[1:])
+    assert reports[1].seconds_left > 0  # type: ignore[operator]
+    assert reports[-1].seconds_left == 0
+    assert [progress.fraction for progress in reports] == [0, 1 / 3, 2 / 3, 1]
 
 
 def test_progress_assumes_that_other_ranks_are_as_fast() -> None:
@@ -135,10 +135,10 @@ def test_a_plan_needs_cameras_that_see_something(tiny_weights: BackboneWeights) 
 
 
 def test_earlier_survey_is_reused(tiny_weights: BackboneWeights) -> None:
-    scene, settings, told = wall(), make_settings(), list[PlanningProgress]()
+    scene, settings, reports = wall(), make_settings(), list[PlanningProgress]()
     first, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
-    second, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights, survey=first.survey, show=told.append)
-    assert not told
+    second, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights, survey=first.survey, show=reports.append)
+    assert not reports
     assert second.survey is first.survey
     assert torch.equal(second.seen, first.seen)
 

@@ -118,8 +118,8 @@ def test_faint_uniform_or_close_gaussians_are_not_candidates() -> None:
 def test_plan_line_states_splits_and_their_image_error(taken_back: int) -> None:
     pieces = torch.ones(1000, 3, dtype=torch.uint8)
     pieces[:10, 0] = 5
-    made = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, taken_back)
-    line = refine_decision(made, make_settings(refine=4))
+    refinement = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, taken_back)
+    line = refine_decision(refinement, make_settings(refine=4))
     assert line.decision == "10 are split, which turns 1,000 Gaussians into 1,040"
     assert "6.5 pixels" in line.reason
     assert ("7 are not split" in line.reason) == bool(taken_back)

@@ -46,11 +46,11 @@ def covariances(scene: Scene) -> Tensor:
 def mixtures(children: Scene, parents: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return opacity-weighted mean [N, 3] and covariance [N, 3, 3] of each parent's children, in float64."""
     opacity = torch.sigmoid(children.opacities.double())
-    share = opacity / torch.zeros(count, dtype=torch.float64).index_add(0, parents, opacity)[parents]
-    mean = torch.zeros(count, 3, dtype=torch.float64).index_add(0, parents, share[:, None] * children.means.double())
+    fraction = opacity / torch.zeros(count, dtype=torch.float64).index_add(0, parents, opacity)[parents]
+    mean = torch.zeros(count, 3, dtype=torch.float64).index_add(0, parents, fraction[:, None] * children.means.double())
     apart = children.means.double() - mean[parents]
     own = covariances(children) + apart[:, :, None] * apart[:, None, :]
-    return mean, torch.zeros(count, 3, 3, dtype=torch.float64).index_add(0, parents, share[:, None, None] * own)
+    return mean, torch.zeros(count, 3, 3, dtype=torch.float64).index_add(0, parents, fraction[:, None, None] * own)
 
 
 @pytest.mark.parametrize("number", NUMBERS)
@@ -99,9 +99,9 @@ def test_unsplit_gaussians_and_inherited_properties_are_bit_identical(monkeypatc
     assert bool((parents[1:] >= parents[:-1]).all())
     for name in ("quats", "sh_dc", "sh_rest"):
         assert torch.equal(getattr(children, name), getattr(scene, name)[parents])
-    whole = (piece_counts(pieces) == 1)[parents]
+    unsplit = (piece_counts(pieces) == 1)[parents]
     for field in fields(Scene):
-        assert torch.equal(getattr(children, field.name)[whole], getattr(scene, field.name)[parents][whole])
+        assert torch.equal(getattr(children, field.name)[unsplit], getattr(scene, field.name)[parents][unsplit])
     monkeypatch.setattr(module, "_CHUNK", 1 << 18)
     again = split(scene, pieces)
     assert all(torch.equal(getattr(again, field.name), getattr(children, field.name)) for field in fields(Scene))

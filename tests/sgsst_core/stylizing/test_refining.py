@@ -49,7 +49,7 @@ def settings(**values: object) -> Settings:
     return make_settings("preview", steps_coarse=0, steps_sos=2, measure=0, **values)
 
 
-def made(weights: BackboneWeights, factor: float, scene: Scene | None = None) -> Refinement:
+def refinement_of(weights: BackboneWeights, factor: float, scene: Scene | None = None) -> Refinement:
     found = refine(scene or large_wall(), cameras(), style(), settings(refine=factor), weights=weights)
     assert found is not None
     return found
@@ -67,9 +67,9 @@ def test_disagreement_is_the_gradient_that_cancels_between_pixels() -> None:
         one[pixel] = 1
         operator.append(reference.color_gradient(one.reshape(14, 20, 3), view)[:, 0])
     weights, flat = torch.stack(operator), gradient.reshape(-1, 3)
-    whole, summed = weights.T @ flat.abs(), (weights.T @ flat).abs()
-    assert torch.allclose(magnitude, whole.sum(dim=1), atol=1e-12)
-    assert torch.allclose(cancels, (whole - summed).sum(dim=1), atol=1e-12)
+    total, summed = weights.T @ flat.abs(), (weights.T @ flat).abs()
+    assert torch.allclose(magnitude, total.sum(dim=1), atol=1e-12)
+    assert torch.allclose(cancels, (total - summed).sum(dim=1), atol=1e-12)
     fast = disagreement(CpuRasterizer(scene), view, gradient.float())
     assert torch.allclose(fast[0], cancels, atol=1e-4 * float(magnitude.max()))
     uniform = disagreement(reference, view, torch.full((14, 20, 3), -0.3, dtype=torch.float64))
@@ -81,31 +81,31 @@ def test_large_gaussians_are_split_within_the_budget_and_images_are_preserved(
     tiny_weights: BackboneWeights, factor: float
 ) -> None:
     scene = large_wall()
-    found = made(tiny_weights, factor)
+    found = refinement_of(tiny_weights, factor)
     counts = piece_counts(found.pieces)
     assert found.split == int((counts > 1).sum()) > 0
     assert len(scene) < found.gaussians == int(counts.sum()) <= factor * len(scene)
     assert found.psnr is not None
     assert found.lowest_psnr is not None
     assert found.psnr >= found.lowest_psnr >= LEAST_PSNR
-    cut = refined(scene, found)
+    refined_scene = refined(scene, found)
     errors = []
     for view in cameras():  # with the slow float64 rasterizer
-        before, after = (render(each, ReferenceRasterizer(each), view).clamp(0, 1) for each in (scene, cut))
+        before, after = (render(each, ReferenceRasterizer(each), view).clamp(0, 1) for each in (scene, refined_scene))
         errors.append(float((after - before).square().mean()))
     assert psnr(max(errors)) == pytest.approx(found.lowest_psnr, abs=0.01)
     assert psnr(sum(errors) / len(errors)) == pytest.approx(found.psnr, abs=0.01)
 
 
 def test_refinement_is_deterministic(tiny_weights: BackboneWeights) -> None:
-    first, second = made(tiny_weights, 2.0), made(tiny_weights, 2.0)
+    first, second = refinement_of(tiny_weights, 2.0), refinement_of(tiny_weights, 2.0)
     assert torch.equal(first.pieces, second.pieces)
     assert first.psnr == second.psnr
 
 
 def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights) -> None:
     small = replace(wall(), scales=torch.full_like(wall().scales, -5.0))
-    found = made(tiny_weights, 8.0, small)
+    found = refinement_of(tiny_weights, 8.0, small)
     assert (found.split, found.gaussians, found.taken_back) == (0, len(small), 0)
     assert found.psnr is None
     assert refined(small, found) is small
@@ -116,12 +116,12 @@ def test_splits_that_would_change_the_image_are_undone(
 ) -> None:
     """An impossible bound undoes all splits, and no bound undoes none."""
     monkeypatch.setattr(refining, "LEAST_PSNR", 200.0)
-    found = made(tiny_weights, 4.0)
+    found = refinement_of(tiny_weights, 4.0)
     assert found.split == 0
     assert found.taken_back > 0
     assert "are not split" in choice.refine_decision(found, settings(refine=4)).reason
     monkeypatch.setattr(refining, "LEAST_PSNR", 0.0)
-    loose = made(tiny_weights, 4.0)
+    loose = refinement_of(tiny_weights, 4.0)
     assert loose.taken_back == 0
     assert loose.split == found.taken_back
 
@@ -141,30 +141,30 @@ def test_cameras_that_see_nothing_are_refused_by_the_plan(tiny_weights: Backbone
 def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> None:
     scene = large_wall()
     stylizer = Stylizer.planned(scene, cameras(), style(), settings(refine=3), weights=tiny_weights)
-    made = stylizer.plan.refinement
-    assert made is not None
-    assert len(stylizer.scene) == made.gaussians > len(scene)
+    refinement = stylizer.plan.refinement
+    assert refinement is not None
+    assert len(stylizer.scene) == refinement.gaussians > len(scene)
     assert stylizer.plan.decisions[0].item == "refined Gaussians"
-    assert len(stylizer.plan.seen) == made.gaussians
+    assert len(stylizer.plan.seen) == refinement.gaussians
     run(stylizer)
-    assert stylizer.stylized().shape == (made.gaussians, 3)
-    parents, change = parents_of(made.pieces), stylizer.stylized() - stylizer.scene.sh_dc
-    cut = int((piece_counts(made.pieces) > 1).nonzero()[0])
-    children = change[parents == cut]
+    assert stylizer.stylized().shape == (refinement.gaussians, 3)
+    parents, change = parents_of(refinement.pieces), stylizer.stylized() - stylizer.scene.sh_dc
+    parent = int((piece_counts(refinement.pieces) > 1).nonzero()[0])
+    children = change[parents == parent]
     assert float(children.std(dim=0).max()) > 0.01, "children have colors of their own"
 
 
 def test_refinement_reports_its_progress(tiny_weights: BackboneWeights) -> None:
-    told: list[tuple[int, int]] = []
+    reports: list[tuple[int, int]] = []
     refine(
         large_wall(),
         cameras(),
         style(),
         settings(refine=2.0),
         weights=tiny_weights,
-        show=lambda now: told.append((now.done, now.total)),
+        show=lambda now: reports.append((now.done, now.total)),
     )
-    assert told == 2 * [(0, 3), (1, 3), (2, 3)]  # surveyed, and asked for their gradient
+    assert reports == 2 * [(0, 3), (1, 3), (2, 3)]  # surveyed, and asked for their gradient
 
 
 def test_views_are_spread_evenly() -> None:

@@ -16,7 +16,7 @@ SOS = ExpectedPhase("sos", 60, 4.5, 2.25)
 
 
 @dataclass(frozen=True)
-class Told:
+class Estimate:
     """Predicted and actual remaining time after a step."""
 
     stage: str
@@ -27,18 +27,18 @@ class Told:
 
 def session(
     phases: list[ExpectedPhase], expected: list[ExpectedPhase], start: int = 0, views_per_step: int = 1, seed: int = 0
-) -> list[Told]:
+) -> list[Estimate]:
     """Simulate the steps of a job from step `start` on, in rounds over all views.
 
     Each view's cached data are computed at its first visit after `start`, as after resuming.
     """
     chance = random.Random(seed)
-    pace = SecondsLeft(expected, range(VIEWS), views_per_step)
+    estimator = SecondsLeft(expected, range(VIEWS), views_per_step)
     queue: list[int] = []
     order = [phase for phase in phases for _ in range(phase.steps)]
     visited: dict[str, set[int]] = {phase.stage: set() for phase in phases}
     prices: list[float] = []
-    told: list[Told] = []
+    estimates: list[Estimate] = []
     for step, phase in enumerate(order, start=1):
         views = []
         for _ in range(views_per_step):
@@ -46,23 +46,23 @@ def session(
             views.append(queue.pop(0))
         if step == start + 1:
             visited = {phase.stage: set() for phase in phases}
-            pace.resume()
+            estimator.resume()
         fresh = len(set(views) - visited[phase.stage])
         visited[phase.stage].update(views)
         prices.append(phase.seconds + fresh * phase.first_visit)
-        pace.add_step(phase.stage, views, prices[-1], fresh * phase.first_visit / 2)
-        number = sum(entry.stage == phase.stage for entry in told[start:]) + 1
-        told.append(Told(phase.stage, number, pace.left(step, queue), 0.0))
-    return [replace(entry, truth=sum(prices[index + 1 :])) for index, entry in enumerate(told)][start:]
+        estimator.add_step(phase.stage, views, prices[-1], fresh * phase.first_visit / 2)
+        number = sum(entry.stage == phase.stage for entry in estimates[start:]) + 1
+        estimates.append(Estimate(phase.stage, number, estimator.left(step, queue), 0.0))
+    return [replace(entry, truth=sum(prices[index + 1 :])) for index, entry in enumerate(estimates)][start:]
 
 
 @pytest.mark.parametrize("start", [0, 7, 30, 40])
 @pytest.mark.parametrize("views_per_step", [1, 3])
 def test_estimate_is_exact_if_steps_take_the_predicted_time(start: int, views_per_step: int) -> None:
     """The prediction is exact in both phases, also after resuming in the middle of a phase."""
-    told = session([COARSE, SOS], [COARSE, SOS], start, views_per_step)
-    assert len(told) == 90 - start
-    for entry in told:
+    estimates = session([COARSE, SOS], [COARSE, SOS], start, views_per_step)
+    assert len(estimates) == 90 - start
+    for entry in estimates:
         assert entry.left == entry.truth, entry
 
 
@@ -87,9 +87,9 @@ def test_estimate_is_within_a_quarter_after_five_steps_of_the_last_phase(known: 
 
 def test_estimate_without_predictions_uses_the_measured_steps() -> None:
     nothing = [ExpectedPhase(phase.stage, phase.steps) for phase in (COARSE, SOS)]
-    told = session([COARSE, SOS], nothing)
-    assert all(entry.left > 0 for entry in told[:-1])
-    later = [entry for entry in told if entry.stage == "sos" and entry.number > VIEWS + VIEWS]
+    estimates = session([COARSE, SOS], nothing)
+    assert all(entry.left > 0 for entry in estimates[:-1])
+    later = [entry for entry in estimates if entry.stage == "sos" and entry.number > VIEWS + VIEWS]
     assert all(entry.left == entry.truth for entry in later)
 
 
@@ -99,21 +99,21 @@ def test_first_visits_after_this_round_count_with_their_probability() -> None:
     Three views are new, one of them in this round.
     """
     phase = ExpectedPhase("sos", 20, 1.0, 6.0)
-    pace = SecondsLeft([phase], range(VIEWS))
+    estimator = SecondsLeft([phase], range(VIEWS))
     for view in range(9):
-        pace.add_step("sos", [view], 7.0)
-    pace.add_step("sos", [1], 1.0)
-    assert pace.left(16, [9, 0]) == 4 * 1.0 + (1 + 2 * 2 / 12) * 6.0
+        estimator.add_step("sos", [view], 7.0)
+    estimator.add_step("sos", [1], 1.0)
+    assert estimator.left(16, [9, 0]) == 4 * 1.0 + (1 + 2 * 2 / 12) * 6.0
 
 
 def test_estimate_includes_measuring_checkpoints_and_time_limit() -> None:
     """Checkpoints keep taking a quarter of the steps' time; the time limit applies to steps alone."""
-    pace = SecondsLeft([ExpectedPhase("sos", 10)], [0])
-    pace.add_step("sos", [0], 3.0)
-    pace.add_step("sos", [0], 1.0)
-    pace.add_beside(1.0)
-    assert pace.left(2, []) == 8 * 1.0 * 1.25
-    assert pace.left(2, [], measuring=5.0) == 8 * 1.0 * 1.25 + 5.0
-    assert pace.left(2, [], limit=4.0) == 4.0 * 1.25
-    assert pace.left(2, [], measuring=5.0, limit=-1.0) == 5.0
-    assert pace.left(10, [], measuring=5.0) == 5.0
+    estimator = SecondsLeft([ExpectedPhase("sos", 10)], [0])
+    estimator.add_step("sos", [0], 3.0)
+    estimator.add_step("sos", [0], 1.0)
+    estimator.add_beside(1.0)
+    assert estimator.left(2, []) == 8 * 1.0 * 1.25
+    assert estimator.left(2, [], measuring=5.0) == 8 * 1.0 * 1.25 + 5.0
+    assert estimator.left(2, [], limit=4.0) == 4.0 * 1.25
+    assert estimator.left(2, [], measuring=5.0, limit=-1.0) == 5.0
+    assert estimator.left(10, [], measuring=5.0) == 5.0
