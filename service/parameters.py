@@ -11,7 +11,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.options import RENAMED, Option
 from sgsst_core.settings import checked
 from worker.options import StylizeOptions
-from worker.regions import MOST_REGIONS, RegionOptions, RegionRequest, region_requests
+from worker.region_requests import MOST_REGIONS, RegionOptions, RegionRequest, region_requests
 from worker.styles import MOST_PICTURES
 
 #: Names without control characters: they are shown in terminals, and some databases cannot store zero bytes.

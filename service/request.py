@@ -8,7 +8,7 @@ from pathlib import Path
 from service.files.names import RESULT
 from service.files.staging import Staged, clean_name, region_styles
 from service.parameters import JobParameters
-from worker.regions import RegionRequest
+from worker.region_requests import RegionRequest
 from worker.request import SceneRequest, StylizeRequest
 from worker.styles import StyleFile
 

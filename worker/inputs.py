@@ -20,17 +20,17 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.sh_attenuation import check_sh_attenuation
-from sgsst_core.loss.mixture import StyleMixture, normalized
-from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import nothing_seen, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
-from sgsst_core.stylizing.style_picture import check_style_size
+from sgsst_core.stylizing.job_styles import check_style_size
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 from worker.selecting import select_regions
@@ -55,7 +55,7 @@ class Inputs:
     """
 
     weights: BackboneWeights
-    style: StyleMixture
+    style: Style
     scene_file: SceneFile
     cameras: list[Camera]
     orbit: Orbit | None
@@ -109,7 +109,7 @@ def read_regions(
         return None
     settings, near = request.settings, request.source.near
 
-    def load(files: Sequence[StyleFile]) -> StyleMixture:
+    def load(files: Sequence[StyleFile]) -> Style:
         style = load_styles(files)
         check_style_size(style, cameras, settings.style_scale)
         return style
@@ -120,7 +120,7 @@ def read_regions(
     )
 
 
-def load_styles(files: Sequence[StyleFile]) -> StyleMixture:
+def load_styles(files: Sequence[StyleFile]) -> Style:
     """Read the images of a style and normalize their weights.
 
     Raises:
@@ -129,7 +129,7 @@ def load_styles(files: Sequence[StyleFile]) -> StyleMixture:
     """
     weights = normalized([file.weight for file in files])  # raises before any image is read
     names = tuple(file.path.name for file in files)
-    return StyleMixture(tuple(load_image(file.path) for file in files), weights, names)
+    return Style(tuple(load_image(file.path) for file in files), weights, names)
 
 
 def _cameras_on_all_ranks(

@@ -13,7 +13,7 @@ from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, ViewOptions
-from worker.regions import RegionRequest
+from worker.region_requests import RegionRequest
 from worker.styles import StyleFile
 
 

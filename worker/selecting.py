@@ -15,13 +15,13 @@ from sgsst_core.errors import ImageError, SceneError
 from sgsst_core.files.images import find_masks, load_photo
 from sgsst_core.files.ply_columns import read_property
 from sgsst_core.files.scene_file import SceneFile
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Region, Regions, check_regions
-from sgsst_core.planning.masks import count_votes, decide_by_votes
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.regions.definition import Region, Regions, check_regions
+from sgsst_core.regions.masks import count_votes, decide_by_votes
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.selection import in_box, in_half_space, in_sphere, where_property
-from worker.regions import REST, RegionRequest, Selection
+from sgsst_core.style import Style
+from worker.region_requests import REST, RegionRequest, Selection
 from worker.styles import StyleFile
 
 
@@ -30,7 +30,7 @@ def select_regions(
     file: SceneFile,
     cameras: Sequence[Camera],
     near: float,
-    load: Callable[[Sequence[StyleFile]], StyleMixture],
+    load: Callable[[Sequence[StyleFile]], Style],
     sh_attenuation: float = 0.0,
 ) -> Regions | None:
     """Return the requested regions of a scene, or None if none are requested.
@@ -38,7 +38,7 @@ def select_regions(
     A Gaussian that several regions select belongs to the last of them.
 
     Args:
-        requests: Requested regions; see `worker.regions.region_requests`.
+        requests: Requested regions; see `worker.region_requests.region_requests`.
         file: Scene.
         cameras: Cameras that mask images may belong to, at the sizes at which the scene is stylized.
         near: Near plane in world units.
@@ -112,7 +112,7 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
 
 
 def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
-    """Return a flag for each Gaussian, [N] bool: whether the masks of some views select it. See `planning.masks`.
+    """Return a flag for each Gaussian, [N] bool: whether the masks of some views select it. See `regions.masks`.
 
     Raises:
         ImageError: If there are no masks, or if a mask cannot be used.

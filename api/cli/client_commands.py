@@ -30,7 +30,7 @@ from sgsst_core.files.formats import (
     format_of_name,
     result_name,
 )
-from worker.regions import RegionOptions, region_options, region_requests
+from worker.region_requests import RegionOptions, region_options, region_requests
 from worker.styles import parse_styles
 
 if TYPE_CHECKING:

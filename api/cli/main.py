@@ -24,7 +24,7 @@ from sgsst_core.files.formats import EXTRA_SUFFIXES, SUFFIXES
 from sgsst_core.options import renamed_hint
 from sgsst_core.settings import make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
-from worker.regions import region_options, region_requests
+from worker.region_requests import region_options, region_requests
 from worker.styles import parse_styles
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs

@@ -1,4 +1,4 @@
-"""Command-line options that define regions of a scene. `worker.regions` interprets them."""
+"""Command-line options that define regions of a scene. `worker.region_requests` interprets them."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from service.errors import RefusedInputError
-from worker.regions import MOST_REGIONS, RegionRequest
+from worker.region_requests import MOST_REGIONS, RegionRequest
 from worker.styles import MOST_PICTURES
 
 ROLES = ("scene", "style", "cameras", "photos")

@@ -39,20 +39,20 @@ from sgsst_core.files.formats import format_of_name, read_scene_header
 from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
 from sgsst_core.files.sh_attenuation import check_sh_attenuation
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.orbit.choice import Orbit
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import PlanningProgress, ShowPlanning
 from sgsst_core.quality.packed import measure_packed
+from sgsst_core.regions.definition import Regions
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.job_styles import check_style_size
 from sgsst_core.stylizing.refining import refine, refined
-from sgsst_core.stylizing.style_picture import check_style_size
 from worker.inputs import check_something_in_view, load_styles, read_cameras_of, read_regions
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
@@ -82,7 +82,7 @@ class _Read:
     scene: Scene
     cameras: list[Camera]
     orbit: Orbit | None
-    style: StyleMixture
+    style: Style
     regions: Regions | None
 
 
@@ -122,7 +122,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
             _check_pixel_count(path, limits)
         job = stylize_request(staged, parameters)
         style = load_styles(job.styles)
-        found["style"] = [style.pictures[0].shape[1], style.pictures[0].shape[0]]
+        found["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
     with _ErrorsOf("cameras"):
         check_choice(source)
         if source.cameras is not None:

@@ -75,6 +75,17 @@ def chosen_places(count: int, most: int = MOST_VECTORS) -> Tensor:
     return ((part + (part * _GOLDEN).frac()) * (count / most)).long().clamp_max(count - 1)
 
 
+def positions_per_image(counts: Sequence[int], weights: Sequence[float], most: int = MOST_VECTORS) -> list[int]:
+    """Return how many positions to take from each image of a style.
+
+    If there are at most `most` positions in total, all are taken. Otherwise each image contributes in proportion to its
+    weight, but at least one position if it has any.
+    """
+    if sum(counts) <= most:
+        return list(counts)
+    return [min(count, max(1, int(most * weight))) for count, weight in zip(counts, weights, strict=True)]
+
+
 def places_in(places: Tensor, width: int, cells: Rectangle) -> tuple[Tensor, Tensor, Tensor]:
     """Select the row-major positions in a feature map of the given width that lie inside a rectangle.
 

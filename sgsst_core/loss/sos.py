@@ -30,8 +30,7 @@ from sgsst_core.features.vgg import (
     FeatureNetwork,
     layer_stride,
 )
-from sgsst_core.loss.mixture import StyleMixture, mixed_target, shares_of
-from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, places_in
+from sgsst_core.loss.nearest import Matches, StyleVectors, chosen_places, places_in, positions_per_image
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.style_losses import has_statistics, nearest_layers, nearest_weight, term_weights
 from sgsst_core.loss.terms import (
@@ -53,6 +52,7 @@ from sgsst_core.scene.pyramid import (
     style_size,
 )
 from sgsst_core.settings import StyleLossName
+from sgsst_core.style import Style
 from sgsst_core.timing import Timer
 
 #: Default memory budget for activations in bytes; leaves most of a laptop's memory free.
@@ -301,7 +301,7 @@ class SosLoss:
             return tiles
         return [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
-    def style_targets(self, style: Tensor | StyleMixture, view_size: Size) -> dict[int, ScaleTarget]:
+    def style_targets(self, style: Tensor | Style, view_size: Size) -> dict[int, ScaleTarget]:
         """Compute the style targets of all scales with a positive weight.
 
         If a style image is so small that a layer's feature map is empty at some scale, the layer is not compared at
@@ -314,8 +314,8 @@ class SosLoss:
         Raises:
             ImageError: If the loss matches features, and the style image is too small to have any.
         """
-        mixture = StyleMixture.of(style)
-        pyramids = [self._style_pyramid(picture, view_size) for picture in mixture.pictures]
+        mixture = Style.of(style)
+        pyramids = [self._style_pyramid(picture, view_size) for picture in mixture.images]
         layers = self._mixed_layers(pyramids, mixture.weights) if self.style_layers else {}
         vectors = {
             scale: self._style_vectors([pyramid[scale] for pyramid in pyramids], mixture.weights)
@@ -347,7 +347,9 @@ class SosLoss:
                 pairs = zip(every, weights, strict=True)
                 some = [(own[scale][layer], weight) for own, weight in pairs if layer in own[scale]]
                 if some:
-                    mixed[scale][layer] = mixed_target([target for target, _ in some], [weight for _, weight in some])
+                    mixed[scale][layer] = LayerTarget.mixed(
+                        [target for target, _ in some], [weight for _, weight in some]
+                    )
         return mixed
 
     def _style_statistics(self, scaled: Mapping[int, Tensor]) -> dict[int, dict[str, LayerTarget]]:
@@ -379,7 +381,7 @@ class SosLoss:
             return None
         stride = layer_stride(self.nearest_layers[0])
         counts = [(size[0] // stride) * (size[1] // stride) for size in map(_size, images)]
-        most = shares_of(counts, weights, MOST_VECTORS)
+        most = positions_per_image(counts, weights)
         parts = [
             self._vectors_of(image, chosen_places(count, some))
             for image, count, some in zip(images, counts, most, strict=True)

@@ -11,6 +11,7 @@ sum instead of the number of positions.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -66,6 +67,27 @@ class LayerTarget:
     def of(statistics: LayerStatistics) -> LayerTarget:
         """Create the target from the statistics of a style image."""
         return LayerTarget(statistics.gram(), statistics.mean, statistics.std())
+
+    @staticmethod
+    def mixed(targets: Sequence[LayerTarget], weights: Sequence[float]) -> LayerTarget:
+        """Combine the targets of several images into the target of a style of all of them.
+
+        The variance is a sum of non-negative terms, which avoids the cancellation in diag(G) - mu^2:
+
+            G = sum_i w_i G_i,  mu = sum_i w_i mu_i,  sigma^2 = sum_i w_i (sigma_i^2 + (mu_i - mu)^2)
+
+        Args:
+            targets: Target of each image.
+            weights: Weights w_i, which need not add up to 1.
+        """
+        if len(targets) == 1:
+            return targets[0]
+        total = math.fsum(weights)
+        pairs = [(target, weight / total) for target, weight in zip(targets, weights, strict=True)]
+        mean = torch.stack([weight * target.mean for target, weight in pairs]).sum(dim=0)
+        gram = torch.stack([weight * target.gram for target, weight in pairs]).sum(dim=0)
+        variances = [weight * (target.std.square() + (target.mean - mean).square()) for target, weight in pairs]
+        return LayerTarget(gram, mean, torch.stack(variances).sum(dim=0).sqrt())
 
 
 class LossTerms(Mapping[str, float]):

@@ -9,8 +9,6 @@ from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.loss.style_losses import has_statistics
 from sgsst_core.orbit.choice import Orbit, orbit_decisions
@@ -24,9 +22,11 @@ from sgsst_core.planning.probe import measure, probe_link
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
+from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
+from sgsst_core.style import Style
 from sgsst_core.timing import Timer
 
 
@@ -43,7 +43,7 @@ def make_plan(
     show: ShowPlanning | None = None,
     timer: Timer | None = None,
     orbit: Orbit | None = None,
-    style: StyleMixture | None = None,
+    style: Style | None = None,
     regions: Regions | None = None,
     refinement: Refinement | None = None,
 ) -> tuple[Plan, PlanningContext]:
@@ -108,17 +108,17 @@ def make_plan(
     return replace(plan, refinement=refinement, decisions=(*request_lines, *plan.decisions)), planning_context
 
 
-def _style_count(style: StyleMixture | None, regions: Regions | None) -> int:
+def _style_count(style: Style | None, regions: Regions | None) -> int:
     """Return the number of style images of a job, including those of regions as resolved by `Regions.resolved`."""
     mixtures = [style] if regions is None else [regions.every[index].style or style for index in regions.active]
-    return sum(len(mixture.pictures) if mixture else 1 for mixture in mixtures)
+    return sum(len(mixture.images) if mixture else 1 for mixture in mixtures)
 
 
-def _about_styles(style: StyleMixture, settings: Settings) -> list[Decision]:
+def _about_styles(style: Style, settings: Settings) -> list[Decision]:
     """Return the line about the mixture of several style images."""
-    if len(style.pictures) == 1:
+    if len(style.images) == 1:
         return []
-    reason = f"{len(style.pictures)} images were given"
+    reason = f"{len(style.images)} images were given"
     if not has_statistics(settings.style_loss):
         reason += (
             "; features are matched with those of all images, whose weights matter only if there are too many features"

@@ -19,13 +19,13 @@ from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN
 from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.scene_file import SceneFile
-from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.planning.survey import Survey, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
+from sgsst_core.style import Style
 
 #: Plausible range of lengths of trained quaternions. Lengths outside it indicate a failed training or export.
 QUATERNION_LENGTHS = (1e-3, 1e3)
@@ -84,7 +84,7 @@ class Finding:
 def findings_of(
     file: SceneFile,
     cameras: Sequence[Camera],
-    style: Tensor | StyleMixture | None,
+    style: Tensor | Style | None,
     *,
     near: float,
     survey: Survey | None = None,
@@ -100,7 +100,7 @@ def findings_of(
     """
     rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: nothing is allocated yet
     found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, survey=survey)]
-    pictures = () if style is None else StyleMixture.of(style).pictures
+    pictures = () if style is None else Style.of(style).images
     return [*found, *(finding for picture in pictures for finding in style_findings(picture, cameras))]
 
 

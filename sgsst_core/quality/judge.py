@@ -20,7 +20,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
-from sgsst_core.loss.mixture import StyleMixture, mixed_moments
 from sgsst_core.loss.sos import resize_area
 from sgsst_core.quality.consistency import shown
 from sgsst_core.quality.lpips import Lpips, unit_features
@@ -29,7 +28,8 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from sgsst_core.stylizing.regions import JobStyles
+from sgsst_core.style import Style, mixed_moments
+from sgsst_core.stylizing.job_styles import JobStyles
 
 #: Maximum longer side of judged views in pixels. The limit keeps results at different resolutions comparable, and
 #: bounds the cost of large views.
@@ -87,7 +87,7 @@ class Judge:
     def __init__(
         self,
         lpips: Lpips,
-        style: Tensor | StyleMixture | JobStyles,
+        style: Tensor | Style | JobStyles,
         scene: Scene,
         rasterizer: Rasterizer,
         cameras: Sequence[Camera],
@@ -95,7 +95,7 @@ class Judge:
     ) -> None:
         self.scene = scene
         self._lpips, self._rasterizer = lpips, rasterizer
-        styles = style if isinstance(style, JobStyles) else JobStyles(StyleMixture.of(style))
+        styles = style if isinstance(style, JobStyles) else JobStyles(Style.of(style))
         self._judges = [_StyleJudge(lpips, each) for each in styles.each or (styles.own,)]
         self._maps = styles.maps(rasterizer)
         self._background = torch.tensor(background, dtype=rasterizer.dtype, device=rasterizer.device)
@@ -184,10 +184,10 @@ class Judge:
 class _StyleJudge:
     """Judge that compares images with one style."""
 
-    def __init__(self, lpips: Lpips, style: StyleMixture) -> None:
+    def __init__(self, lpips: Lpips, style: Style) -> None:
         self._lpips = lpips
         self._style = style.map(lambda picture: picture.to(lpips.device, torch.float32))
-        moments = [_moments(each.reshape(-1, 3), each.new_ones(each[..., 0].numel())) for each in self._style.pictures]
+        moments = [_moments(each.reshape(-1, 3), each.new_ones(each[..., 0].numel())) for each in self._style.images]
         self._palette = mixed_moments(moments, style.weights)
         self._targets: dict[tuple[int, int], list[Tensor]] = {}
 
@@ -215,7 +215,7 @@ class _StyleJudge:
         Style images are resized as in the loss, but not below AlexNet's minimum size.
         """
         if view not in self._targets:
-            every = [self._grams_of(picture, view) for picture in self._style.pictures]
+            every = [self._grams_of(picture, view) for picture in self._style.images]
             self._targets[view] = [
                 reduce(operator.add, [weight * gram for gram, weight in zip(grams, self._style.weights, strict=True)])
                 for grams in zip(*every, strict=True)

@@ -34,10 +34,10 @@ from sgsst_core.quality.consistency import (
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.arguments import CameraKey, camera_key
+from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.camera import Camera, between, resized
 from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from sgsst_core.stylizing.regions import RegionMaps
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
 MOST_VIEWS = 4

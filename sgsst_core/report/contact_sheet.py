@@ -45,7 +45,7 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
             camera = views.cameras[index]
             renders = [_picture(views.rasterizer.render(views.colors(index, dc), camera)) for dc in dcs]
             pairs.append((camera, renders))
-    sheet = _sheet(_stacked([_picture(picture) for style in stylizer.styles.all for picture in style.pictures]), pairs)
+    sheet = _sheet(_stacked([_picture(picture) for style in stylizer.styles.all for picture in style.images]), pairs)
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
 

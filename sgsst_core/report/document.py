@@ -151,7 +151,7 @@ def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
         paths = tuple(map(Path, style.names))  # a single active region with its own style covers the whole scene
     return [
         {"path": str(path), "width": picture.shape[1], "height": picture.shape[0], "weight": weight}
-        for path, picture, weight in zip(paths, style.pictures, style.weights, strict=True)
+        for path, picture, weight in zip(paths, style.images, style.weights, strict=True)
     ]
 
 

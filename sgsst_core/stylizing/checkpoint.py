@@ -25,16 +25,16 @@ from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.loss.feature_scale import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCALE
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.refine.split import Refinement
+from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.state import StepRecord, StylizerState
 
@@ -132,7 +132,7 @@ def versions() -> dict[str, str]:
 def fingerprint(
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor | StyleMixture,
+    style: Tensor | Style,
     settings: Settings,
     weights: str,
     photos: str = "",
@@ -150,9 +150,9 @@ def fingerprint(
         regions: Regions of the scene; None if there are none.
     """
     digest = hashlib.sha256(repr((weights, photos)).encode())
-    mixture = StyleMixture.of(style)
+    mixture = Style.of(style)
     arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest)
-    for tensor in (*arrays, *mixture.pictures):
+    for tensor in (*arrays, *mixture.images):
         digest.update(repr(tuple(tensor.shape)).encode())
         if isinstance(tensor, StoredHarmonics):
             tensor.for_blocks(
@@ -160,7 +160,7 @@ def fingerprint(
             )
         else:
             digest.update(tensor.contiguous().numpy().data)
-    if len(mixture.pictures) > 1:
+    if len(mixture.images) > 1:
         digest.update(repr(mixture.weights).encode())
     if regions is not None:
         _add_regions(digest, regions)
@@ -177,7 +177,7 @@ def _add_regions(digest: Any, regions: Regions) -> None:
     """Add the grouping and treatment of Gaussians to a digest, without the names of the regions."""
     digest.update(regions.labels.contiguous().numpy().data)
     for region in regions.every:
-        pictures, weights = (region.style.pictures, region.style.weights) if region.style else ((), ())
+        pictures, weights = (region.style.images, region.style.weights) if region.style else ((), ())
         digest.update(repr((region.freeze, region.weight, weights)).encode())
         for picture in pictures:
             digest.update(repr(tuple(picture.shape)).encode() + picture.contiguous().numpy().tobytes())

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import has_converged, has_reached
-from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
@@ -228,7 +228,7 @@ def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:
 def stylize(
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor | StyleMixture,
+    style: Tensor | Style,
     settings: Settings,
     *,
     weights: BackboneWeights | None = None,

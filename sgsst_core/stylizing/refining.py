@@ -22,8 +22,6 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.difference import psnr
 from sgsst_core.loss.feature_scale import weights_for
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import ScaleTarget, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -33,11 +31,13 @@ from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, most_children
 from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split
+from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.style_picture import prepared_style
+from sgsst_core.style import Style
+from sgsst_core.stylizing.job_styles import prepared_style
 from sgsst_core.stylizing.warm_start import with_moments
 
 #: Number of evenly spread views whose gradient is computed; each costs an iteration.
@@ -54,7 +54,7 @@ _ROUNDS, _TAKEN_BACK = 24, 0.25
 def refine(
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor | StyleMixture,
+    style: Tensor | Style,
     settings: Settings,
     *,
     weights: BackboneWeights,
@@ -84,7 +84,7 @@ def refine(
     fitted = fit_cameras(cameras, settings)
     planning_context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
     frozen = None if regions is None else regions.frozen
-    return _Refining(planning_context, StyleMixture.of(style), collectives, frozen, show).run()
+    return _Refining(planning_context, Style.of(style), collectives, frozen, show).run()
 
 
 def refined(scene: Scene, refinement: Refinement | None) -> Scene:
@@ -123,7 +123,7 @@ class _Refining:
     def __init__(
         self,
         planning_context: PlanningContext,
-        style: StyleMixture,
+        style: Style,
         collectives: Collectives,
         frozen: Tensor | None,
         show: ShowPlanning | None,

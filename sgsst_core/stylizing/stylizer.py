@@ -20,8 +20,6 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Regions
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -32,9 +30,11 @@ from sgsst_core.planning.planner import make_plan
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import repeatable
 from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.evaluation import (
     Evaluation,
@@ -43,14 +43,14 @@ from sgsst_core.stylizing.evaluation import (
     mean_evaluation,
     mean_loss,
 )
+from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.optimizer import ColorOptimizer, constrained, is_too_large
 from sgsst_core.stylizing.refining import refine, refined
-from sgsst_core.stylizing.regions import JobStyles, neighbors_change_by_region
 from sgsst_core.stylizing.schedule import Phase, drawn_round, drawn_views, phase_at, planned_phases
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.training_background import Color, drawn_color
-from sgsst_core.stylizing.unseen import neighbors_change
+from sgsst_core.stylizing.unseen import neighbors_change, neighbors_change_by_region
 from sgsst_core.stylizing.views import Views
 from sgsst_core.timing import Timer
 
@@ -86,7 +86,7 @@ class Stylizer:
         plan: Plan,
         scene: Scene,
         cameras: Sequence[Camera],
-        style: Tensor | StyleMixture,
+        style: Tensor | Style,
         settings: Settings,
         *,
         weights: BackboneWeights,
@@ -112,7 +112,7 @@ class Stylizer:
         self.photos = photos
         weights_of_views = plan.survey.total_blend_weights
         self.regions = regions = regions and regions.resolved(weights_of_views)
-        self.styles = JobStyles.prepared(StyleMixture.of(style), regions, settings, scene.sh_dc, weights_of_views)
+        self.styles = JobStyles.prepared(Style.of(style), regions, settings, scene.sh_dc, weights_of_views)
         forget_device_peak(plan.device)
         self.network = (
             planning_context.network
@@ -168,7 +168,7 @@ class Stylizer:
         cls,
         scene: Scene,
         cameras: Sequence[Camera],
-        style: Tensor | StyleMixture,
+        style: Tensor | Style,
         settings: Settings,
         *,
         weights: BackboneWeights | None = None,
@@ -182,7 +182,7 @@ class Stylizer:
         If the settings request refinement, the stylizer contains the refined scene.
         """
         weights = weights or load_network_weights("auto")
-        mixture = StyleMixture.of(style)
+        mixture = Style.of(style)
         made = refine(
             scene,
             cameras,
@@ -324,7 +324,7 @@ class Stylizer:
         )
 
     @property
-    def style(self) -> StyleMixture:
+    def style(self) -> Style:
         """Style of all Gaussians that are not in a region with its own style."""
         return self.styles.own
 

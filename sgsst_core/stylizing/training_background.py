@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.settings import PlannedBackground
+from sgsst_core.style import Style
 
 #: Red, green and blue in 0..1.
 Color = tuple[float, float, float]
@@ -24,7 +24,7 @@ Color = tuple[float, float, float]
 _BITS = 53  # bits of a float64's fraction
 
 
-def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style: Tensor | StyleMixture) -> Color | None:
+def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style: Tensor | Style) -> Color | None:
     """Return the background color of a view in one step; None for the background of the settings.
 
     Args:
@@ -39,18 +39,18 @@ def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style:
         return None
     red, green, blue = _uniform(seed, step, view)
     if kind == "palette":
-        pixels = _drawn_picture(StyleMixture.of(style), green).reshape(-1, 3)
+        pixels = _drawn_picture(Style.of(style), green).reshape(-1, 3)
         red, green, blue = pixels[int(red * len(pixels))].tolist()
     return red, green, blue
 
 
-def _drawn_picture(style: StyleMixture, number: float) -> Tensor:
+def _drawn_picture(style: Style, number: float) -> Tensor:
     """Return the image of a mixture that a random number in [0, 1) selects, with probabilities equal to the weights."""
-    for picture, weight in zip(style.pictures, style.weights, strict=True):
+    for picture, weight in zip(style.images, style.weights, strict=True):
         number -= weight
         if number < 0:
             return picture
-    return style.pictures[-1]  # the sum of the weights may be rounded down
+    return style.images[-1]  # the sum of the weights may be rounded down
 
 
 def _uniform(*numbers: int) -> Color:

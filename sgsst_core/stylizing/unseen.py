@@ -6,6 +6,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from sgsst_core.regions.definition import Regions
+
 #: Number of seen neighbors that determine the color change of an unseen Gaussian.
 NEIGHBORS = 8
 #: Number of unseen Gaussians processed at a time; their neighbors' changes and weights take some tens of megabytes.
@@ -62,3 +64,29 @@ def _votes(nearest: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     # Relative to the largest weight, so that tiny weights do not underflow.
     share = own / own.amax(dim=1, keepdim=True)
     return (change[nearest].double() * share[:, :, None]).sum(dim=1) / share.sum(dim=1, keepdim=True)
+
+
+def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:
+    """Return color changes for the Gaussians that are not optimized: those of their neighbors in the same region.
+
+    If a region has no optimized Gaussians, neighbors in all regions count. The change of frozen Gaussians is 0.
+
+    Args:
+        means: [N, 3], see `neighbors_change`.
+        change: [N, 3], see `neighbors_change`.
+        weights: [N] float64, total blend weights of the optimized Gaussians; 0 for all others.
+        regions: Regions of the scene.
+
+    Returns:
+        [N, 3].
+    """
+    result = torch.zeros_like(change)
+    for region in regions.labels[~regions.frozen].unique().tolist():
+        members = regions.members(region)
+        voters = torch.where(members, weights, 0.0)
+        if not bool((voters > 0).any()):
+            voters = weights
+        rows = members | (voters > 0)
+        takes = rows & (voters <= 0)
+        result[takes] = neighbors_change(means[rows], change[rows], voters[rows])
+    return result

@@ -17,12 +17,12 @@ from sgsst_core.parallel.division import Piece, divide_rows
 from sgsst_core.parallel.shown import ShownGaussians
 from sgsst_core.rasterizer import Rasterizer, Rows
 from sgsst_core.rasterizer.cached import CachedRasterizer, repeatable
+from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_colors_gradient
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
-from sgsst_core.stylizing.regions import RegionMaps
 from sgsst_core.stylizing.training_background import Color, put_behind
 
 

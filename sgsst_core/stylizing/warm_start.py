@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
-from sgsst_core.loss.mixture import StyleMixture, mixed_moments
 from sgsst_core.loss.nearest import chosen_places
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
+from sgsst_core.style import Style, mixed_moments
 from sgsst_core.stylizing.color_transport import transported
 
 #: A direction counts as flat if the variance of the colors along it is less than this fraction of their largest
@@ -30,7 +30,7 @@ _FLAT = 1e-9
 _PIXELS = 1 << 16
 
 
-def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
+def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | Style) -> Tensor:
     """Return DC coefficients with the distribution of the style's colors, all of them displayable (0..1).
 
     Args:
@@ -42,33 +42,33 @@ def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> 
         [N, 3] float32.
     """
     colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
-    wanted = _some_pixels(StyleMixture.of(style)).to(colors)
+    wanted = _some_pixels(Style.of(style)).to(colors)
     moved = transported(colors, weights.double() / weights.double().amax(), wanted)
     return on_screen(((moved.clamp(0, 1) - COLOR_OFFSET) / SH_C0).to(sh_dc.dtype))
 
 
-def _some_pixels(style: StyleMixture) -> Tensor:
+def _some_pixels(style: Style) -> Tensor:
     """Return evenly spread pixels [n, 3] of a style, in proportion to the weights of its images."""
     parts = []
-    for picture, weight in zip(style.pictures, style.weights, strict=True):
+    for picture, weight in zip(style.images, style.weights, strict=True):
         pixels, count = picture.reshape(-1, 3), max(1, round(_PIXELS * weight))
         places = chosen_places(len(pixels), count)
-        if len(style.pictures) > 1 and len(places) < count:  # repeat the pixels of a small image
+        if len(style.images) > 1 and len(places) < count:  # repeat the pixels of a small image
             places = torch.arange(count) * len(pixels) // count
         parts.append(pixels[places])
     return torch.cat(parts)
 
 
-def with_moments(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
+def with_moments(sh_dc: Tensor, weights: Tensor, style: Tensor | Style) -> Tensor:
     """Return DC coefficients with the style's mean and covariance, clipped to 0..1; arguments as in `warm_start`."""
     colors = 0.5 + SH_C0 * sh_dc.double()
     mean, covariance = _moments(colors, weights.double() / weights.double().amax())
-    wanted_mean, wanted = _style_moments(StyleMixture.of(style))
+    wanted_mean, wanted = _style_moments(Style.of(style))
     matched = (colors - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
     return on_screen(((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype))
 
 
-def in_colors_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
+def in_colors_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
     """Match the mean and covariance of a style's colors to those of a scene, the inverse of `with_moments`.
 
     Several images are mapped together, by the moments of their mixture.
@@ -90,16 +90,16 @@ def in_colors_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMi
     return style.map(match)
 
 
-def _style_moments(style: StyleMixture) -> tuple[Tensor, Tensor]:
+def _style_moments(style: Style) -> tuple[Tensor, Tensor]:
     """Return mean [3] and covariance [3, 3] of a style's pixels, float64."""
     found = []
-    for picture in style.pictures:
+    for picture in style.images:
         pixels = picture.reshape(-1, 3).double()
         found.append(_moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device)))
     return mixed_moments(found, style.weights)
 
 
-def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture) -> Tensor:
+def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | Style) -> Tensor:
     """Return DC coefficients with the style's mean and spread of luminance, clamped to 0..1, and their own chroma.
 
     Arguments are as in `warm_start`.
@@ -108,11 +108,11 @@ def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | StyleMixture
         [N, 3] float32.
     """
     own = luminance(COLOR_OFFSET + SH_C0 * sh_dc.double())
-    matched = _matched(own, _luminance_moments(own, weights.double()), _style_luminance(StyleMixture.of(style)))
+    matched = _matched(own, _luminance_moments(own, weights.double()), _style_luminance(Style.of(style)))
     return (sh_dc.double() + ((matched - own) / SH_C0)[:, None]).to(sh_dc.dtype)
 
 
-def in_luminance_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> StyleMixture:
+def in_luminance_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
     """Convert a style to gray, and match the mean and deviation of its luminance to those of a scene.
 
     Several images are mapped together, by the moments of their mixture.
@@ -132,9 +132,9 @@ def in_luminance_of(style: StyleMixture, sh_dc: Tensor, weights: Tensor) -> Styl
     return style.map(match)
 
 
-def _style_luminance(style: StyleMixture) -> tuple[Tensor, Tensor]:
+def _style_luminance(style: Style) -> tuple[Tensor, Tensor]:
     """Return mean and deviation of the luminance of a style's pixels."""
-    found = [luminance(picture.reshape(-1, 3).double()) for picture in style.pictures]
+    found = [luminance(picture.reshape(-1, 3).double()) for picture in style.images]
     parts = [_luminance_moments(values, torch.ones_like(values)) for values in found]
     if len(parts) == 1:
         return parts[0]

@@ -23,7 +23,7 @@ from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall, write_files
 from worker.execute import Result, execute
 from worker.prepare import Job, prepare
-from worker.regions import region_options, region_requests
+from worker.region_requests import region_options, region_requests
 from worker.request import Resume, SceneRequest, StylizeRequest
 from worker.styles import StyleFile
 

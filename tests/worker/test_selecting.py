@@ -14,12 +14,12 @@ from sgsst_core.errors import ImageError, SceneError, SettingsError
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.images import save_png
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.style import Style
 from tests.small_scenes import cameras, wall, write_files
 from worker.inputs import load_styles
-from worker.regions import RegionRequest, parse_selection
+from worker.region_requests import RegionRequest, parse_selection
 from worker.selecting import select, select_regions
 
 
@@ -167,7 +167,7 @@ def test_styles_are_read(tmp_path: Path, file: SceneFile) -> None:
     request = region("a", "half-space=1,0,0,0", styles=(StyleFile(tmp_path / "s.png"),), weight=2.0)
     found = select_regions((request,), file, cameras(), 0.2, load_styles)
     assert found is not None
-    assert isinstance(found.every[1].style, StyleMixture)
+    assert isinstance(found.every[1].style, Style)
     assert (found.every[1].style.names, found.every[1].weight, found.every[1].select) == (
         ("s.png",),
         2.0,

@@ -12,18 +12,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.loss.sos import resize_area
 from sgsst_core.quality.judge import JUDGED_SIDE, Judge, Judgment, frechet_distance, saturated
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.scene.stored_harmonics import held
-from sgsst_core.stylizing.regions import JobStyles
+from sgsst_core.style import Style
+from sgsst_core.stylizing.job_styles import JobStyles
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -155,7 +155,7 @@ def regions_of(scene: Scene, left: Tensor, right: Tensor, *, freeze: bool = Fals
     labels = (scene.means[:, 0] > 0).to(torch.uint8)
     regions = Regions(every, labels).resolved(torch.ones(len(scene)).double())
     each = (right,) if freeze else (left, right)
-    return JobStyles(StyleMixture.of(left), regions, tuple(map(StyleMixture.of, each)))
+    return JobStyles(Style.of(left), regions, tuple(map(Style.of, each)))
 
 
 def test_regions_are_judged_by_their_own_styles(alex: Lpips) -> None:
@@ -184,7 +184,7 @@ def test_what_is_kept_has_no_style_to_be_judged_by(alex: Lpips) -> None:
 
 def test_equal_pictures_are_judged_as_one(alex: Lpips) -> None:
     scene, views = wall(), cameras(2)
-    mixture = StyleMixture.weighted([style(), style()], [1, 3])
+    mixture = Style.weighted([style(), style()], [1, 3])
     one, two = (
         judged(Judge(alex, each, scene, CpuRasterizer(scene), views), scene.sh_dc) for each in (style(), mixture)
     )

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.quality.judge import saturated
+from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.screen import LARGEST
 from sgsst_core.settings import make_settings

@@ -13,12 +13,12 @@ from safetensors.torch import save_file
 from sgsst_core.decision import Decision
 from sgsst_core.errors import CheckpointError, OutputError
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.terms import TERMS, LossTerms
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.refine.split import Refinement
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing import checkpoint
 from sgsst_core.stylizing.checkpoint import (
     Checkpoint,
@@ -310,10 +310,10 @@ def test_the_fingerprint_of_several_styles_tells_them_and_their_weights_apart() 
     scene, views, settings = wall(), cameras(), make_settings()
     pictures = [style(), style().flip(0)]
     alone = fingerprint(scene, views, style(), settings, "w")
-    assert fingerprint(scene, views, StyleMixture.weighted(pictures[:1], [3]), settings, "w") == alone
+    assert fingerprint(scene, views, Style.weighted(pictures[:1], [3]), settings, "w") == alone
     mixtures = [([0, 1], [1, 1]), ([0, 1], [1, 2]), ([1, 0], [1, 2])]
     found = {
-        fingerprint(scene, views, StyleMixture.weighted([pictures[i] for i in order], weights), settings, "w")
+        fingerprint(scene, views, Style.weighted([pictures[i] for i in order], weights), settings, "w")
         for order, weights in mixtures
     }
     assert len(found | {alone}) == 4

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.refine.split import parents_of, piece_counts
+from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.stylizing.test_refining import large_wall
@@ -24,13 +24,13 @@ def halves() -> Regions:
     across = large_wall().means[:, 0]
     labels = torch.zeros(len(across), dtype=torch.uint8)
     labels[across < -0.5], labels[across > 0.5] = 1, 2
-    own = StyleMixture.weighted([style().flip(0), style().flip(2)], [1, 3])
+    own = Style.weighted([style().flip(0), style().flip(2)], [1, 3])
     return Regions((Region("rest"), Region("left", freeze=True), Region("right", style=own, weight=2.0)), labels)
 
 
 def job(weights: BackboneWeights, **values: object) -> Stylizer:
     settings = make_settings("preview", steps_coarse=1, steps_sos=2, measure=0, coarsest_side=24, **values)
-    both = StyleMixture.weighted([style(), style().flip(1)], [2, 1])
+    both = Style.weighted([style(), style().flip(1)], [2, 1])
     return Stylizer.planned(large_wall(), cameras(), both, settings, weights=weights, regions=halves())
 
 

@@ -12,15 +12,15 @@ import torch
 from sgsst_core import Settings, Stylizer, make_settings
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.quality.measure import Measurements
+from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.screen import on_screen_by_luminance
+from sgsst_core.style import Style
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.warm_start import warm_start
 from tests.small_scenes import cameras, style, wall
@@ -94,7 +94,7 @@ def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights) ->
 
 def test_each_region_has_the_colors_of_its_own_style_and_kept_ones_their_bits(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
-    dark, bright = (StyleMixture.of(torch.full((40, 40, 3), gray)) for gray in (0.2, 0.7))
+    dark, bright = (Style.of(torch.full((40, 40, 3), gray)) for gray in (0.2, 0.7))
     labels = (scene.means[:, 0] > 0.5).to(torch.uint8)
     labels[scene.means[:, 1] > 1] = 2
     regions = Regions(

@@ -12,7 +12,6 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
@@ -20,10 +19,11 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.job_styles import prepared_style
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.optimizer import ColorOptimizer
-from sgsst_core.stylizing.style_picture import prepared_style
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.warm_start import luminance_start
 from tests.sgsst_core.pictures import picture, relative_error
@@ -90,7 +90,7 @@ def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: Ba
     colors = (COLOR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
     image = rasterizer.render(colors, view)
     size = (view.height, view.width)
-    (painting,) = stylizer.style.pictures
+    (painting,) = stylizer.style.images
     used = resize_area(painting, style_size((painting.shape[0], painting.shape[1]), size))
     _, pixels = sos_reference(stylizer.weights, image, used, image, coarsest=24)
     exact = rasterizer.color_gradient(pixels, view) * SH_C0 * (colors > 0)
@@ -127,8 +127,8 @@ def test_the_style_takes_the_scenes_luminance() -> None:
     colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=generator)
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
     settings = make_settings(preserve_colors="luminance")
-    painting = StyleMixture.of(0.5 + 0.1 * picture(64, 64, seed=2).float())
-    (found,) = prepared_style(painting, settings, (colors - 0.5) / SH_C0, weights).pictures
+    painting = Style.of(0.5 + 0.1 * picture(64, 64, seed=2).float())
+    (found,) = prepared_style(painting, settings, (colors - 0.5) / SH_C0, weights).images
     assert torch.equal(found[..., 0], found[..., 1])
     share, values = weights / weights.sum(), luminance(colors.double())
     mean = float((share * values).sum())
@@ -142,10 +142,10 @@ def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
     """Dark and bright images stay dark and bright; only the mixture has the scene's mean and deviation."""
     colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=torch.Generator().manual_seed(1))
     dark, bright = (0.2 + 0.1 * picture(40, 60, seed=2), 0.6 + 0.1 * picture(60, 40, seed=3))
-    mixture = StyleMixture.weighted([dark.float(), bright.float()], [3, 1])
+    mixture = Style.weighted([dark.float(), bright.float()], [3, 1])
     ones = torch.ones(5000, dtype=torch.float64)
     found = prepared_style(mixture, make_settings(preserve_colors="luminance"), (colors - 0.5) / SH_C0, ones)
-    first, second = (luminance(each.double()) for each in found.pictures)
+    first, second = (luminance(each.double()) for each in found.images)
     assert float(first.mean()) < float(second.mean())
     values = luminance(colors.double())
     mean = 0.75 * first.mean() + 0.25 * second.mean()
@@ -164,7 +164,7 @@ def test_flat_styles_and_scenes_are_finite(value: float) -> None:
     flat, some = torch.full((5, 4, 3), value), 0.3 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     ones = torch.ones(20, dtype=torch.float64)
     for scene_colors, painting in ((some, flat), (torch.full((20, 3), (value - 0.5) / SH_C0), style())):
-        (found,) = prepared_style(StyleMixture.of(painting), settings, scene_colors, ones).pictures
+        (found,) = prepared_style(Style.of(painting), settings, scene_colors, ones).images
         assert bool(found.isfinite().all())
         wanted = luminance((0.5 + SH_C0 * scene_colors).clamp(0, 1)).mean()
         torch.testing.assert_close(found.mean(), wanted, atol=1e-4, rtol=0)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
-from sgsst_core.loss.mixture import StyleMixture
+from sgsst_core.style import Style
 from sgsst_core.stylizing.warm_start import warm_start, with_moments
 from tests.sgsst_core.pictures import picture
 
@@ -72,7 +72,7 @@ def test_a_dark_scene_gets_both_colors_of_a_bright_style() -> None:
 def test_pictures_of_a_style_count_by_their_weights() -> None:
     """Colors are as frequent as in the mixture, whatever the sizes of the images."""
     pictures = [torch.full((8, 8, 3), 0.2), torch.full((300, 400, 3), 0.8)]
-    mixture = StyleMixture.weighted(pictures, [3.0, 1.0])
+    mixture = Style.weighted(pictures, [3.0, 1.0])
     sh_dc = torch.randn(4000, 3, generator=torch.Generator().manual_seed(5))
     found = colors_of(warm_start(sh_dc, torch.ones(4000, dtype=torch.float64), mixture))
     assert float((found < 0.5).all(dim=1).double().mean()) == pytest.approx(0.75, abs=0.02)

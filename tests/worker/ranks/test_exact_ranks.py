@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName, make_settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.regions import JobStyles
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
 from tests.networks import comparing_pixels, tiny_weights
@@ -60,7 +60,7 @@ def gradient(
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     survey = survey_views(scene, [camera], rasterizer)
     weighted = survey.uncovered_share > 0.01
-    picture_ = StyleMixture.of(picture(90, 110, seed=4, dtype=dtype))
+    picture_ = Style.of(picture(90, 110, seed=4, dtype=dtype))
     regions = regions and regions.resolved(survey.total_blend_weights)
     styles = JobStyles.prepared(picture_, regions, make_settings(), scene.sh_dc, survey.total_blend_weights)
     views = Views(
@@ -121,7 +121,7 @@ def test_ranks_of_different_speed_get_different_shares_of_the_same_gradient() ->
 def test_regions_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> None:
     """Some of the three ranks have no pixel of a region, and one region is frozen."""
     scene, camera = wall(), cameras(1, 128, 96)[0]
-    other = StyleMixture.of(picture(64, 80, seed=5, dtype=torch.float64))
+    other = Style.of(picture(64, 80, seed=5, dtype=torch.float64))
     every = (Region("rest"), Region("a", style=other, weight=3.0), Region("b", freeze=True))
     labels = (scene.means[:, 1] > 0.8).to(torch.uint8) + 2 * (scene.means[:, 0] > 1).to(torch.uint8)
     regions = Regions(every, labels.clamp(max=2))

@@ -9,11 +9,11 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.loss.sos import SosLoss, resize_area
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
-from sgsst_core.stylizing.style_picture import _inside, check_style_size, prepared_style, turned
+from sgsst_core.style import Style
+from sgsst_core.stylizing.job_styles import _inside, check_style_size, prepared_style, rotated
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, wall
 
@@ -31,10 +31,10 @@ def ramp(height: int, width: int, slope_y: float, slope_x: float) -> torch.Tenso
 
 def test_quarters_of_a_turn_move_pixels_only() -> None:
     style = picture()
-    assert torch.equal(turned(style, 90), torch.rot90(style, 1, (0, 1)))
-    assert torch.equal(turned(style, -90), torch.rot90(style, -1, (0, 1)))
-    assert torch.equal(turned(style, 360), style)
-    assert turned(style, 180).is_contiguous()
+    assert torch.equal(rotated(style, 90), torch.rot90(style, 1, (0, 1)))
+    assert torch.equal(rotated(style, -90), torch.rot90(style, -1, (0, 1)))
+    assert torch.equal(rotated(style, 360), style)
+    assert rotated(style, 180).is_contiguous()
 
 
 @pytest.mark.parametrize("degrees", [1, 17, 45, 89, 107, -30, 200])
@@ -42,7 +42,7 @@ def test_quarters_of_a_turn_move_pixels_only() -> None:
 def test_a_plane_of_brightness_turns_with_the_picture(degrees: float, size: tuple[int, int]) -> None:
     """Every pixel comes from inside the image: edges are not extended and nothing is filled in."""
     height, width = size
-    found = turned(ramp(height, width, 0.001, 0.002), degrees)[..., 0]
+    found = rotated(ramp(height, width, 0.001, 0.002), degrees)[..., 0]
     angle = math.radians(degrees)
     # Counterclockwise, as seen with y pointing down: what was on the right moves up.
     slope_x = 0.002 * math.cos(angle) + 0.001 * math.sin(angle)
@@ -71,8 +71,8 @@ def test_the_cut_is_the_largest_that_lies_inside(degrees: float, size: tuple[int
     assert (across + 3) * (down + 3) >= best * 0.99
 
 
-def test_a_style_of_one_pixel_can_be_turned() -> None:
-    assert turned(torch.full((1, 1, 3), 0.25), 30).shape == (1, 1, 3)
+def test_a_style_of_one_pixel_can_be_rotated() -> None:
+    assert rotated(torch.full((1, 1, 3), 0.25), 30).shape == (1, 1, 3)
 
 
 def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
@@ -83,7 +83,7 @@ def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
     settings = make_settings("standard", preserve_colors="match")
     style = 0.5 + 0.05 * torch.randn(64, 64, 3, generator=generator)
-    (image,) = prepared_style(StyleMixture.of(style), settings, (colors - 0.5) / SH_C0, weights).pictures
+    (image,) = prepared_style(Style.of(style), settings, (colors - 0.5) / SH_C0, weights).images
     found = image.reshape(-1, 3).double()
     share = (weights / weights.sum())[:, None]
     inside = colors.double().clamp(0, 1)
@@ -95,13 +95,13 @@ def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
 
 def test_a_flat_style_takes_the_scenes_mean() -> None:
     settings = make_settings("standard", preserve_colors="match")
-    gray = StyleMixture.of(torch.full((4, 4, 3), 0.9))
-    (found,) = prepared_style(gray, settings, torch.zeros(10, 3), torch.ones(10).double()).pictures
+    gray = Style.of(torch.full((4, 4, 3), 0.9))
+    (found,) = prepared_style(gray, settings, torch.zeros(10, 3), torch.ones(10).double()).images
     torch.testing.assert_close(found, torch.full((4, 4, 3), 0.5))
 
 
 def test_without_wishes_the_style_is_itself() -> None:
-    style = StyleMixture.of(picture())
+    style = Style.of(picture())
     assert prepared_style(style, make_settings("standard"), torch.zeros(2, 3), torch.ones(2).double()) is style
 
 
@@ -137,10 +137,10 @@ def test_a_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("standard", style_rotation=90, preserve_colors="match", style_scale=2, coarsest_side=24)
     scene, style = wall(), picture()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
-    (used,) = stylizer.style.pictures
+    (used,) = stylizer.style.images
     assert used.shape == (60, 40, 3)
     assert stylizer.loss.style_scale == 2
     weights = stylizer.plan.survey.total_blend_weights
-    (wanted,) = prepared_style(StyleMixture.of(style), settings, scene.sh_dc, weights).pictures
+    (wanted,) = prepared_style(Style.of(style), settings, scene.sh_dc, weights).images
     assert torch.equal(used, wanted)
     stylizer.run_step()

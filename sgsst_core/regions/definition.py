@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.loss.mixture import StyleMixture
 from sgsst_core.refine.split import Refinement, parents_of
+from sgsst_core.style import Style
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Region:
 
     name: str
     select: str = ""
-    style: StyleMixture | None = None
+    style: Style | None = None
     weight: float = 1.0
     freeze: bool = False
     selected: int = 0

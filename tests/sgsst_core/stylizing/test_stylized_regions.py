@@ -12,18 +12,19 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.mixture import StyleMixture
-from sgsst_core.loss.regions import Region, Regions
 from sgsst_core.loss.sos import ViewTarget
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.regions import RegionMaps, neighbors_change_by_region
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.unseen import neighbors_change_by_region
 from tests.sgsst_core.pictures import relative_error
 from tests.small_scenes import ball, cameras, style, wall
 
@@ -37,7 +38,7 @@ def other_style() -> Tensor:
 def halves(scene: Scene, left: Region | None = None, right: Region | None = None) -> Regions:
     """Return the regions left and right of x = 0, of which the left one is the background."""
     labels = (scene.means[:, 0] >= 0).to(torch.uint8)
-    return Regions((left or Region("rest"), right or Region("right", style=StyleMixture.of(other_style()))), labels)
+    return Regions((left or Region("rest"), right or Region("right", style=Style.of(other_style()))), labels)
 
 
 def make(weights: BackboneWeights, scene: Scene, regions: Regions | None, image: Tensor | None = None, **values: Any):
@@ -118,7 +119,7 @@ def test_a_region_of_everything_is_a_job_with_its_style(tiny_weights: BackboneWe
     """Results are bit-identical, including unseen Gaussians."""
     scene = wall(60, 40, sh_degree=1)
     whole = Regions(
-        (Region("rest"), Region("all", style=StyleMixture.of(other_style()))), torch.ones(len(scene), dtype=torch.uint8)
+        (Region("rest"), Region("all", style=Style.of(other_style()))), torch.ones(len(scene), dtype=torch.uint8)
     )
     found, wanted = make(tiny_weights, scene, whole), make(tiny_weights, scene, None, other_style())
     for stylizer in (found, wanted):
@@ -130,7 +131,7 @@ def test_a_region_of_everything_is_a_job_with_its_style(tiny_weights: BackboneWe
 def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     labels = torch.zeros(len(scene), dtype=torch.uint8)
-    empty = Regions((Region("rest"), Region("empty", style=StyleMixture.of(other_style()))), labels)
+    empty = Regions((Region("rest"), Region("empty", style=Style.of(other_style()))), labels)
     found, wanted = make(tiny_weights, scene, empty), make(tiny_weights, scene, None)
     for stylizer in (found, wanted):
         run(stylizer)
@@ -143,7 +144,7 @@ def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights
     """A region does not approach another region's style; the styles are a uniform dark and a uniform bright image."""
     scene = wall()
     dark, bright = torch.full((40, 40, 3), 0.1), torch.full((40, 40, 3), 0.9)
-    regions = halves(scene, right=Region("right", style=StyleMixture.of(bright)))
+    regions = halves(scene, right=Region("right", style=Style.of(bright)))
     stylizer = make(tiny_weights, scene, regions, dark, steps_sos=60, content_weight=0.0, early_stop=False)
     run(stylizer)
     labels, found = regions.labels[stylizer.plan.seen], stylizer.stylized()[stylizer.plan.seen]
@@ -155,7 +156,7 @@ def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights
 def test_colors_of_a_warm_start_are_each_regions_own(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     dark, bright = torch.full((40, 40, 3), 0.2), torch.full((40, 40, 3), 0.7)
-    regions = halves(scene, right=Region("right", style=StyleMixture.of(bright)))
+    regions = halves(scene, right=Region("right", style=Style.of(bright)))
     stylizer = make(tiny_weights, scene, regions, dark, warm_start=True)
     seen = stylizer.plan.optimized
     colors = 0.5 + 0.28209479 * stylizer.transferred()
@@ -168,7 +169,7 @@ def test_colors_of_a_warm_start_are_each_regions_own(tiny_weights: BackboneWeigh
 
 def test_the_names_and_order_of_disjoint_regions_do_not_matter(tiny_weights: BackboneWeights) -> None:
     scene = wall()
-    one = halves(scene, left=Region("rest", style=StyleMixture.of(style())))
+    one = halves(scene, left=Region("rest", style=Style.of(style())))
     two = Regions(
         (Region("rest"), Region("b", style=one.every[1].style), Region("a", style=one.every[0].style)),
         torch.where(one.labels == 1, 1, 2).to(torch.uint8),
@@ -238,7 +239,7 @@ def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
     lines = {line.item: line for line in plan.decisions}
     assert "2 renders at a view's first visit, 0.1 MB for all views" in lines["regions"].decision
     assert "% of what the views show, use the style" in lines["region rest"].decision
-    assert "use picture 1" in lines["region right"].decision
+    assert "use image 1" in lines["region right"].decision
 
 
 def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: BackboneWeights) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.errors import SettingsError
-from worker.regions import MOST_REGIONS, REST, RegionOptions, parse_selection, region_options, region_requests
+from worker.region_requests import MOST_REGIONS, REST, RegionOptions, parse_selection, region_options, region_requests
 from worker.styles import MOST_PICTURES, StyleFile
 
 

@@ -6,11 +6,11 @@ import torch
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.statistics import layer_statistics_reference, merge_all
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.mixture import StyleMixture, mixed_moments, mixed_target, normalized, shares_of
-from sgsst_core.loss.nearest import MOST_VECTORS
+from sgsst_core.loss.nearest import MOST_VECTORS, positions_per_image
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.loss.terms import LayerTarget
+from sgsst_core.style import Style, mixed_moments, normalized
 from tests.sgsst_core.pictures import picture
 
 
@@ -28,7 +28,7 @@ def test_a_mixture_has_the_moments_of_all_positions_together():
     """Images with positions in proportion to their weights have the moments of their union."""
     parts = [features(1, 40), features(2, 10, offset=0.3)]
     statistics = [layer_statistics_reference(part) for part in parts]
-    mixed = mixed_target([LayerTarget.of(part) for part in statistics], normalized([4, 1]))
+    mixed = LayerTarget.mixed([LayerTarget.of(part) for part in statistics], normalized([4, 1]))
     assert_same(mixed, LayerTarget.of(merge_all(statistics)), rtol=1e-12, atol=1e-14)
 
 
@@ -38,19 +38,19 @@ def test_digits_do_not_cancel_at_large_means():
         LayerTarget(torch.eye(2).double(), torch.full((2,), 1e6).double(), torch.tensor(s, dtype=torch.float64))
         for s in ([1e-6, 0.0], [2e-6, 0.0])
     ]
-    mixed = mixed_target(targets, [0.5, 0.5])
+    mixed = LayerTarget.mixed(targets, [0.5, 0.5])
     torch.testing.assert_close(mixed.std, torch.tensor([2.5**0.5 * 1e-6, 0], dtype=torch.float64), rtol=1e-9, atol=0)
 
 
 def test_equal_pictures_are_one_picture():
     target = LayerTarget.of(layer_statistics_reference(features(3)))
-    assert_same(mixed_target([target] * 3, normalized([0.2, 3, 1])), target, rtol=1e-13, atol=1e-15)
+    assert_same(LayerTarget.mixed([target] * 3, normalized([0.2, 3, 1])), target, rtol=1e-13, atol=1e-15)
 
 
 def test_one_picture_is_itself(tiny_weights):
     loss, style = SosLoss(FeatureNetwork(tiny_weights), coarsest=40), picture(90, 70)
     alone = loss.style_targets(style, (100, 80))
-    weighted = loss.style_targets(StyleMixture.weighted([style], [0.3]), (100, 80))
+    weighted = loss.style_targets(Style.weighted([style], [0.3]), (100, 80))
     for scale, target in alone.items():
         for layer, wanted in target.layers.items():
             assert torch.equal(weighted[scale].layers[layer].gram, wanted.gram)
@@ -60,19 +60,19 @@ def test_one_picture_is_itself(tiny_weights):
 def test_targets_are_those_of_each_picture_at_its_own_size(tiny_weights):
     pictures, weights = [picture(300, 90, seed=1), picture(40, 64, seed=2)], [3.0, 1.0]
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64), coarsest=40)
-    mixed = loss.style_targets(StyleMixture.weighted(pictures, weights), (64, 80))
+    mixed = loss.style_targets(Style.weighted(pictures, weights), (64, 80))
     single = [loss.style_targets(each, (64, 80)) for each in pictures]
     for scale, target in mixed.items():
         assert set(target.layers) == set(STYLE_LAYERS)
         for layer, found in target.layers.items():
-            wanted = mixed_target([each[scale].layers[layer] for each in single], [0.75, 0.25])
+            wanted = LayerTarget.mixed([each[scale].layers[layer] for each in single], [0.75, 0.25])
             assert_same(found, wanted, rtol=1e-13, atol=1e-15)
 
 
 def test_a_tiny_picture_leaves_layers_without_cells_to_the_others(tiny_weights):
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64))
     large, tiny = picture(64, 64), picture(7, 7, seed=2)
-    mixed = loss.style_targets(StyleMixture.weighted([large, tiny], [1, 9]), (64, 64))[0].layers
+    mixed = loss.style_targets(Style.weighted([large, tiny], [1, 9]), (64, 64))[0].layers
     alone = loss.style_targets(large, (64, 64))[0].layers
     assert_same(mixed["relu4_1"], alone["relu4_1"], rtol=0, atol=0)
     assert not torch.equal(mixed["relu1_1"].mean, alone["relu1_1"].mean)
@@ -82,16 +82,16 @@ def test_features_are_matched_with_those_of_all_pictures(tiny_weights):
     network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights, content=False))
     loss = SosLoss(network, style_loss="nnfm", content_weight=0)
     pictures = [picture(40, 48, seed=1), picture(64, 32, seed=2)]
-    mixed = loss.style_targets(StyleMixture.weighted(pictures, [1, 5]), (64, 64))[0].vectors.units
+    mixed = loss.style_targets(Style.weighted(pictures, [1, 5]), (64, 64))[0].vectors.units
     single = [loss.style_targets(each, (64, 64))[0].vectors.units for each in pictures]
     assert torch.equal(mixed, torch.cat(single))
 
 
 def test_too_many_vectors_are_shared_out_by_weight():
-    assert shares_of([MOST_VECTORS, MOST_VECTORS], [0.75, 0.25], MOST_VECTORS) == [6144, 2048]
-    assert shares_of([3, 10**6], [0.9, 0.1], MOST_VECTORS) == [3, 819]
-    assert shares_of([10**6, 10**6], [1 - 1e-9, 1e-9], MOST_VECTORS)[1] == 1
-    assert shares_of([3, 4], [0.1, 0.9], MOST_VECTORS) == [3, 4]
+    assert positions_per_image([MOST_VECTORS, MOST_VECTORS], [0.75, 0.25], MOST_VECTORS) == [6144, 2048]
+    assert positions_per_image([3, 10**6], [0.9, 0.1], MOST_VECTORS) == [3, 819]
+    assert positions_per_image([10**6, 10**6], [1 - 1e-9, 1e-9], MOST_VECTORS)[1] == 1
+    assert positions_per_image([3, 4], [0.1, 0.9], MOST_VECTORS) == [3, 4]
 
 
 @pytest.mark.parametrize("weights", [[], [1.0, 0.0], [1.0, -1.0], [float("nan")], [float("inf"), 1.0]])

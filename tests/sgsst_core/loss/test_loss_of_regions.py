@@ -6,10 +6,10 @@ import torch
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.statistics import layer_statistics, merge
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.regions import Region, Regions, check_regions
 from sgsst_core.loss.sos import RegionTarget, ScaleTarget, SosLoss, resize_area
 from sgsst_core.loss.sos_reference import RegionReference, sos_reference
 from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.regions.definition import Region, Regions, check_regions
 from sgsst_core.scene.pyramid import style_size
 from tests.networks import comparing_pixels
 from tests.sgsst_core.pictures import picture, relative_error

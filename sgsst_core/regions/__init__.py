@@ -1,0 +1,1 @@
+"""Regions of a scene: their definition, their selection by masks, and their share of every pixel."""

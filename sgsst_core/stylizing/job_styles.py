@@ -1,0 +1,211 @@
+"""Styles of a job: one style, or one for each region of the scene, prepared as the settings require."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from sgsst_core.errors import SettingsError
+from sgsst_core.loss.sos import RegionTarget, ScaleTarget, SosLoss
+from sgsst_core.parallel.division import Size
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.regions.definition import Regions
+from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.pyramid import style_size
+from sgsst_core.settings import MAX_RESOLUTION, Settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.warm_start import in_colors_of, in_luminance_of, luminance_start, warm_start
+
+
+@dataclass(frozen=True)
+class JobStyles:
+    """Styles of a job, prepared as its settings require.
+
+    Attributes:
+        own: Default style; if one region contains everything that the views show, the style of that region.
+        regions: Regions of the scene; None if there are none.
+        each: Style of each region in `Regions.active`; empty if views need no region maps.
+    """
+
+    own: Style
+    regions: Regions | None = None
+    each: tuple[Style, ...] = ()
+
+    @staticmethod
+    def prepared(
+        style: Style, regions: Regions | None, settings: Settings, sh_dc: Tensor, weights: Tensor
+    ) -> JobStyles:
+        """Prepare styles as the settings require; see `prepared_style`.
+
+        Args:
+            style: Style of the job.
+            regions: Result of `Regions.resolved`; None if there are no regions.
+            settings: Settings of the job.
+            sh_dc: [N, 3], colors of the scene. A region's style may be matched to the colors of the region's own
+                Gaussians.
+            weights: [N] float64, total blend weights.
+        """
+        if regions is None:
+            return JobStyles(prepared_style(style, settings, sh_dc, weights))
+        asked = [regions.every[place].style or style for place in regions.active]
+        if not regions.mapped:
+            return JobStyles(prepared_style(asked[0], settings, sh_dc, weights), regions)
+        each = [
+            prepared_style(own, settings, sh_dc, torch.where(regions.members(place), weights, 0.0))
+            for place, own in zip(regions.active, asked, strict=True)
+        ]
+        rest = each[regions.active.index(0)] if 0 in regions.active else prepared_style(style, settings, sh_dc, weights)
+        return JobStyles(rest, regions, tuple(each))
+
+    @property
+    def all(self) -> list[Style]:
+        """All distinct styles in use."""
+        found: list[Style] = []
+        for style in self.each or (self.own,):
+            if all(style is not other for other in found):
+                found.append(style)
+        return found
+
+    def to(self, device: torch.device) -> JobStyles:
+        """Return the styles with their images on a device."""
+
+        def move(style: Style) -> Style:
+            return style.map(lambda image: image.to(device))
+
+        return replace(self, own=move(self.own), each=tuple(map(move, self.each)))
+
+    def targets(self, loss: SosLoss, view_size: Size) -> dict[int, ScaleTarget]:
+        """Compute the targets for views of a size (height, width); see `SosLoss.style_targets`."""
+        if not self.each:
+            return loss.style_targets(self.own, view_size)
+        assert self.regions is not None
+        weights = [self.regions.every[place].weight for place in self.regions.active]
+        every = [loss.style_targets(style, view_size) for style in self.each]
+        return {
+            scale: ScaleTarget(
+                {}, None, tuple(RegionTarget(own[scale], weight) for own, weight in zip(every, weights, strict=True))
+            )
+            for scale in every[0]
+        }
+
+    def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, keep_chroma: bool = False) -> Tensor:
+        """Transfer to each Gaussian the colors of its region's style; see `warm_start`.
+
+        Args:
+            sh_dc: [n, 3], colors of some of the scene's Gaussians.
+            weights: [n] float64, total blend weights.
+            rows: [N] bool, mask of these Gaussians.
+            keep_chroma: Whether to change luminance only.
+
+        Returns:
+            [n, 3].
+        """
+        transfer = luminance_start if keep_chroma else warm_start
+        if not self.each:
+            return transfer(sh_dc, weights, self.own)
+        assert self.regions is not None
+        result, labels = sh_dc.clone(), self.regions.labels[rows]
+        for place, style in zip(self.regions.active, self.each, strict=True):
+            own = labels == place
+            if bool((weights[own] > 0).any()):
+                result[own] = transfer(sh_dc[own], weights[own], style)
+        return result
+
+    def maps(self, rasterizer: Rasterizer, rows: Tensor | None = None) -> RegionMaps | None:
+        """Return the renderer of region maps; None if the views need none.
+
+        Args:
+            rasterizer: Rasterizer of the maps.
+            rows: [N] bool, Gaussians that the rasterizer contains; None for all.
+        """
+        if not self.each:
+            return None
+        assert self.regions is not None
+        labels = self.regions.labels if rows is None else self.regions.labels[rows]
+        return RegionMaps(labels, self.regions.active, rasterizer)
+
+
+def prepared_style(style: Style, settings: Settings, sh_dc: Tensor, weights: Tensor) -> Style:
+    """Prepare a style as the settings require. If they require nothing, return the style itself.
+
+    Args:
+        style: Images [H, W, 3] in 0..1.
+        settings: Settings of the job.
+        sh_dc: [N, 3], colors of the scene.
+        weights: [N] float64, total blend weights, at least one positive.
+    """
+    if settings.style_rotation:
+        style = style.map(lambda image: rotated(image, settings.style_rotation))
+    if settings.preserve_colors == "match":
+        # Gatys, Ecker, Bethge, Hertzmann, Shechtman, "Controlling Perceptual Factors in Neural Style Transfer", CVPR
+        # 2017, section 5.2.
+        style = in_colors_of(style, sh_dc, weights)
+    elif settings.preserve_colors == "luminance":
+        style = in_luminance_of(style, sh_dc, weights)  # section 5.1 of the same paper
+    return style
+
+
+def check_style_size(style: Tensor | Style, cameras: Sequence[Camera], scale: float) -> None:
+    """Check that no view requires a style image with a longer side of more than `MAX_RESOLUTION` pixels.
+
+    Args:
+        style: Image [H, W, 3], or a mixture.
+        cameras: Cameras at the sizes used for stylization.
+        scale: Scale of the strokes.
+
+    Raises:
+        SettingsError: If an image would be larger.
+    """
+    if scale <= 1:
+        return
+    images = Style.of(style).images
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    for size, image in itertools.product(sizes, images):
+        height, width = style_size((image.shape[0], image.shape[1]), size, scale)
+        if max(height, width) > MAX_RESOLUTION:
+            raise SettingsError(
+                f"--style-scale {scale:g} would make the style image {width:,} x {height:,} pixels for views of "
+                f"{size[1]} x {size[0]}. Its longer side must be at most {MAX_RESOLUTION:,}. Use a smaller scale."
+            )
+
+
+def rotated(style: Tensor, degrees: float) -> Tensor:
+    """Rotate an image [H, W, 3] counterclockwise, and crop it to the largest upright rectangle inside.
+
+    Quarter turns are exact. Other angles are interpolated (cubic splines) and clamped to 0..1.
+    """
+    quarters, rest = divmod(degrees, 90)
+    style = torch.rot90(style, int(quarters) % 4, (0, 1)).contiguous()
+    if not rest:
+        return style
+    height, width = style.shape[:2]
+    spun = ndimage.rotate(style.double().numpy(), rest, axes=(1, 0), reshape=True, order=3, mode="nearest")
+    inner_height, inner_width = _inside(height, width, math.radians(rest))
+    top, left = (spun.shape[0] - inner_height) // 2, (spun.shape[1] - inner_width) // 2
+    cropped = spun[top : top + inner_height, left : left + inner_width]
+    return torch.from_numpy(cropped).clamp(0, 1).to(style.dtype).contiguous()
+
+
+def _inside(height: int, width: int, angle: float) -> tuple[int, int]:
+    """Return the sides of the largest upright rectangle inside one that is rotated by 0 to pi/2; at least 1.
+
+    If the rotated rectangle is narrow, two corners of the result lie on one of its long sides, and half of its short
+    side is the limit. Otherwise, each corner of the result lies on a different side.
+    """
+    sine, cosine = math.sin(angle), math.cos(angle)
+    shorter, longer = min(height, width), max(height, width)
+    if shorter <= 2 * sine * cosine * longer:
+        half = shorter / 2
+        across, down = (half / sine, half / cosine) if width >= height else (half / cosine, half / sine)
+    else:
+        spread = cosine * cosine - sine * sine
+        across, down = (width * cosine - height * sine) / spread, (height * cosine - width * sine) / spread
+    # One pixel less on each side, where the interpolation reads beyond the image.
+    return max(int(down) - 2, 1), max(int(across) - 2, 1)
