@@ -32,8 +32,8 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import soft_image
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections, intersections_of_subset
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
@@ -115,7 +115,7 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
         found["render"].append(timed(lambda camera=camera: rasterizer.render(colors, camera)))  # type: ignore[misc]
         gradient = timed(lambda image=image, camera=camera: rasterizer.color_gradient(image, camera))  # type: ignore[misc]
         found["gradient"].append(gradient)
-        found["plain"].append(timed(lambda camera=camera: plain_survey(rasterizer, camera)))  # type: ignore[misc]
+        found["plain"].append(timed(lambda camera=camera: Rasterizer.survey(rasterizer, camera)))  # type: ignore[misc]
         found["survey"].append(timed(lambda camera=camera: rasterizer.survey(camera)))  # type: ignore[misc]
     seconds = {f"{name}_seconds": statistics.median(values) for name, values in found.items()}
     return {

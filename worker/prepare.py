@@ -15,11 +15,11 @@ import torch
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.choices import GPU_RASTERIZERS
 from sgsst_core.planning.context import common_device, rasterizer_problem
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import ShowPlanning
+from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.refine.split import Refinement
 from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings
@@ -158,7 +158,8 @@ def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan |
     plan = resumed.plan
     if plan.device != common_device(collectives):
         return None
-    return None if plan.rasterizer in GPU_RASTERIZERS and rasterizer_problem(collectives, plan.rasterizer) else plan
+    on_gpu = RASTERIZERS[plan.uncached].on_gpu
+    return None if on_gpu and rasterizer_problem(collectives, plan.uncached) else plan
 
 
 def _workers_used(stylizer: Stylizer) -> dict[str, Any]:

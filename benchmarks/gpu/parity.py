@@ -7,7 +7,7 @@ from torch import Tensor
 
 from benchmarks.gpu.inputs import surface_scene, views
 from benchmarks.gpu.part import Findings, Sizes, device
-from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.camera import Camera
@@ -17,7 +17,7 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 #: By rasterizer: relative distance from an alpha or transmittance cutoff within which float32 rounding may change the
 #: decision, then error bounds for images and for gradients. They are larger for gsplat, which projects in float32 and
 #: uses the fast exponential intrinsic.
-RASTERIZERS: dict[RasterizerName, tuple[float, float, float]] = {
+RASTERIZERS: dict[str, tuple[float, float, float]] = {
     "triton": (2e-5, 1e-5, 5e-6),
     "cached": (2e-5, 1e-5, 5e-6),
     "cuda": (2e-3, 1e-4, 1e-4),

@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, TypeVar, get_args
 from torch import Tensor
 
 from sgsst_core.features.statistics import LayerStatistics
-from sgsst_core.rasterizer.arguments import Rows
+from sgsst_core.rasterizer.base import Rows
 
 T = TypeVar("T")
 

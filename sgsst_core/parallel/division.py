@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.features.partition import PartitionTile, Rectangle, partition
 from sgsst_core.features.vgg import ALIGNMENT
-from sgsst_core.rasterizer.arguments import Rows
+from sgsst_core.rasterizer.base import Rows
 
 Size = tuple[int, int]  # height, width in pixels
 

@@ -7,7 +7,7 @@ makes them too.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,9 +22,8 @@ from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, has_statistics
 from sgsst_core.planning.cost import OPTIMIZER_BYTES, CostModel, RanksChoice, ViewData
 from sgsst_core.planning.facts import LEAST_VISITS, LaunchCost, Link, Probe, RasterCost
-from sgsst_core.planning.plan import Device
 from sgsst_core.planning.survey import Survey
-from sgsst_core.rasterizer import RasterizerName
+from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.settings import CachedWeights, PlannedBackground, Precision, Settings
 
 #: Fraction of uncovered pixels above which statistics are weighted by coverage, unless the settings say otherwise.
@@ -37,8 +36,6 @@ _SCAN_BACKGROUND: PlannedBackground = "palette"
 #: Minimum passes per image size for which benchmarking cuDNN's algorithms pays off. It takes as long as about ten
 #: passes, and makes later passes a few percent faster.
 LEAST_PASSES = 200
-#: GPU rasterizers in order of preference.
-GPU_RASTERIZERS: tuple[RasterizerName, ...] = ("triton", "cuda")
 ANOTHER_LOSS = "differs from the paper's loss"
 
 
@@ -396,34 +393,16 @@ def _launch_times(cost: LaunchCost) -> str:
 # --- rasterizer ----------------------------------------------------------------------------------------------------
 
 
-def uncached_rasterizer(device: Device, problems: Mapping[str, str]) -> RasterizerName:
-    """Return the rasterizer that computes blend weights: on a GPU, the first of `GPU_RASTERIZERS` that works.
-
-    Args:
-        device: Device of the job.
-        problems: Reason by name for each GPU rasterizer that does not work.
-    """
-    if device == "cuda":
-        return next((name for name in GPU_RASTERIZERS if name not in problems), "cpu")
-    return "cpu"
-
-
 def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, Any]:
     """Return the constructor options, apart from the scene, of the rasterizer that computes blend weights.
-
-    On the CPU, tile intersections and cached weights share one memory budget (`CachedRasterizer`). On a GPU, tile
-    intersections have their own budget, half that of cached weights, taken from the memory reserved for buffers. They
-    are small compared to GPU memory, and recomputing them costs a sort and a synchronization per view.
 
     Args:
         name: Name of the rasterizer.
         settings: Settings of the job.
         memory: Memory budget of the rank in bytes.
     """
-    options: dict[str, Any] = {"background": settings.background, "near": settings.near}
-    if name in ("cpu", "triton"):
-        options["max_intersection_bytes"] = memory_for("rasterizer", memory) // (2 if name == "triton" else 1)
-    return options
+    options = RASTERIZERS[name].options(memory_for("rasterizer", memory)) if name in RASTERIZERS else {}
+    return {"background": settings.background, "near": settings.near, **options}
 
 
 def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[CachedWeights, Decision]:
@@ -442,7 +421,7 @@ def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[Cac
     fraction = ViewData(0.0, size, budget, len(probe.survey.covered)).cached
     portion = "all" if fraction == 1 else f"{fraction:.0%} of the views'"
     reason = f"they take {size / 1e9:.2f} GB for all views; {budget / 1e9:.1f} GB are available for blend weights"
-    if probe.rasterizer in GPU_RASTERIZERS and raster.cached_seconds is not None:
+    if RASTERIZERS[probe.rasterizer].on_gpu and raster.cached_seconds is not None:
         reason += f"; {_weight_times(raster)}"
     saved = (raster.seconds - raster.cached_seconds) * fraction if raster.cached_seconds else None
     return cached, Decision(item, f"{portion} cached in {name}", reason, seconds=saved, error=error)
@@ -454,10 +433,10 @@ def _why_not_cached(probe: Probe, settings: Settings, visits: Visits) -> str | N
     if settings.cached_weights == "none" or "blend-weights" in settings.keep:
         return "requested"
     if raster.bytes is None or raster.half_bytes is None:
-        return "gsplat cannot cache them"
+        return f"{RASTERIZERS[probe.rasterizer].title} cannot cache them"
     if settings.cached_weights != "auto":
         return None
-    if probe.rasterizer not in GPU_RASTERIZERS:
+    if not RASTERIZERS[probe.rasterizer].on_gpu:
         return visited if visits.of_a_view < LEAST_VISITS else None
     if raster.cached_seconds is None:
         return "the weights of one view do not fit"
@@ -482,13 +461,14 @@ def about_rasterizer(probe: Probe, *, cached: bool) -> list[Decision]:
     """
     if probe.machine.device != "cuda":
         return []
-    names = {"cuda": "gsplat", "triton": "Triton"}
-    how = f"{names[probe.rasterizer]} on the GPU" if probe.rasterizer in names else "on the CPU"
+    used = RASTERIZERS[probe.rasterizer]
+    how = f"{used.title} on the GPU" if used.on_gpu else "on the CPU"
     if cached:
         how += ", with cached blend weights"
-    reasons = [f"{names[name]} cannot be used: {problem}" for name, problem in probe.machine.problems.items()]
-    if probe.rasterizer in names:
-        reasons.append(f"{names[probe.rasterizer]} works here")
+    problems = probe.machine.problems.items()
+    reasons = [f"{RASTERIZERS[name].title} cannot be used: {problem}" for name, problem in problems]
+    if used.on_gpu:
+        reasons.append(f"{used.title} works here")
     return [Decision("rasterizer", how, "; ".join(reasons) or "requested")]
 
 

@@ -12,10 +12,10 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
 from sgsst_core.loss.style_losses import layers_of
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.planning.choices import GPU_RASTERIZERS, precision_of, rasterizer_options, uncached_rasterizer
+from sgsst_core.planning.choices import precision_of, rasterizer_options
 from sgsst_core.planning.facts import Machine
 from sgsst_core.planning.plan import Device
-from sgsst_core.rasterizer import Rasterizer, RasterizerName, make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, gpu_rasterizers, make_rasterizer, rasterizer_for
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -89,7 +89,7 @@ def equip(
         ranks=collectives.size,
         problems=problems,
     )
-    name = rasterizer or uncached_rasterizer(device, problems)
+    name = rasterizer or rasterizer_for(device, problems)
     of_scene = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
     return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, ratio, of_scene, sh_degree)
 
@@ -105,7 +105,7 @@ def gpu_problems(collectives: Collectives) -> dict[str, str]:
     Rasterizers are tried in order of preference, until one works.
     """
     problems: dict[str, str] = {}
-    for name in GPU_RASTERIZERS:
+    for name in gpu_rasterizers():
         problem = rasterizer_problem(collectives, name)
         if problem is None:
             break
@@ -113,7 +113,7 @@ def gpu_problems(collectives: Collectives) -> dict[str, str]:
     return problems
 
 
-def rasterizer_problem(collectives: Collectives, name: RasterizerName) -> str | None:
+def rasterizer_problem(collectives: Collectives, name: str) -> str | None:
     """Return the reason why a GPU rasterizer does not work on some rank; None if it works on all."""
     return next(filter(None, collectives.all_gather(drawing_problem(name))), None)
 

@@ -52,7 +52,7 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
         memory_limit=machine.memory_limit,
         device=machine.device,
         rasterizer="cached" if caches else probe.rasterizer,
-        uncached=next((name for name in choices.GPU_RASTERIZERS if name == probe.rasterizer), "cpu"),
+        uncached=probe.rasterizer,
         precision=precision,
         search=search,
         graphs=graphs,

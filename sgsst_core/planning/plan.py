@@ -9,7 +9,6 @@ from torch import Tensor
 
 from sgsst_core.decision import Decision
 from sgsst_core.planning.survey import Survey
-from sgsst_core.rasterizer import RasterizerName
 from sgsst_core.refine.split import Refinement
 from sgsst_core.settings import CachedWeights, PlannedBackground, Precision
 
@@ -96,7 +95,7 @@ class Plan:
     warm_start: bool = False
     device: Device = "cpu"
     rasterizer: str = "cpu"
-    uncached: RasterizerName = "cpu"
+    uncached: str = "cpu"
     precision: Precision = "float32"
     search: bool = False
     graphs: bool = False

@@ -39,12 +39,8 @@ from sgsst_core.planning.facts import (
 from sgsst_core.planning.plan import Device
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.rasterizer.base import Precision as WeightPrecision
 from sgsst_core.rasterizer.cached import CachedRasterizer
-from sgsst_core.rasterizer.cached_weights import Precision as WeightPrecision
-from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.projection import Shapes
-from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
-from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
@@ -288,61 +284,37 @@ def _raster_cost(context: PlanningContext, cameras: Sequence[Camera]) -> RasterC
     budget = memory_for("rasterizer", context.machine.memory)
     sample = spread(cameras, SAMPLED_VIEWS)
     count, middle = len(sample), len(sample) // 2
-    if isinstance(rasterizer, CpuRasterizer):
-        _raster_seconds(CpuRasterizer(scene.subset(torch.arange(1))), 1, sample[0])  # compiles the kernels
-        seconds = []
-        for camera in sample:
-            rasterizer.intersections(camera)  # reuses those of the survey if it cached them
-            seconds += _raster_seconds(rasterizer, len(scene), camera)
-        more, intersection_bytes = _intersections_cost(scene, sample, settings.near)
-    else:
-        timed = [_raster_seconds(rasterizer, len(scene), camera, visits=2) for camera in sample]
-        seconds = [later for _, later in timed]
-        # Minimum, because one of them may include compilation or waiting for memory.
-        more, intersection_bytes = max(min(first - later for first, later in timed), 0.0), 0
-    mean = sum(seconds) / count
+    cost = rasterizer.probe_cost(sample)
+    mean = sum(cost.seconds) / count
     known: dict[str, Any] = {
-        "first_seconds": more,
-        "intersection_bytes": intersection_bytes,
+        "first_seconds": cost.preparation_seconds,
+        "intersection_bytes": cost.preparation_bytes,
         "colors_seconds": _colors_seconds(scene, sample[middle], rasterizer.device),
     }
-    if rasterizer.name == "cuda":
+    if not rasterizer.can_cache:
         return RasterCost(mean, **known)
-    uncached = rasterizer
-    if not isinstance(uncached, CpuRasterizer | TritonRasterizer):
-        uncached = CpuRasterizer(scene, near=settings.near)
-    cached = CachedRasterizer(scene, uncached=uncached)
-    if isinstance(uncached, CpuRasterizer) and _comes_too_seldom(settings, len(cameras)):
-        total, half = (cached.count(sample[middle]).nbytes(format_) * len(cameras) for format_ in _FORMATS)
+    if not rasterizer.on_gpu and _comes_too_seldom(settings, len(cameras)):
+        counted = rasterizer.count_weights(sample[middle])
+        total, half = (counted.nbytes(format_) * len(cameras) for format_ in _FORMATS)
         return RasterCost(mean, None, total, half, **known)
-    sizes = [[counted.nbytes(format_) for format_ in _FORMATS] for counted in map(cached.count, sample)]
+    sizes = [[counted.nbytes(format_) for format_ in _FORMATS] for counted in map(rasterizer.count_weights, sample)]
     total, half = (sum(column) * len(cameras) // count for column in zip(*sizes, strict=True))
     fitting = [format_ for format_, size in zip(_FORMATS, sizes[middle], strict=True) if size <= budget]
     if not fitting:
         return RasterCost(mean, None, total, half, **known)
     caching = None
-    if isinstance(uncached, TritonRasterizer):  # known on the CPU: see `LEAST_VISITS`
-        caching = _caching_seconds(cached, sample[middle], fitting[0])
-    cached = CachedRasterizer(scene, precision=fitting[0], uncached=uncached)
-    reused = _raster_seconds(cached, len(scene), sample[middle], visits=2)[1]
+    if rasterizer.on_gpu:  # known on the CPU: see `LEAST_VISITS`
+        caching = _caching_seconds(rasterizer, sample[middle], fitting[0])
+    cached = CachedRasterizer(scene, precision=fitting[0], uncached=rasterizer)
+    reused = cached.step_seconds(sample[middle], visits=2)[1]
     # Scaled to the mean view, like the seconds that it is compared with.
-    return RasterCost(mean, reused * mean / seconds[middle], total, half, caching, **known)
+    return RasterCost(mean, reused * mean / cost.seconds[middle], total, half, caching, **known)
 
 
 def _comes_too_seldom(settings: Settings, views: int) -> bool:
     """Return whether views are visited too few times for caching to pay off on a CPU, and it was not requested."""
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / views
     return settings.cached_weights == "auto" and visits < LEAST_VISITS
-
-
-def _intersections_cost(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[float, int]:
-    """Return the time in seconds and the size in bytes of recomputed tile intersections, mean over some views."""
-    seconds, size, shapes = 0.0, 0, Shapes.of(scene)
-    for camera in cameras:
-        started = time.perf_counter()
-        size += build_tile_intersections(scene, camera, near=near, shapes=shapes).nbytes
-        seconds += time.perf_counter() - started
-    return seconds / len(cameras), size // len(cameras)
 
 
 def _colors_seconds(scene: Scene, camera: Camera, device: torch.device) -> float:
@@ -358,29 +330,14 @@ def _colors_seconds(scene: Scene, camera: Camera, device: torch.device) -> float
     return seconds
 
 
-def _caching_seconds(cached: CachedRasterizer, camera: Camera, format_: WeightPrecision) -> float:
+def _caching_seconds(rasterizer: Rasterizer, camera: Camera, format_: WeightPrecision) -> float:
     """Return the time in seconds to compute a view's cached weights on the second run; the first one compiles."""
     seconds = 0.0
     for _ in range(2):
         started = time.perf_counter()
-        cached.count(camera).keep(format_)
-        wait_for(cached.device)
-        seconds = time.perf_counter() - started
-    return seconds
-
-
-def _raster_seconds(rasterizer: Rasterizer, gaussians: int, camera: Camera, visits: int = 1) -> list[float]:
-    """Return the time in seconds of each of several renders with gradient.
-
-    The first one includes the time to prepare the view, unless it is already prepared.
-    """
-    colors = torch.full((gaussians, 3), 0.5, device=rasterizer.device)
-    seconds = []
-    for _ in range(visits):
-        started = time.perf_counter()
-        rasterizer.color_gradient(rasterizer.render(colors, camera), camera)
+        rasterizer.count_weights(camera).store(format_)
         wait_for(rasterizer.device)
-        seconds.append(time.perf_counter() - started)
+        seconds = time.perf_counter() - started
     return seconds
 
 

@@ -18,10 +18,7 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.style_losses import layers_of
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
-from sgsst_core.rasterizer.cached import CachedRasterizer
-from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName
@@ -35,15 +32,9 @@ def approximations(stylizer: Stylizer) -> list[str]:
     found = []
     if stylizer.network.precision != "float32":
         found.append("TF32 convolutions" if stylizer.network.tf32 else f"{stylizer.network.precision} features")
-    if stylizer.plan.cached_weights == "half" and stylizer.views.rasterizer.name == "cached":
+    if stylizer.plan.cached_weights == "half":
         found.append("half-precision blend weights")
     return found
-
-
-def uncached_rasterizer(stylizer: Stylizer) -> Rasterizer:
-    """Return the job's underlying rasterizer, which computes blend weights without caching them."""
-    rasterizer = stylizer.views.rasterizer
-    return rasterizer.uncached if isinstance(rasterizer, CachedRasterizer) else rasterizer
 
 
 def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
@@ -51,11 +42,7 @@ def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
 
     It shares the job's memory budget for tile intersections, with lower priority.
     """
-    settings, job = stylizer.settings, uncached_rasterizer(stylizer)
-    options: dict[str, Any] = {"background": settings.background, "near": settings.near}
-    if isinstance(job, CpuRasterizer | TritonRasterizer) and job.name == stylizer.plan.uncached:
-        options["beside"] = job
-    return make_rasterizer(stylizer.plan.uncached, scene, **options)
+    return stylizer.views.rasterizer.uncached.beside(scene)
 
 
 @dataclass(frozen=True)
@@ -129,8 +116,8 @@ class Float32Reference(ExactLoss):
         super().__init__(stylizer, style_loss)
         settings = stylizer.settings
         self.shown = stylizer.plan.survey.total_blend_weights > 0
-        scene, rasterizer = stylizer.views.scene, uncached_rasterizer(stylizer)
-        if not (torch.equal(self.shown, stylizer.plan.seen) and rasterizer.name == stylizer.plan.uncached):
+        scene, rasterizer = stylizer.views.scene, stylizer.views.rasterizer.uncached
+        if not torch.equal(self.shown, stylizer.plan.seen):
             scene = stylizer.scene.subset(self.shown).without_zero_bands()
             rasterizer = rasterizer_beside(stylizer, scene)
         self.views = Views(

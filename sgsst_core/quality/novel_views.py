@@ -33,7 +33,7 @@ from sgsst_core.quality.consistency import (
 )
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.rasterizer.arguments import CameraKey, camera_key
+from sgsst_core.rasterizer.base import CameraKey, camera_key
 from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.camera import Camera, between, resized
 from sgsst_core.scene.gaussians import Scene, sampled

@@ -5,20 +5,19 @@ Tile intersections are cached per view; blend weights are recomputed in every ca
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.compiled import kernel_threads
-from sgsst_core.constants import ALPHA_MAX, NEAR
+from sgsst_core.constants import ALPHA_MAX
 from sgsst_core.rasterizer import kernels
-from sgsst_core.rasterizer.arguments import (
-    Rows,
-    check_colors,
-    check_image_gradient,
-    check_rows,
-)
+from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost, Rows, check_rows
 from sgsst_core.rasterizer.projection import Shapes
 from sgsst_core.rasterizer.tile_intersections import (
     TileIntersections,
@@ -31,77 +30,68 @@ from sgsst_core.scene.gaussians import Scene
 
 #: Tile intersections take some 15 to 20 bytes per pair of Gaussian and tile: a few megabytes per view at 1280x720.
 DEFAULT_INTERSECTION_BYTES = 1 << 30
-_CPU = torch.device("cpu")
 
 
-class CpuRasterizer:
-    """Implementation of `sgsst_core.rasterizer.Rasterizer` in compiled float32 code.
+class CpuRasterizer(Rasterizer):
+    """Rasterizer in compiled float32 code.
 
     The order of summation is fixed. Results are therefore bit-identical for any number of threads, and the concatenated
     images of bands are bit-identical to that of the whole view. Tile intersections are cached within a budget
     (`ViewCache`).
 
     Args:
-        scene: Scene, whose geometry must not change during this object's lifetime.
-        background: RGB color behind pixels that Gaussians leave uncovered.
-        near: Near plane in world units.
+        scene, background, near, device: As in `Rasterizer`.
         alpha_max: Upper limit of alpha.
         max_intersection_bytes: Memory budget for tile intersections in bytes.
-        beside: Rasterizer whose budget for tile intersections is shared, with lower priority, instead of using
-            `max_intersection_bytes`; None for a separate budget.
     """
 
     name = "cpu"
-    scale = 0
-    dtype = torch.float32
-    device = _CPU
+    title = "compiled code"
+    can_cache = True
+    caches_exactly = True
 
     def __init__(
         self,
         scene: Scene,
         *,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        near: float = NEAR,
         alpha_max: float = ALPHA_MAX,
         max_intersection_bytes: int = DEFAULT_INTERSECTION_BYTES,
-        beside: CpuRasterizer | None = None,
+        **common: Any,
     ) -> None:
-        self.scene = scene
-        self.near = near
+        super().__init__(scene, alpha_max=alpha_max, max_intersection_bytes=max_intersection_bytes, **common)
         self.alpha_max = alpha_max
-        self.background: NDArray[np.float32] = np.asarray(background, dtype=np.float32)
         self._shapes: Shapes | None = None
-        host = None if beside is None else beside._intersections
-        self._intersections: ViewCache[TileIntersections] = ViewCache(self._build, max_intersection_bytes, host=host)
+        self._intersections: ViewCache[TileIntersections] = ViewCache(self._build, max_intersection_bytes)
 
-    def of_subset(
-        self, scene: Scene, rows: Tensor, *, max_intersection_bytes: int = DEFAULT_INTERSECTION_BYTES
-    ) -> CpuRasterizer:
-        """Return a rasterizer of a subset of the Gaussians.
+    @classmethod
+    def options(cls, memory: int) -> dict[str, Any]:
+        """Return constructor options for a memory budget in bytes, which cached weights share."""
+        return {"max_intersection_bytes": memory}
+
+    def for_subset(self, scene: Scene, rows: Tensor, **options: Any) -> CpuRasterizer:
+        """Return a rasterizer of a subset of the Gaussians, see `Rasterizer.for_subset`.
 
         The new rasterizer takes over the cached tile intersections. Those of a view are restricted to the subset when
         the view is first used.
-
-        Args:
-            scene: Scene of the subset, with unchanged geometry.
-            rows: [N] bool, mask of the subset.
-            max_intersection_bytes: Memory budget of the new rasterizer for tile intersections, in bytes.
         """
         if len(scene) != int(rows.sum()) or len(rows) != len(self.scene):
             raise ValueError(f"{len(scene)} Gaussians are not the {int(rows.sum())} chosen ones of {len(self.scene)}")
-        part = CpuRasterizer(
-            scene, near=self.near, alpha_max=self.alpha_max, max_intersection_bytes=max_intersection_bytes
-        )
-        part.background = self.background
-        places = torch.where(rows, rows.cumsum(0, dtype=torch.int32) - 1, -1).to(torch.int32).numpy()
-        part._intersections = ViewCache(
-            part._build,
-            max_intersection_bytes,
+        subset = self.for_scene(scene, **options)
+        indices = torch.where(rows, rows.cumsum(0, dtype=torch.int32) - 1, -1).to(torch.int32).numpy()
+        subset._intersections = ViewCache(
+            subset._build,
+            subset._options["max_intersection_bytes"],
             self._intersections,
-            lambda isects: intersections_of_subset(isects, places),
+            lambda isects: intersections_of_subset(isects, indices),
         )
         self._shapes = None
-        return part
+        return subset
+
+    def beside(self, scene: Scene) -> CpuRasterizer:
+        """Return a rasterizer of another scene that shares the budget for tile intersections, with lower priority."""
+        other = self.for_scene(scene)
+        other._intersections = ViewCache(other._build, 0, host=self._intersections)
+        return other
 
     def _build(self, camera: Camera) -> TileIntersections:
         if self._shapes is None:
@@ -120,25 +110,38 @@ class CpuRasterizer:
         """Return whether the view's tile intersections are cached, so it needs no projection and no sorting."""
         return self._intersections.holds(camera)
 
-    def drop_intersections(self, camera: Camera, left: int) -> None:
-        """Drop the view's tile intersections, and set the budget for those of all other views to `left` bytes."""
+    def release_view(self, camera: Camera, budget: int) -> None:
+        """Drop the view's tile intersections, and set the budget for those of all other views to `budget` bytes."""
         self._intersections.take(camera)
-        self._intersections.limit(left)
+        self._intersections.limit(budget)
 
-    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
-        values = check_colors(colors, len(self.scene), torch.float32, _CPU).numpy()
-        return self._render(values, camera, check_rows(camera, rows))[0]
+    def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
+        """Count a band's weights without storing them; takes about as long as one render."""
+        from sgsst_core.rasterizer.strips import CountedStrips
 
-    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return 1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
-        nothing = np.zeros((len(self.scene), 3), dtype=np.float32)
-        return 1 - self._render(nothing, camera, check_rows(camera, rows))[1]
+        return CountedStrips(self, camera, check_rows(camera, rows))
 
-    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows."""
-        band = check_rows(camera, rows)
-        pixels = check_image_gradient(image_gradient, camera, band, torch.float32, _CPU).numpy()
+    def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
+        """Measure the cost of rendering some views with gradient; reuses their tile intersections if cached."""
+        self.for_scene(self.scene.subset(torch.arange(1))).step_seconds(cameras[0])  # compiles the kernels
+        seconds = []
+        for camera in cameras:
+            self.intersections(camera)
+            seconds += self.step_seconds(camera)
+        preparation, size, shapes = 0.0, 0, Shapes.of(self.scene)
+        for camera in cameras:
+            started = time.perf_counter()
+            size += build_tile_intersections(self.scene, camera, near=self.near, shapes=shapes).nbytes
+            preparation += time.perf_counter() - started
+        return RenderCost(seconds, preparation / len(cameras), size // len(cameras))
+
+    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
+        return self._blend(colors.numpy(), camera, band)[0]
+
+    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
+        return 1 - self._blend(np.zeros((len(self.scene), 3), dtype=np.float32), camera, band)[1]
+
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
         isects = self.intersections(camera)
         projection = isects.projection
         slot_gradients = np.empty((len(isects.ranks), 3), dtype=np.float32)
@@ -149,7 +152,7 @@ class CpuRasterizer:
                 isects.slots,
                 isects.starts,
                 projection.values,
-                pixels,
+                image_gradient.numpy(),
                 band[0],
                 self.alpha_max,
                 slot_gradients,
@@ -174,7 +177,7 @@ class CpuRasterizer:
             kernels.add_slot_weights(slot_weights, isects.first_slots, isects.projection.gaussians, weights)
         return 1 - torch.from_numpy(transmittance), torch.from_numpy(weights)
 
-    def _render(self, colors: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
+    def _blend(self, colors: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Return the image and the final transmittance of a band."""
         isects = self.intersections(camera)
         height = band[1] - band[0]
@@ -187,7 +190,7 @@ class CpuRasterizer:
                 isects.projection.values,
                 isects.projection.gaussians,
                 colors,
-                self.background,
+                self.background.numpy(),
                 band[0],
                 self.alpha_max,
                 image,

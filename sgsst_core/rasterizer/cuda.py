@@ -12,21 +12,14 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import EPS2D, NEAR, RASTER_TILE
+from sgsst_core.constants import EPS2D, RASTER_TILE
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.arguments import (
-    CameraKey,
-    Rows,
-    camera_key,
-    check_colors,
-    check_image_gradient,
-    check_rows,
-)
-from sgsst_core.rasterizer.plain_survey import plain_survey
+from sgsst_core.rasterizer.base import CameraKey, Rasterizer, Rows, camera_key
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -64,80 +57,65 @@ class _Splats:
     flat_ids: Tensor
 
 
-class CudaRasterizer:
-    """Implementation of `sgsst_core.rasterizer.Rasterizer` with gsplat on one GPU.
+class CudaRasterizer(Rasterizer):
+    """Rasterizer that calls gsplat on one GPU.
 
     Results are gsplat's in float32. Its backward pass uses atomics, so gradients are reproducible only up to rounding.
     Projection and tile intersections of the latest view and band are cached.
 
     Args:
-        scene: Scene, whose geometry must not change during this object's lifetime.
-        background: RGB color behind pixels that Gaussians leave uncovered.
-        near: Near plane in world units.
-        device: CUDA device.
+        scene, background, near: As in `Rasterizer`.
+        device: CUDA device; None for the current one.
 
     Raises:
         SettingsError: If gsplat or the GPU is missing.
     """
 
     name = "cuda"
-    scale = 0
-    dtype = torch.float32
+    title = "gsplat"
+    on_gpu = True
 
-    def __init__(
-        self,
-        scene: Scene,
-        *,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        near: float = NEAR,
-        device: torch.device | str = "cuda",
-    ) -> None:
+    def __init__(self, scene: Scene, **common: Any) -> None:
         self._gsplat = load_gsplat()
-        self.device = torch.device(device)
-        if self.device.type != "cuda" or not torch.cuda.is_available():
-            raise SettingsError(
-                f"rasterizer 'cuda' on device {str(device)!r}: PyTorch sees no CUDA GPU; choose 'cpu' or 'cached'"
-            )
-        self.scene = scene
-        self.near = near
+        super().__init__(scene, **common)
         self.alpha_max = gsplat_alpha_max(self._gsplat.__version__)
-        self._background = torch.tensor(background, dtype=torch.float32, device=self.device)
         self._means = scene.means.to(self.device)
         self._quats = scene.quats.to(self.device)
         self._scales = scene.scales.to(self.device).exp()
         self._opacities = scene.opacities.to(self.device).sigmoid()
         self._latest: tuple[CameraKey, Rows, _Splats] | None = None
 
-    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
-        band = check_rows(camera, rows)
-        values = check_colors(colors, len(self.scene), torch.float32, self.device)
-        with torch.no_grad():
-            image, alpha = self._rasterize(values, camera, band)
-        return image + (1 - alpha) * self._background
+    @classmethod
+    def usable_device(cls, device: torch.device | str | None) -> torch.device:
+        """Validate a CUDA device and return it.
 
-    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return 1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
-        nothing = torch.zeros(len(self.scene), 3, device=self.device)
-        with torch.no_grad():
-            return self._rasterize(nothing, camera, check_rows(camera, rows))[1][..., 0]
-
-    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows.
-
-        The image is linear in the colors, so this is the gradient of <image, image_gradient> at any colors.
+        Raises:
+            SettingsError: If it is no GPU, or there is none.
         """
-        band = check_rows(camera, rows)
-        pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
+        found = torch.device(device or "cuda")
+        if found.type != "cuda" or not torch.cuda.is_available():
+            raise SettingsError(
+                f"rasterizer 'cuda' on device {str(found)!r}: PyTorch sees no CUDA GPU; choose 'cpu' or 'cached'"
+            )
+        return found
+
+    @torch.no_grad()
+    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
+        image, alpha = self._rasterize(colors, camera, band)
+        return image + (1 - alpha) * self.background
+
+    @torch.no_grad()
+    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
+        nothing = torch.zeros(len(self.scene), 3, device=self.device)
+        return self._rasterize(nothing, camera, band)[1][..., 0]
+
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+        # The image is linear in the colors, so the gradient of <image, image_gradient> is the same at any colors.
         with torch.enable_grad():
             colors = torch.zeros(len(self.scene), 3, device=self.device, requires_grad=True)
             image, _ = self._rasterize(colors, camera, band)
-            (gradient,) = torch.autograd.grad(image, colors, pixels)
+            (gradient,) = torch.autograd.grad(image, colors, image_gradient)
         return gradient
-
-    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N]."""
-        return plain_survey(self, camera)
 
     def _rasterize(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Return the image [h, width, 3] over black, and 1 - T_final [h, width, 1]."""

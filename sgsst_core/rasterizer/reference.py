@@ -8,20 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
-from sgsst_core.rasterizer.arguments import (
-    CameraKey,
-    Rows,
-    camera_key,
-    check_colors,
-    check_image_gradient,
-    check_rows,
-)
-from sgsst_core.rasterizer.plain_survey import plain_survey
+from sgsst_core.rasterizer.base import CameraKey, Rasterizer, Rows, camera_key, check_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rotations import unit_rotations
@@ -103,70 +96,49 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
     return Splats(index[keep], *columns[:, keep])
 
 
-class ReferenceRasterizer:
-    """Implementation of `sgsst_core.rasterizer.Rasterizer` in plain PyTorch on the CPU.
+class ReferenceRasterizer(Rasterizer):
+    """Rasterizer in plain PyTorch on the CPU.
 
     Memory is bounded by batches of about a million (pixel, Gaussian) pairs, for views and scenes of any size.
     Projection and tile intersections of the last camera are cached, because they do not depend on colors.
 
     Args:
-        scene: Scene, whose geometry must not change during this object's lifetime.
-        background: RGB color behind pixels that Gaussians leave uncovered.
-        near: Near plane in world units.
+        scene, background, near, device: As in `Rasterizer`.
         alpha_max: Upper limit of alpha.
         dtype: Dtype of blending, image and gradient; the projection is always float64.
     """
 
     name = "reference"
-    scale = 0
-    device = torch.device("cpu")
+    title = "the float64 reference"
 
     def __init__(
-        self,
-        scene: Scene,
-        *,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        near: float = NEAR,
-        alpha_max: float = ALPHA_MAX,
-        dtype: torch.dtype = torch.float64,
+        self, scene: Scene, *, alpha_max: float = ALPHA_MAX, dtype: torch.dtype = torch.float64, **common: Any
     ) -> None:
-        self.scene = scene
-        self.near = near
-        self.alpha_max = alpha_max
         self.dtype = dtype
-        self.background = torch.tensor(background, dtype=dtype)
+        super().__init__(scene, alpha_max=alpha_max, dtype=dtype, **common)
+        self.alpha_max = alpha_max
         self._prepared: tuple[CameraKey, Splats, Tensor, Tensor] | None = None
 
-    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return the image [h, width, 3] of colors [N, 3] over the background."""
-        colors = check_colors(colors, len(self.scene), self.dtype, self.device)
-        start, stop = check_rows(camera, rows)
+    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
+        start, stop = band
         image = self.background.expand((stop - start) * camera.width + 1, 3).clone()
-        for pixels, gaussians, weights, left in self._blended(camera, (start, stop)):
+        for pixels, gaussians, weights, left in self._blended(camera, band):
             image[pixels] = torch.bmm(weights, colors[gaussians]) + left[..., None] * self.background
         return image[:-1].view(stop - start, camera.width, 3)
 
-    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return 1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
-        start, stop = check_rows(camera, rows)
+    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
+        start, stop = band
         coverage = torch.zeros((stop - start) * camera.width + 1, dtype=self.dtype)
-        for pixels, _, _, left in self._blended(camera, (start, stop)):
+        for pixels, _, _, left in self._blended(camera, band):
             coverage[pixels] = 1 - left
         return coverage[:-1].view(stop - start, camera.width)
 
-    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3] of the rows."""
-        band = check_rows(camera, rows)
-        flat = check_image_gradient(image_gradient, camera, band, self.dtype, self.device).view(-1, 3)
-        flat = torch.cat([flat, flat.new_zeros(1, 3)])
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+        flat = torch.cat([image_gradient.view(-1, 3), image_gradient.new_zeros(1, 3)])
         gradient = torch.zeros(len(self.scene), 3, dtype=self.dtype)
         for pixels, gaussians, weights, _ in self._blended(camera, band):
             gradient.index_add_(0, gaussians.flatten(), torch.bmm(weights.mT, flat[pixels]).flatten(0, 1))
         return gradient
-
-    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N]."""
-        return plain_survey(self, camera)
 
     def near_cutoff(self, camera: Camera, tolerance: float, rows: Rows | None = None) -> Tensor:
         """Return the mask [h, width] bool of pixels with an alpha or a transmittance close to its cutoff.

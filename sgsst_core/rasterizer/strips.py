@@ -14,8 +14,7 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import kernels
-from sgsst_core.rasterizer.arguments import Rows
-from sgsst_core.rasterizer.cached_weights import Precision
+from sgsst_core.rasterizer.base import Precision, Rows
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import run_starts
 from sgsst_core.scene.camera import Camera
@@ -51,7 +50,7 @@ class CountedStrips:
         piece = _PIECE_BYTES + kernels.PIECE * (4 if precision == "float32" else 2)
         return index + int(self.pieces.sum()) * piece
 
-    def keep(self, precision: Precision) -> WeightStrips:
+    def store(self, precision: Precision) -> WeightStrips:
         """Compute the weights again and store them."""
         return WeightStrips(self, precision)
 
@@ -66,7 +65,7 @@ class WeightStrips:
     def __init__(self, counted: CountedStrips, precision: Precision) -> None:
         rasterizer, isects, band = counted.rasterizer, counted.intersections, counted.band
         self.first_row = band[0]
-        self.background = rasterizer.background
+        self.background = rasterizer.background.numpy()
         self.gaussians = isects.projection.gaussians
         self.nbytes = counted.nbytes(precision)
         self._total = len(rasterizer.scene)

@@ -16,12 +16,12 @@ from pathlib import Path
 import torch
 
 from sgsst_core.constants import RASTER_TILE
-from sgsst_core.rasterizer import RasterizerName, make_rasterizer
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
 
-def drawing_problem(name: RasterizerName, device: torch.device | str = "cuda") -> str | None:
+def drawing_problem(name: str, device: torch.device | str = "cuda") -> str | None:
     """Return the reason why a rasterizer cannot render on a device, as a short text; None if it can.
 
     Takes minutes if this or another process has to compile kernels. The compiled kernels are cached.
@@ -34,7 +34,7 @@ def drawing_problem(name: RasterizerName, device: torch.device | str = "cuda") -
     return None if drawn else "it draws nothing"
 
 
-def _draws(name: RasterizerName, device: torch.device | str) -> bool:
+def _draws(name: str, device: torch.device | str) -> bool:
     gaussian = Scene(
         torch.tensor([[0.0, 0.0, 2.0]]),
         torch.tensor([[1.0, 0.0, 0.0, 0.0]]),

@@ -12,18 +12,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
+from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, RASTER_TILE, TRANSMITTANCE_MIN
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.arguments import (
-    Rows,
-    check_colors,
-    check_image_gradient,
-    check_rows,
-)
+from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, Rows, check_rows
 from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
 from sgsst_core.rasterizer.view_cache import ViewCache
 from sgsst_core.scene.camera import Camera
@@ -66,56 +62,88 @@ class DeviceIntersections:
         )
 
 
-class TritonRasterizer:
-    """Implementation of `sgsst_core.rasterizer.Rasterizer` in Triton kernels.
+class TritonRasterizer(Rasterizer):
+    """Rasterizer in float32 Triton kernels.
 
     Color gradients are reproducible bit for bit on one machine: every pair of Gaussian and tile has a separate slot,
     and slots are added in a fixed order. The concatenated images of bands are bit-identical to that of the whole view.
     Tile intersections are cached within a budget (`ViewCache`).
 
     Args:
-        scene: Scene, whose geometry must not change during this object's lifetime.
-        background: RGB color behind pixels that Gaussians leave uncovered.
-        near: Near plane in world units.
+        scene, background, near: As in `Rasterizer`.
         device: GPU, or the CPU if Triton's interpreter is enabled (TRITON_INTERPRET=1). None for the current GPU; if
             there is no GPU and the interpreter is enabled, the CPU.
         alpha_max: Upper limit of alpha.
         max_intersection_bytes: Memory budget for tile intersections in bytes.
-        beside: Rasterizer whose budget for tile intersections is shared, with lower priority, instead of using
-            `max_intersection_bytes`; None for a separate budget.
 
     Raises:
         SettingsError: If Triton is missing or cannot run on the device.
     """
 
     name = "triton"
-    scale = 0
-    dtype = torch.float32
+    title = "Triton"
+    on_gpu = True
+    can_cache = True
 
     def __init__(
         self,
         scene: Scene,
         *,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        near: float = NEAR,
-        device: torch.device | str | None = None,
         alpha_max: float = ALPHA_MAX,
         max_intersection_bytes: int = DEFAULT_INTERSECTION_BYTES,
-        beside: TritonRasterizer | None = None,
+        **common: Any,
     ) -> None:
-        if not near > 0:
-            raise ValueError(f"near plane {near}: must be positive")
-        self.device = _usable_device(device)
-        self.scene = scene
-        self.near = near
+        super().__init__(scene, alpha_max=alpha_max, max_intersection_bytes=max_intersection_bytes, **common)
         self.alpha_max = alpha_max
-        self.background = torch.tensor(background, dtype=torch.float32, device=self.device)
         self._geometry = [
             tensor.to(self.device).float().contiguous()
             for tensor in (scene.means, scene.quats, scene.scales, scene.opacities)
         ]
-        host = None if beside is None else beside._intersections
-        self._intersections: ViewCache[DeviceIntersections] = ViewCache(self._build, max_intersection_bytes, host=host)
+        self._intersections: ViewCache[DeviceIntersections] = ViewCache(self._build, max_intersection_bytes)
+
+    @classmethod
+    def options(cls, memory: int) -> dict[str, Any]:
+        """Return constructor options for a memory budget in bytes.
+
+        Tile intersections have their own budget, half that of cached weights. They are small compared to GPU memory,
+        and recomputing them costs a sort and a synchronization per view.
+        """
+        return {"max_intersection_bytes": memory // 2}
+
+    @classmethod
+    def usable_device(cls, device: torch.device | str | None) -> torch.device:
+        """Validate the device and return it; a GPU is returned with its index.
+
+        Raises:
+            SettingsError: If Triton is missing or cannot run on the device.
+        """
+        try:
+            import triton
+        except ImportError as error:
+            raise SettingsError(
+                f"rasterizer 'triton' needs Triton, which cannot be imported ({error}). PyTorch's CUDA and ROCm builds "
+                "bring it; choose 'cpu' or 'cached' elsewhere."
+            ) from error
+        interpreted = triton.knobs.runtime.interpret
+        if device is None:
+            device = "cpu" if interpreted and not torch.cuda.is_available() else "cuda"
+        found = torch.device(device)
+        if found.type == "cuda":
+            if not torch.cuda.is_available():
+                raise SettingsError(f"rasterizer 'triton' on device {str(device)!r}: PyTorch sees no GPU; choose 'cpu'")
+            return torch.device("cuda", torch.cuda.current_device() if found.index is None else found.index)
+        if found.type == "cpu" and not interpreted:
+            raise SettingsError(
+                "rasterizer 'triton' runs on the CPU in Triton's interpreter only: set TRITON_INTERPRET=1 before the "
+                "program starts, or choose 'cpu' or 'cached'."
+            )
+        return found
+
+    def beside(self, scene: Scene) -> TritonRasterizer:
+        """Return a rasterizer of another scene that shares the budget for tile intersections, with lower priority."""
+        other = self.for_scene(scene)
+        other._intersections = ViewCache(other._build, 0, host=self._intersections)
+        return other
 
     def intersections(self, camera: Camera) -> DeviceIntersections:
         """Return the tile intersections of a view, cached or newly built.
@@ -125,22 +153,21 @@ class TritonRasterizer:
         """
         return self._intersections.of(camera)
 
-    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
-        values = check_colors(colors, len(self.scene), torch.float32, self.device)
-        return self._render(values, camera, check_rows(camera, rows))[0]
+    def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
+        """Count a band's weights without storing them; takes about as long as one render."""
+        from sgsst_core.rasterizer.triton_cached import CountedPieces
 
-    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return 1 - T_final, [h, width] float32 in [0, 1]: how much of each pixel the Gaussians cover."""
-        nothing = torch.zeros((len(self.scene), 3), device=self.device)
-        return 1 - self._render(nothing, camera, check_rows(camera, rows))[1]
+        return CountedPieces(self, camera, check_rows(camera, rows))
 
-    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3] of the rows."""
+    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
+        return self._blend(colors, camera, band)[0]
+
+    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
+        return 1 - self._blend(torch.zeros((len(self.scene), 3), device=self.device), camera, band)[1]
+
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
         from sgsst_core.rasterizer import triton_kernels as kernels
 
-        band = check_rows(camera, rows)
-        pixels = check_image_gradient(image_gradient, camera, band, torch.float32, self.device)
         gradient = torch.zeros((len(self.scene), 3), device=self.device)
         isects = self.intersections(camera)
         visible = len(isects.gaussians)
@@ -149,7 +176,8 @@ class TritonRasterizer:
         slots = torch.zeros((len(isects.ranks), 3), device=self.device)
         across, tiles = tiles_of(camera, band)
         kernels.slot_gradients[(tiles,)](
-            isects.ranks, isects.slots, isects.starts, isects.values, pixels, slots, camera.width, *band, across,
+            isects.ranks, isects.slots, isects.starts, isects.values, image_gradient, slots,
+            camera.width, *band, across,
             **self.cuts(),
         )  # fmt: skip
         add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
@@ -179,7 +207,7 @@ class TritonRasterizer:
             )
         return 1 - transmittance, weights
 
-    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
+    def _blend(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
         """Return the image and the final transmittance of a band."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
@@ -255,35 +283,6 @@ def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: 
     kernels.add_slots[(-(-len(gaussians) // block),)](
         slots, first_slots, gaussians, gradient, len(gaussians), BLOCK=block, SLOTS=kernels.SLOTS.value
     )
-
-
-def _usable_device(device: torch.device | str | None) -> torch.device:
-    """Validate the device and return it; a GPU is returned with its index.
-
-    Raises:
-        SettingsError: If Triton is missing or cannot run on the device.
-    """
-    try:
-        import triton
-    except ImportError as error:
-        raise SettingsError(
-            f"rasterizer 'triton' needs Triton, which cannot be imported ({error}). PyTorch's CUDA and ROCm builds "
-            "bring it; choose 'cpu' or 'cached' elsewhere."
-        ) from error
-    interpreted = triton.knobs.runtime.interpret
-    if device is None:
-        device = "cpu" if interpreted and not torch.cuda.is_available() else "cuda"
-    found = torch.device(device)
-    if found.type == "cuda":
-        if not torch.cuda.is_available():
-            raise SettingsError(f"rasterizer 'triton' on device {str(device)!r}: PyTorch sees no GPU; choose 'cpu'")
-        return torch.device("cuda", torch.cuda.current_device() if found.index is None else found.index)
-    if found.type == "cpu" and not interpreted:
-        raise SettingsError(
-            "rasterizer 'triton' runs on the CPU in Triton's interpreter only: set TRITON_INTERPRET=1 before the "
-            "program starts, or choose 'cpu' or 'cached'."
-        )
-    return found
 
 
 def _numbers(camera: Camera, near: float) -> list[float]:

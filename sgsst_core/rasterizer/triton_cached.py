@@ -10,8 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.rasterizer.arguments import Rows
-from sgsst_core.rasterizer.cached_weights import Precision
+from sgsst_core.rasterizer.base import Precision, Rows
 from sgsst_core.rasterizer.triton import TritonRasterizer, add_slots_, tiles_of
 from sgsst_core.scene.camera import Camera
 
@@ -64,7 +63,7 @@ class CountedPieces:
         starts = len(self.block_pieces) + 1 + visible + 1
         return int(self.pieces * piece + starts * index + 4 * (visible + pixels))
 
-    def keep(self, precision: Precision) -> WeightPieces:
+    def store(self, precision: Precision) -> WeightPieces:
         """Compute the weights again and store them."""
         return WeightPieces(self, precision)
 

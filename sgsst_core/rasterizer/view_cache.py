@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, Generic, Protocol, TypeVar
 from weakref import WeakSet
 
-from sgsst_core.rasterizer.arguments import CameraKey, camera_key
+from sgsst_core.rasterizer.base import CameraKey, camera_key
 from sgsst_core.scene.camera import Camera
 
 

@@ -25,10 +25,9 @@ from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import ScaleTarget, SosLoss, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.choices import rasterizer_options
 from sgsst_core.planning.context import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, most_children
 from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.regions.definition import Regions
@@ -228,9 +227,8 @@ class _Refining:
 
     def _change(self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]) -> _Change:
         """Return the effect of pieces [N, 3] on the unstylized image of `views`, with colors fitted to `fitted`."""
-        scene, name = split(self._scene, pieces), self._rasterizer.name
-        options = rasterizer_options(name, self._settings, self._planning_context.machine.memory)
-        rasterizer = make_rasterizer(name, scene, **options)
+        scene = split(self._scene, pieces)
+        rasterizer = self._rasterizer.for_scene(scene)
         scene = self._fit(scene, rasterizer, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
         squared = torch.zeros(len(self._scene), dtype=torch.float64)
         errors: dict[int, float] = {}

@@ -27,9 +27,8 @@ from sgsst_core.planning.choices import ends_with_transfer, rasterizer_options
 from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
-from sgsst_core.rasterizer.cached import repeatable
-from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
@@ -276,19 +275,17 @@ class Stylizer:
     def _make_rasterizer(self, seen: Scene, planning_context: PlanningContext | None) -> Rasterizer:
         """Return the plan's rasterizer of the rendered Gaussians."""
         plan, settings = self.plan, self.settings
-        name = plan.uncached if plan.rasterizer == "cached" else plan.rasterizer
-        options = rasterizer_options(name, settings, self.memory)
+        options = rasterizer_options(plan.uncached, settings, self.memory)
         whole = planning_context.rasterizer if planning_context else None
-        if whole is not None and whole.name == name and plan.seen.all():
+        if whole is None:
+            uncached = make_rasterizer(plan.uncached, seen, **options)
+        elif plan.seen.all():
             uncached = whole
-        elif isinstance(whole, CpuRasterizer) and whole.name == name:
-            uncached = whole.of_subset(seen, plan.seen, max_intersection_bytes=options["max_intersection_bytes"])
-        else:  # data that a GPU rasterizer prepared for the whole scene refer to Gaussians by index
-            uncached = make_rasterizer(name, seen, **options)
-        if plan.rasterizer != "cached":
+        else:
+            uncached = whole.for_subset(seen, plan.seen, **options)
+        if plan.cached_weights == "none":
             return uncached
-        return make_rasterizer(
-            "cached",
+        return CachedRasterizer(
             seen,
             max_bytes=memory_for("rasterizer", self.memory),
             least_intersection_bytes=self._least_intersection_bytes,
@@ -300,8 +297,8 @@ class Stylizer:
     @property
     def _least_intersection_bytes(self) -> int:
         """Budget in bytes for tile intersections next to cached weights, taken from the memory for views."""
-        on_cpu = self.plan.rasterizer == "cached" and self.plan.uncached == "cpu"
-        return least_intersection_memory(self.memory) if on_cpu else 0
+        shared = self.plan.cached_weights != "none" and not RASTERIZERS[self.plan.uncached].on_gpu
+        return least_intersection_memory(self.memory) if shared else 0
 
     def _views(self, seen: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> Views:
         plan, settings = self.plan, self.settings
@@ -319,7 +316,7 @@ class Stylizer:
             regions=plan.survey.regions if plan.weighted else None,
             background=settings.background,
             drawn=plan.training_background != "background",
-            maps=self.styles.maps(repeatable(rasterizer), plan.seen),
+            maps=self.styles.maps(rasterizer.repeatable, plan.seen),
             collectives=self.group,
         )
 

@@ -16,7 +16,6 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide_rows
 from sgsst_core.parallel.shown import ShownGaussians
 from sgsst_core.rasterizer import Rasterizer, Rows
-from sgsst_core.rasterizer.cached import CachedRasterizer, repeatable
 from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -75,7 +74,7 @@ class Views:
         self.cameras = list(cameras)
         self.rasterizer = rasterizer
         #: Rasterizer for values that are cached over many steps; its results do not depend on what is cached.
-        self._repeatable = repeatable(rasterizer)
+        self._repeatable = rasterizer.repeatable
         self.loss = loss
         self.collectives = collectives
         self._photos = photos
@@ -157,14 +156,14 @@ class Views:
     def keep_weights(self, index: int) -> None:
         """Cache the blend weights of this rank's band of a view, if the rasterizer can cache them and they fit."""
         band = self._own_band(index)
-        if isinstance(self.rasterizer, CachedRasterizer) and band[0] < band[1]:
-            self.rasterizer.keep(self.cameras[index], band)
+        if band[0] < band[1]:
+            self.rasterizer.cache_weights(self.cameras[index], band)
 
     def lending_weights(self, index: int) -> AbstractContextManager[None]:
         """Use in a `with` block the blend weights that `keep_weights` would cache, even if they are not cached."""
         band = self._own_band(index)
-        if isinstance(self.rasterizer, CachedRasterizer) and band[0] < band[1]:
-            return self.rasterizer.lending(self.cameras[index], band)
+        if band[0] < band[1]:
+            return self.rasterizer.temporary_weights(self.cameras[index], band)
         return nullcontext()
 
     def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:

@@ -167,7 +167,8 @@ def test_a_rasterizer_that_does_not_work_here_is_planned_anew(request_: StylizeR
     go_on(job, steps=3)
     path = request_.out.with_name("s.checkpoint.safetensors")
     saved = load_checkpoint(path, job.fingerprint)
-    save_checkpoint(path, replace(saved, plan=replace(saved.plan, rasterizer="cuda")), job.fingerprint)
+    unusable = replace(saved.plan, rasterizer="cuda", uncached="cuda")
+    save_checkpoint(path, replace(saved, plan=unusable), job.fingerprint)
     again = prepare(request_, resume=Resume(True))
     assert again.resumed is not None
     assert again.resumed.plan.rasterizer == "cuda"

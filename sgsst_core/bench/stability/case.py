@@ -21,7 +21,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult, resize_area
 from sgsst_core.loss.sos_reference import sos_reference
-from sgsst_core.rasterizer import RasterizerName, make_rasterizer
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -148,7 +148,7 @@ def repeated(
     )
 
 
-def fast_rasterizers() -> tuple[RasterizerName, ...]:
+def fast_rasterizers() -> tuple[str, ...]:
     """Return the rasterizers to compare with `reference`: those for CPUs, and the GPU's if there is a GPU."""
     return ("cpu", "cached", "triton") if torch.cuda.is_available() else ("cpu", "cached")
 

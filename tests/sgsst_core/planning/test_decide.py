@@ -14,12 +14,13 @@ from sgsst_core.decision import Decision
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import MOST_VECTORS
-from sgsst_core.planning.choices import LEAST_PASSES, uncached_rasterizer
+from sgsst_core.planning.choices import LEAST_PASSES
 from sgsst_core.planning.cost import MEASURING_BYTES, OPTIMIZER_BYTES, SHAPE_BYTES, gaussian_bytes
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import LaunchCost, Link, Machine, NetworkFacts, Probe, RasterCost, Rate, SceneFacts
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import Survey
+from sgsst_core.rasterizer import rasterizer_for
 from sgsst_core.settings import make_settings
 
 VIEWS = 4
@@ -406,10 +407,10 @@ def test_half_precision_is_used_if_only_that_fits() -> None:
 
 
 def test_first_working_rasterizer_is_chosen_on_a_gpu() -> None:
-    assert uncached_rasterizer("cuda", {}) == "triton"
-    assert uncached_rasterizer("cuda", {"triton": "no driver"}) == "cuda"
-    assert uncached_rasterizer("cuda", {"triton": "no driver", "cuda": "no kernels"}) == "cpu"
-    assert uncached_rasterizer("cpu", {}) == "cpu"
+    assert rasterizer_for("cuda", {}) == "triton"
+    assert rasterizer_for("cuda", {"triton": "no driver"}) == "cuda"
+    assert rasterizer_for("cuda", {"triton": "no driver", "cuda": "no kernels"}) == "cpu"
+    assert rasterizer_for("cpu", {}) == "cpu"
 
 
 def on_a_gpu(raster: RasterCost, **changes: Any) -> Probe:

@@ -23,10 +23,9 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
-from sgsst_core.rasterizer import Rows, make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, Rows, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.plain_survey import plain_survey
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
 from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, check_intersections
 from sgsst_core.rasterizer.vectors import as_float
@@ -92,7 +91,7 @@ def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera
     for name in FAST:
         fast = make_rasterizer(name, scene)
         coverage, weights = fast.survey(view)
-        plain, gradient = plain_survey(CpuRasterizer(scene), view)
+        plain, gradient = Rasterizer.survey(CpuRasterizer(scene), view)
         assert torch.equal(coverage, plain)
         assert torch.equal(weights, gradient)
         assert_close_outside_band(coverage, expected, band, tolerance=1e-4)
@@ -338,7 +337,7 @@ def test_what_does_not_fit_the_budget_is_recomputed() -> None:
     scene = cloud(800, seed=20)
     views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
     colors, pixels = colors_of(scene), pixels_like(views[0])
-    sizes = [CachedRasterizer(scene).operator_bytes(view) for view in views]
+    sizes = [CpuRasterizer(scene).count_weights(view).nbytes("float32") for view in views]
     budget = sizes[0] + sizes[1]
     cached, cpu = CachedRasterizer(scene, max_bytes=budget), CpuRasterizer(scene)
     for _ in range(2):
@@ -367,7 +366,7 @@ def test_weights_and_lists_share_a_budget() -> None:
     scene = cloud(800, seed=20)
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
     colors = colors_of(scene)
-    weights = [CachedRasterizer(scene).operator_bytes(view) for view in views]
+    weights = [CpuRasterizer(scene).count_weights(view).nbytes("float32") for view in views]
     isects = [CpuRasterizer(scene).intersections(view).nbytes for view in views]
     cpu = CpuRasterizer(scene, max_intersection_bytes=sum(weights[:2]) + isects[2])
     cached = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + isects[2], uncached=cpu)
@@ -394,7 +393,7 @@ def test_arguments_are_checked_before_any_work() -> None:
 
 
 def test_unknown_rasterizers_and_devices_are_refused() -> None:
-    with pytest.raises(SettingsError, match="choose reference, cpu, cached, triton or cuda"):
+    with pytest.raises(SettingsError, match="choose triton, cuda, cpu, cached or reference"):
         make_rasterizer("fast", cloud(10))
     with pytest.raises(SettingsError, match="runs on the CPU"):
         make_rasterizer("cpu", cloud(10), device="cuda")

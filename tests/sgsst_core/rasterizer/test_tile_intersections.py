@@ -123,7 +123,7 @@ def test_tile_intersections_are_handed_on_once_and_stay_within_the_budget() -> N
     for view in views:
         whole.intersections(view)
     budget = sum(sizes[:3])
-    part = whole.of_subset(scene.subset(chosen), chosen, max_intersection_bytes=budget)
+    part = whole.for_subset(scene.subset(chosen), chosen, max_intersection_bytes=budget)
     assert [part.has_intersections(view) for view in views] == [True, True, True, False]
     for done, view in enumerate(views):
         check_same(part.intersections(view), build_tile_intersections(scene.subset(chosen), view))
@@ -132,7 +132,7 @@ def test_tile_intersections_are_handed_on_once_and_stay_within_the_budget() -> N
         assert [whole.has_intersections(other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
     assert part.intersections(views[1]) is part.intersections(views[1])
     with pytest.raises(ValueError, match="450 Gaussians are not the 600 chosen ones of 600"):
-        whole.of_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool))
+        whole.for_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool))
 
 
 def test_tile_intersections_beyond_a_new_limit_are_let_go_the_last_ones_first() -> None:
@@ -140,7 +140,7 @@ def test_tile_intersections_beyond_a_new_limit_are_let_go_the_last_ones_first() 
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
     cpu = CpuRasterizer(scene)
     sizes = [cpu.intersections(view).nbytes for view in views]
-    cpu.drop_intersections(views[0], sizes[1])
+    cpu.release_view(views[0], sizes[1])
     assert [cpu.has_intersections(view) for view in views] == [False, True, False]
 
 
@@ -149,7 +149,7 @@ def test_tile_intersections_beside_others_keep_what_these_leave_of_their_bytes()
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
     sizes = [build_tile_intersections(scene, view).nbytes for view in views]
     host = CpuRasterizer(scene, max_intersection_bytes=sum(sizes))
-    guests = [CpuRasterizer(scene, beside=host) for _ in range(2)]
+    guests = [host.beside(scene) for _ in range(2)]
 
     def kept() -> list[list[bool]]:
         return [[one.has_intersections(view) for view in views] for one in (host, *guests)]
@@ -163,10 +163,10 @@ def test_tile_intersections_beside_others_keep_what_these_leave_of_their_bytes()
     host.intersections(views[1])
     host.intersections(views[2])
     assert kept() == [[True] * 3, [False] * 3, [False] * 3]
-    host.drop_intersections(views[0], sum(sizes))
+    host.release_view(views[0], sum(sizes))
     guests[0].intersections(views[0])
     assert kept()[1] == [True, False, False]
-    host.drop_intersections(views[1], sizes[2])
+    host.release_view(views[1], sizes[2])
     assert kept()[:2] == [[False, False, True], [False] * 3]
     del guests[1]
     gc.collect()

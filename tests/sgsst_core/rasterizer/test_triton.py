@@ -21,8 +21,7 @@ import torch
 
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.plain_survey import plain_survey
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.rasterizer.trial import drawing_problem
@@ -105,7 +104,7 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera], one_thread: None)
 def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera], one_thread: None) -> None:
     scene, view = case
     coverage, weights = on_device(scene).survey(view)
-    plain, gradient = plain_survey(on_device(scene), view)
+    plain, gradient = Rasterizer.survey(on_device(scene), view)
     assert torch.equal(coverage, plain)
     if DEVICE == "cpu":
         assert torch.equal(weights, gradient)

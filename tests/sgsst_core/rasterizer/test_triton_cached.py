@@ -19,8 +19,8 @@ from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import measure
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer.base import Precision
 from sgsst_core.rasterizer.cached import CachedRasterizer
-from sgsst_core.rasterizer.cached_weights import Precision
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
@@ -86,7 +86,7 @@ def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
     """The bound holds down to the smallest weights, of a faint Gaussian behind opaque ones."""
     scene, view = cloud(150, seed=7, log_scale=-1.0), camera(18, 17)
     uncached = on_device(scene)
-    exact, half = (CachedRasterizer(scene, uncached=uncached).count(view).keep(form) for form in ERRORS)
+    exact, half = (CachedRasterizer(scene, uncached=uncached).count_weights(view).store(form) for form in ERRORS)
     weights = exact.weights.double()  # type: ignore[attr-defined]
     rounded = half.weights.double() / half.scale  # type: ignore[attr-defined]
     # On a GPU the exact weights come from another kernel, which may round differently.
@@ -133,7 +133,7 @@ def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
     gradient = cached.color_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()
-    assert cached.cached_bytes == cached.operator_bytes(view)
+    assert cached.cached_bytes == cached.count_weights(view).nbytes(cached.precision)
 
 
 def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() -> None:
@@ -141,9 +141,7 @@ def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() 
     views = [camera(20, 17), camera(20, 17, pose=turned_pose(0.1)), camera(17, 20, pose=turned_pose(0.2))]
     colors, pixels, uncached = colors_of(scene), pixels_like(views[0]), on_device(scene)
     for precision in ERRORS:
-        sizes = [
-            CachedRasterizer(scene, precision=precision, uncached=uncached).operator_bytes(view) for view in views[:2]
-        ]
+        sizes = [uncached.count_weights(view).nbytes(precision) for view in views[:2]]
         budget = sum(sizes)
         cached = CachedRasterizer(scene, precision=precision, uncached=uncached, max_bytes=budget)
         for view in views:
@@ -154,15 +152,15 @@ def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() 
     gradient = cached.color_gradient(pixels_like(views[2]), views[2])
     assert torch.equal(gradient, uncached.color_gradient(pixels_like(views[2]), views[2]))
     band = (3, 16)
-    assert cached.operator_bytes(views[2], band) < cached.operator_bytes(views[2])
+    assert cached.count_weights(views[2], band).nbytes(precision) < cached.count_weights(views[2]).nbytes(precision)
     alone = CachedRasterizer(scene, uncached=uncached)
     alone.color_gradient(pixels[3:16], views[0], band)
-    assert alone.cached_bytes == alone.operator_bytes(views[0], band)
+    assert alone.cached_bytes == alone.count_weights(views[0], band).nbytes(alone.precision)
 
 
 def test_a_piece_holds_a_weight_and_every_slot_is_filled_once() -> None:
     scene, view = cloud(120, seed=21), camera(33, 20)
-    weights: Any = cached_on_device(scene).count(view).keep("float32")
+    weights: Any = cached_on_device(scene).count_weights(view).store("float32")
     assert bool((weights.weights.view(-1, 16).amax(1) > 0).all())
     pieces = len(weights.piece_slots)
     assert torch.equal(weights.piece_slots.sort().values.cpu(), torch.arange(pieces, dtype=torch.int32))
@@ -195,7 +193,8 @@ def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monk
     """Intersections wait for their length, and weights for the number of pieces."""
     scene, view = cloud(60, seed=22), camera(20, 17)
     cached, colors, pixels = cached_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
-    cached.uncached.intersections(view)
+    uncached: Any = cached.uncached
+    uncached.intersections(view)
     with waits(monkeypatch) as found:
         cached.coverage(view)
     assert found == ["__int__"]

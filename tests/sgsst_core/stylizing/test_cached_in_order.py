@@ -26,7 +26,7 @@ def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
     """Make a job with enough memory for the blend weights of about half the views."""
     scene = wall()
     cached = CachedRasterizer(scene, precision="float32" if form == "float32" else "half")
-    size = sum(cached.operator_bytes(camera) for camera in VIEWS) // 2
+    size = sum(cached.count_weights(camera).nbytes(cached.precision) for camera in VIEWS) // 2
     settings = {"steps_coarse": 0, "steps_sos": STEPS, "position_weights": "on", "seed": 3, **settings}
     limit = size * 1024 // memory_for("rasterizer", 1024)
     chosen = make_settings("preview", cached_weights=form, memory_limit=limit, **settings)
@@ -90,25 +90,25 @@ def test_keeping_is_left_to_the_caller() -> None:
     pixels = torch.ones(view.height, view.width, 3)
     assert torch.equal(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view))
     assert (cached.is_cached(view), cached.cached_bytes) == (False, 0)
-    assert cached.keep(view)
+    assert cached.cache_weights(view)
     assert cached.is_cached(view, (3, 9))
     assert not cached.is_cached(VIEWS[1])
-    assert not CachedRasterizer(scene, at_first_use=False, max_bytes=10).keep(view)
+    assert not CachedRasterizer(scene, at_first_use=False, max_bytes=10).cache_weights(view)
 
 
 def test_lent_weights_are_those_that_are_cached() -> None:
     scene, view = wall(), VIEWS[0]
     lender, keeper = (CachedRasterizer(scene, at_first_use=False, precision="half") for _ in range(2))
     pixels = torch.ones(view.height, view.width, 3)
-    keeper.keep(view)
-    with lender.lending(view):
+    keeper.cache_weights(view)
+    with lender.temporary_weights(view):
         assert torch.equal(lender.color_gradient(pixels, view), keeper.color_gradient(pixels, view))
     uncached = CpuRasterizer(scene).color_gradient(pixels, view)
     assert torch.equal(lender.color_gradient(pixels, view), uncached)
     assert lender.cached_bytes == 0
     small = CachedRasterizer(scene, at_first_use=False, precision="half", max_bytes=10)
-    with small.lending(view):
+    with small.temporary_weights(view):
         assert torch.equal(small.color_gradient(pixels, view), uncached)
-    with keeper.lending(view):
+    with keeper.temporary_weights(view):
         pass
     assert keeper.is_cached(view)

@@ -63,6 +63,7 @@ def make(
         memory_limit=10**9,
         device="cuda",
         rasterizer=rasterizer,
+        uncached=rasterizer,
         graphs=graphs,
     )
     return Stylizer(plan, scene, views, style(), settings, weights=weights)

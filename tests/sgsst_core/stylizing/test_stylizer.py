@@ -80,7 +80,8 @@ def test_tile_intersections_of_the_survey_are_not_built_again(
         stylizer = Stylizer(plan, scene, views, style(), settings, weights=tiny_weights, planning_context=given)
         run(stylizer)
         results.append(stylizer.stylized())
-    assert built == [len(scene)] * 3 + [int(plan.seen.sum())] * 3
+    surveyed, timed = [len(scene)] * 3, [len(scene)] * 3
+    assert built == [*surveyed, *timed, *[int(plan.seen.sum())] * 3]
     assert torch.equal(*results)
 
 

@@ -1,0 +1,296 @@
+"""Base class of all rasterizers.
+
+Geometry is frozen, so the image of a view is linear in the colors c: image = W c + T_final * background, where W are
+the blend weights and T_final is the final transmittance. The gradient with respect to the colors is W^T dL/dimage.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Protocol, Self
+
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import NEAR
+from sgsst_core.errors import SettingsError
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.timing import wait_for
+
+Color = tuple[float, float, float]
+#: Half-open band (start, stop) of pixel rows of a view.
+Rows = tuple[int, int]
+
+#: Precision of cached blend weights. `half` stores weights times a power of two as float16, with a relative error of at
+#: most 2^-11 per weight.
+Precision = Literal["float32", "half"]
+
+#: Cache key of a camera. It contains everything that rendering depends on, so cameras with equal keys render equal
+#: images. The camera's name is not part of it.
+CameraKey = tuple[int, int, float, float, float, float, bytes]
+
+
+def camera_key(camera: Camera) -> CameraKey:
+    """Return the cache key of a camera."""
+    pose = camera.world_to_camera.detach().cpu().double().contiguous().numpy().tobytes()
+    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose
+
+
+def check_rows(camera: Camera, rows: Rows | None) -> Rows:
+    """Validate a band of rows and return it as (start, stop); None stands for the whole view.
+
+    Raises:
+        ValueError: If the band is empty or extends beyond the view.
+    """
+    start, stop = (0, camera.height) if rows is None else rows
+    if not 0 <= start < stop <= camera.height:
+        raise ValueError(f"rows {start} to {stop}: a band of view {camera.name!r} lies within 0 to {camera.height}")
+    return start, stop
+
+
+class CachedWeights(Protocol):
+    """Cached blend weights of one band of a view, on the device where they are applied.
+
+    Attributes:
+        transmittance: [h, width] float32, final transmittance.
+    """
+
+    transmittance: Tensor
+
+    @property
+    def nbytes(self) -> int:
+        """Size on the device in bytes."""
+        ...
+
+    def render(self, colors: Tensor) -> Tensor:
+        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
+        ...
+
+    def color_gradient(self, image_gradient: Tensor) -> Tensor:
+        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3]."""
+        ...
+
+
+class CountedWeights(Protocol):
+    """Blend weights of one band of a view, counted but not stored."""
+
+    def nbytes(self, precision: Precision) -> int:
+        """Return the size that the weights would have in bytes."""
+        ...
+
+    def store(self, precision: Precision) -> CachedWeights:
+        """Compute the weights again and store them."""
+        ...
+
+
+@dataclass(frozen=True)
+class RenderCost:
+    """Measured cost of rendering views with gradient.
+
+    Attributes:
+        seconds: Time in seconds of one render with gradient of each prepared view.
+        preparation_seconds: Mean time in seconds to prepare a view, for example to build its tile intersections.
+        preparation_bytes: Mean size in bytes of the prepared data in the memory of the CPU.
+    """
+
+    seconds: list[float]
+    preparation_seconds: float
+    preparation_bytes: int
+
+
+class Rasterizer(ABC):
+    """Renderer of a scene with frozen geometry and arbitrary colors.
+
+    A new rasterizer implements `_render`, `_coverage` and `_color_gradient` and is listed in
+    `sgsst_core.rasterizer.RASTERIZERS`; everything else has a default. Public methods accept colors and image gradients
+    of any floating dtype on any device. Results are on `device`, in `dtype`. A wrong shape raises ValueError.
+
+    Args:
+        scene: Scene, whose geometry must not change during the rasterizer's lifetime.
+        background: RGB color behind pixels that Gaussians leave uncovered.
+        near: Near plane in world units.
+        device: Device of the results; None for the rasterizer's default.
+        options: Other arguments of the subclass's constructor, which `for_scene` passes on.
+
+    Attributes:
+        name: Name for `make_rasterizer`.
+        title: Name in texts for users.
+        on_gpu: Whether it is meant for GPUs.
+        can_cache: Whether `CachedRasterizer` can cache its blend weights, with `count_weights`.
+        caches_exactly: Whether images from cached float32 weights are bit-identical to those from recomputed ones.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    on_gpu: ClassVar[bool] = False
+    can_cache: ClassVar[bool] = False
+    caches_exactly: ClassVar[bool] = False
+    dtype: torch.dtype = torch.float32
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        background: Color = (0.0, 0.0, 0.0),
+        near: float = NEAR,
+        device: torch.device | str | None = None,
+        **options: Any,
+    ) -> None:
+        if not near > 0:
+            raise ValueError(f"near plane {near}: must be positive")
+        self.scene = scene
+        self.near = near
+        self.device = self.usable_device(device)
+        self.background = torch.tensor(background, dtype=self.dtype, device=self.device)
+        self._options = {"background": background, "near": near, "device": device, **options}
+
+    @classmethod
+    def usable_device(cls, device: torch.device | str | None) -> torch.device:
+        """Validate a device and return it, or the default device for None.
+
+        Raises:
+            SettingsError: If the rasterizer cannot run on the device.
+        """
+        if device is not None and torch.device(device).type != "cpu":
+            raise SettingsError(f"rasterizer {cls.name!r} runs on the CPU, not on {device}: choose 'cached' or 'cuda'")
+        return torch.device("cpu")
+
+    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Return the image [h, width, 3] of colors [N, 3] over the background.
+
+        Args:
+            colors: Colors of one view, after spherical harmonics and clamping.
+            camera: Camera of the view.
+            rows: Band of rows to render; None for the whole view.
+        """
+        band, expected = check_rows(camera, rows), (len(self.scene), 3)
+        if tuple(colors.shape) != expected:
+            raise ValueError(f"colors of shape {tuple(colors.shape)}: the scene needs {expected}")
+        return self._render(self._converted(colors), camera, band)
+
+    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Return 1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
+        return self._coverage(camera, check_rows(camera, rows))
+
+    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
+        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3] of the rows."""
+        band = check_rows(camera, rows)
+        expected = (band[1] - band[0], camera.width, 3)
+        if tuple(image_gradient.shape) != expected:
+            raise ValueError(f"image gradient of shape {tuple(image_gradient.shape)}: the band needs {expected}")
+        return self._color_gradient(self._converted(image_gradient), camera, band)
+
+    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Return coverage [h, width] of the whole view, and each Gaussian's blend weight summed over all pixels [N].
+
+        The latter is a column of the color gradient for an image gradient of ones.
+        """
+        coverage = self.coverage(camera)
+        ones = torch.ones((*coverage.shape, 3), dtype=self.dtype, device=coverage.device)
+        return coverage, self.color_gradient(ones, camera)[:, 0]
+
+    @abstractmethod
+    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
+        """Implement `render` for valid arguments on the rasterizer's device, in its dtype."""
+
+    @abstractmethod
+    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
+        """Implement `coverage` for a valid band."""
+
+    @abstractmethod
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+        """Implement `color_gradient` for valid arguments on the rasterizer's device, in its dtype."""
+
+    def _converted(self, values: Tensor) -> Tensor:
+        return values.detach().to(device=self.device, dtype=self.dtype).contiguous()
+
+    # --- other scenes ---
+
+    @classmethod
+    def options(cls, memory: int) -> dict[str, Any]:
+        """Return constructor options for a memory budget in bytes."""
+        return {}
+
+    def for_scene(self, scene: Scene, **options: Any) -> Self:
+        """Return a rasterizer of another scene with the same options, apart from those given."""
+        return type(self)(scene, **(self._options | options))
+
+    def for_subset(self, scene: Scene, rows: Tensor, **options: Any) -> Self:
+        """Return a rasterizer of a subset of the Gaussians, which may take over data prepared for views.
+
+        Args:
+            scene: Scene of the subset, with unchanged geometry.
+            rows: [N] bool, mask of the subset.
+            options: Constructor options that differ.
+        """
+        return self.for_scene(scene, **options)
+
+    def beside(self, scene: Scene) -> Self:
+        """Return a rasterizer of another scene that shares this one's memory budget, with lower priority."""
+        return self.for_scene(scene)
+
+    # --- cached blend weights ---
+
+    @property
+    def uncached(self) -> Rasterizer:
+        """Rasterizer that computes blend weights in every call."""
+        return self
+
+    @property
+    def repeatable(self) -> Rasterizer:
+        """Rasterizer whose images are bit-identical whether or not weights are cached."""
+        return self
+
+    def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
+        """Count a band's weights without storing them; takes about as long as one render.
+
+        Raises:
+            NotImplementedError: If `can_cache` is False.
+        """
+        raise NotImplementedError(f"rasterizer {self.name!r} cannot cache the blend weights of {camera.name!r}, {rows}")
+
+    def cache_weights(self, camera: Camera, rows: Rows | None = None) -> bool:
+        """Cache a band's weights if possible, and return whether they are cached."""
+        return False
+
+    def temporary_weights(
+        self,
+        camera: Camera,
+        rows: Rows | None = None,
+    ) -> AbstractContextManager[None]:
+        """Use cached weights for a band inside a `with` block if this rasterizer caches any."""
+        return nullcontext()
+
+    def release_view(self, camera: Camera, budget: int) -> None:
+        """Drop the data prepared for a view, whose weights are now cached, and limit those of others to `budget` bytes.
+
+        Only rasterizers whose data share a memory budget with cached weights need this.
+        """
+
+    # --- cost ---
+
+    def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
+        """Measure the cost of rendering some views with gradient."""
+        timed = [self.step_seconds(camera, visits=2) for camera in cameras]
+        # Minimum, because one of them may include compilation or waiting for memory.
+        preparation = max(min(first - later for first, later in timed), 0.0)
+        return RenderCost([later for _, later in timed], preparation, 0)
+
+    def step_seconds(self, camera: Camera, visits: int = 1) -> list[float]:
+        """Return the time in seconds of each of several renders with gradient.
+
+        The first one includes the time to prepare the view, unless it is already prepared.
+        """
+        colors = torch.full((len(self.scene), 3), 0.5, device=self.device)
+        seconds = []
+        for _ in range(visits):
+            started = time.perf_counter()
+            self.color_gradient(self.render(colors, camera), camera)
+            wait_for(self.device)
+            seconds.append(time.perf_counter() - started)
+        return seconds
