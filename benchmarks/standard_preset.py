@@ -21,7 +21,8 @@ from benchmarks.cameras import read_views
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
-from sgsst_core.files.scene_file import read_scene, write_stylized
+from sgsst_core.files.scene_file import read_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.stylizing.evaluation import mean_loss
 
 #: Fractions of each phase after which all views are evaluated.

@@ -13,7 +13,8 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers
 from sgsst_core.files.colors import write_colors
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.scene_file import write_scene, write_stylized
+from sgsst_core.files.scene_file import write_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
@@ -188,7 +189,7 @@ def _write_ply(job: Job) -> None:
 def _only_colors_change(job: Job) -> bool:
     """Return whether the result has the same rows as the scene's file, with only f_dc changed."""
     file, attenuation = job.scene_file, job.stylizer.settings.sh_attenuation
-    return file.kept is None and file.copies is None and not (attenuation and file.scene.sh_degree)
+    return file.retained is None and file.copies is None and not (attenuation and file.scene.sh_degree)
 
 
 def _write_packed(job: Job) -> PackedLoss | None:

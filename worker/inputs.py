@@ -19,7 +19,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import check_photos, load_image, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
-from sgsst_core.files.sh_attenuation import check_sh_attenuation
+from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -82,7 +82,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     scene_file, reader = read_shared_scene(
         source.scene, collectives, drop_invalid=source.drop_invalid, growth=settings.refine
     )
-    together(collectives, lambda: check_sh_attenuation(scene_file.path, scene_file.header, settings.sh_attenuation))
+    together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
     cameras = fit_cameras(found, settings)
     together(collectives, lambda: check_scales(settings.scales, cameras, settings.coarsest_side))

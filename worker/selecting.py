@@ -13,8 +13,7 @@ from torch import Tensor
 
 from sgsst_core.errors import ImageError, SceneError
 from sgsst_core.files.images import find_masks, load_photo
-from sgsst_core.files.ply_columns import read_property
-from sgsst_core.files.scene_file import SceneFile
+from sgsst_core.files.scene_file import SceneFile, read_property
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions, check_regions
 from sgsst_core.regions.masks import count_votes, decide_by_votes
@@ -94,7 +93,7 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
     Raises:
         SceneError: If the file is not .npy, has another shape, or has values other than 0 and 1.
     """
-    rows = len(file.scene) if file.kept is None else len(file.kept)
+    rows = len(file.scene) if file.retained is None else len(file.retained)
     try:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # TokenError: unclosed bracket
@@ -108,7 +107,7 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
     flags = found == 1
     if not bool((flags | (found == 0)).all()):
         raise SceneError(f"{path}: has values other than 0 and 1. Give a flag for each Gaussian.")
-    return torch.from_numpy(np.array(flags if file.kept is None else flags[file.kept]))
+    return torch.from_numpy(np.array(flags if file.retained is None else flags[file.retained]))
 
 
 def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:

@@ -20,7 +20,8 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.scene_file import SceneFile, write_stylized
+from sgsst_core.files.scene_file import SceneFile
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.report.machine import machine
 from sgsst_core.scene.camera import Camera
 from worker.inputs import read_scene_and_cameras

@@ -15,7 +15,7 @@ from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.sh_attenuation import check_sh_attenuation
+from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
@@ -55,7 +55,7 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
             raise OutputError(f"{sheet}: not the name of a JPEG file. Give one, such as views.jpg.")
         check_folder(sheet.parent)
     file, cameras, orbit = read_scene_and_cameras(source)
-    check_sh_attenuation(file.path, file.header, settings.sh_attenuation)
+    check_sh_attenuation(file, settings.sh_attenuation)
     weights = load_network_weights(request.backbone)
     style = load_styles(request.styles)  # also reports an unusable style before any work is done
     regions = read_regions(request, file, fit_cameras(cameras, settings))

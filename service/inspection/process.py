@@ -38,7 +38,7 @@ from sgsst_core.files.cache_folder import cache_folder
 from sgsst_core.files.formats import format_of_name, read_scene_header
 from sgsst_core.files.images import check_photos, image_size, load_image
 from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
-from sgsst_core.files.sh_attenuation import check_sh_attenuation
+from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.orbit.choice import Orbit
 from sgsst_core.paintings import STARRY_NIGHT
@@ -115,7 +115,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
                 f"The scene has {declared:,} Gaussians{_once(settings)}. At most {limits['gaussians']:,} are allowed.",
             )
         file = read_scene(source.scene, drop_invalid=source.drop_invalid)
-        check_sh_attenuation(file.path, file.header, settings.sh_attenuation)
+        check_sh_attenuation(file, settings.sh_attenuation)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _ErrorsOf("style"):
         for path in staged.styles:

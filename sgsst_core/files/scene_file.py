@@ -1,16 +1,13 @@
-"""Reader and writer of scenes in any format, and writer of stylized PLYs that changes only the colors.
+"""Reader and writer of scenes in any format.
 
-PLYs may have any order and numeric type of the properties, and further ones; `write_stylized` returns them unchanged.
-Stylized scenes from other formats are written as PLYs with the layout of 3DGS trainers.
+PLYs may have any order and numeric type of the properties, and further ones; `stylized_ply` returns them unchanged.
 """
 
 from __future__ import annotations
 
 import io
-import itertools
 import re
 import warnings
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -28,7 +25,7 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
 from sgsst_core.files.formats.scene_format import SceneFormat, SceneHeader
-from sgsst_core.files.sh_attenuation import ShAttenuation, check_sh_attenuation
+from sgsst_core.files.scene_columns import SceneColumns
 from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
@@ -42,11 +39,18 @@ READ_BYTES = 1 << 20
 #: Maximum bytes of SH coefficients above degree 0 in memory: those of 1.4 million Gaussians of degree 3.
 HELD_BYTES = 1 << 28
 
-_DC = PROPERTIES["sh_dc"]
+#: Standard 3DGS properties by their names in PLY files: field of `Scene`, and column of its tensor (None for a 1D
+#: tensor).
+_STANDARD = {
+    **{name: ("means", column) for column, name in enumerate("xyz")},
+    **{f"scale_{column}": ("scales", column) for column in range(3)},
+    **{f"rot_{column}": ("quats", column) for column in range(4)},
+    **{f"f_dc_{column}": ("sh_dc", column) for column in range(3)},
+    "opacity": ("opacities", None),
+}
+
 #: Properties that differ between the pieces of a split Gaussian.
 _SHAPE = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"])
-#: Order of the properties in messages; f_rest_* follow.
-_ORDER = (*itertools.chain(*PROPERTIES.values()), "opacity")
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ class SceneFile:
         path: Path of the file.
         scene: Gaussians of the file, without dropped ones.
         header: PLY header, whose file `write_stylized` preserves; None for other formats.
-        kept: Mask [rows] bool of the file's rows that the scene contains; None if it contains all.
+        retained: Mask [rows] bool of the file's rows that the scene contains; None if it contains all.
         stamp: Size in bytes and modification time in ns of the file when it was read.
         format: Name of the file's format.
         copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
@@ -66,7 +70,7 @@ class SceneFile:
     path: Path
     scene: Scene
     header: PlyHeader | None
-    kept: NDArray[np.bool_] | None
+    retained: NDArray[np.bool_] | None
     stamp: tuple[int, int]
     format: str = PLY.name
     copies: NDArray[np.int64] | None = None
@@ -81,26 +85,24 @@ class SceneFile:
             return self
         if self.header is not None:
             kinds = {prop.name: prop.kind for prop in self.header.vertex.properties}
-            whole = [name for name in _SHAPE if kinds[name][0] != "f"]
-            if whole:
+            integers = [name for name in _SHAPE if kinds[name][0] != "f"]
+            if integers:
                 raise SceneError(
-                    f"{self.path}: {', '.join(whole)} are stored as integers; smaller Gaussians need float or double. "
-                    "Convert the scene first, or leave --refine out."
+                    f"{self.path}: {', '.join(integers)} are stored as integers; smaller Gaussians need float or "
+                    "double. Convert the scene first, or leave --refine out."
                 )
-        scene, copies = refinement.of(self.scene), piece_counts(refinement.pieces)
-        return replace(self, scene=scene, copies=copies.numpy())
+        return replace(self, scene=refinement.of(self.scene), copies=piece_counts(refinement.pieces).numpy())
 
     @property
     def dropped(self) -> int:
         """Return the number of the file's Gaussians that were dropped."""
-        return 0 if self.kept is None else int(len(self.kept) - self.kept.sum())
+        return 0 if self.retained is None else int(len(self.retained) - self.retained.sum())
 
 
 def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None = None) -> SceneFile:
     """Read a 3DGS scene of SH degree 0 to 3. The format is detected from the file's content.
 
-    PLYs may be text or binary, with any order and numeric type of the properties. Compressed PLY, SPZ and .splat are
-    decompressed into memory.
+    Scenes of other formats than PLY are decompressed into memory.
 
     Args:
         path: Path of the file.
@@ -114,45 +116,38 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
         SceneError: If the file cannot be read, is truncated, is not a 3DGS scene, has a wrong header, no Gaussians or
             invalid values, or has changed while it was read.
     """
-    declared = read_scene_header(path)
-    if not isinstance(declared, PlySceneHeader):
-        return _read_arrays(path, declared, drop_invalid)
-    header = declared.ply
-    offset = element_offsets(path, header).get("vertex", 0)
+    header = read_scene_header(path)
+    ply = header.ply if isinstance(header, PlySceneHeader) else None
+    offset = element_offsets(path, ply).get("vertex", 0) if ply else 0
     file = RowFile(path)
     stamp = file.stamp
-    stored = _row_layout(path, header, stamp, offset) if stays_in_file(declared, held_bytes) else None
-    into = _Columns(header.vertex.count, 0 if stored else declared.coefficients, stored)
-    if header.text:
-        rows = text_vertices(path, header)
+    stored = _row_layout(path, ply, stamp, offset) if ply and stays_in_file(header, held_bytes) else None
+    columns = SceneColumns(header.count, 0 if stored else header.coefficients, stored)
+    if ply is None:
+        _read_arrays(file, header, columns)
+    elif ply.text:
+        rows = text_vertices(path, ply)
         for start in range(0, len(rows), BLOCK_ROWS):
-            into.take(start, rows[start : start + BLOCK_ROWS])
+            columns.take(start, rows[start : start + BLOCK_ROWS])
     else:
-        _read_binary(file, header, offset, into)
+        _read_binary(file, ply, offset, columns)
     file.check_unchanged(stamp)
-    kept = _valid_rows(path, header.vertex.count, into.flaws, drop_invalid)
-    arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in into.arrays.items()}
+    retained = columns.valid_rows(path, drop_invalid)
+    arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in columns.arrays.items()}
     if stored:
         arrays["sh_rest"] = StoredHarmonics(stored, file=file)
     scene = Scene(**arrays)
-    return SceneFile(path, scene if kept is None else scene.subset(torch.from_numpy(kept)), header, kept, stamp)
+    if retained is not None:
+        scene = scene.subset(torch.from_numpy(retained))
+    return SceneFile(path, scene, ply, retained, stamp, header.format.name)
 
 
-def _read_arrays(path: Path, header: SceneHeader, drop_invalid: bool) -> SceneFile:
+def _read_arrays(file: RowFile, header: SceneHeader, columns: SceneColumns) -> None:
     """Read a scene in any format other than PLY."""
-    file = RowFile(path)
-    stamp = file.stamp
-    into = _Columns(header.count, header.coefficients, None)
     assert header.format.read is not None
-    header.format.read(file, header, into.arrays)
-    file.check_unchanged(stamp)
+    header.format.read(file, header, columns.arrays)
     for start in range(0, header.count, BLOCK_ROWS):
-        into.check(start, min(BLOCK_ROWS, header.count - start))
-    kept = _valid_rows(path, header.count, into.flaws, drop_invalid)
-    scene = Scene(**{name: torch.from_numpy(array) for name, array in into.arrays.items()})
-    if kept is not None:
-        scene = scene.subset(torch.from_numpy(kept))
-    return SceneFile(path, scene, None, kept, stamp, header.format.name)
+        columns.check(start, min(BLOCK_ROWS, header.count - start))
 
 
 def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
@@ -175,48 +170,6 @@ def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
     plain &= all(dtype[name] == np.dtype("<f4") for name in names[first : first + count])
     offset = dtype.fields["f_rest_0"][1] if dtype.fields else 0
     return plain and dtype.itemsize % 4 == 0 and offset % 4 == 0 and 4 * count * header.vertex.count > limit
-
-
-def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
-    """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
-
-    A color keeps its bytes too if its float32 value does not change. The rest of the file changes in three cases:
-
-    - With an SH attenuation, f_rest_* change.
-    - Dropped rows are absent, and the count in the header is adjusted.
-    - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
-
-    A scene in another format is written as a PLY by `write_scene`.
-
-    Args:
-        source: File from `read_scene`.
-        target: File to write; may be the source itself.
-        sh_dc: Finite coefficients, [N, 3] with N = len(source.scene).
-        sh_attenuation: SH attenuation of f_rest_*, 0 to 1; see `Scene.attenuated`.
-
-    Raises:
-        SceneError: If the source file has changed since it was read, or cannot store attenuated coefficients.
-        OutputError: If the target cannot be written.
-        ValueError: If sh_dc has the wrong shape or non-finite values.
-    """
-    if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
-        raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
-    if file_stamp(source.path) != source.stamp:
-        raise changed(source.path)
-    if source.header is None:
-        write_scene(
-            target, replace(source.scene.attenuated(sh_attenuation), sh_dc=sh_dc.detach().to("cpu", torch.float32))
-        )
-        return
-    check_sh_attenuation(source.path, source.header, sh_attenuation)
-    attenuation = ShAttenuation.of(source.header, sh_attenuation)
-    columns = _new_columns(source, sh_dc.detach().to("cpu", torch.float32))
-    with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
-        output.write(_header_for(source, source.header))
-        if source.header.text:
-            _write_text(source, source.header, columns, attenuation, file, output)
-        else:
-            _write_binary(source, source.header, columns, attenuation, file, output)
 
 
 def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY) -> None:
@@ -262,90 +215,7 @@ def _row_layout(path: Path, header: PlyHeader, stamp: tuple[int, int], offset: i
     return RowLayout(path, stamp, offset, header.vertex.count, size, fields["f_rest_0"][1], count // 3)
 
 
-@dataclass(frozen=True)
-class _Flaws:
-    """Invalid values in a block of rows.
-
-    Attributes:
-        start: First row of the block.
-        valid: Mask [n] bool of rows with valid values only.
-        counts: Numbers of NaN and of infinite values, for each property that has any.
-        unrotated: Mask [n] bool of rows with a quaternion of length 0, which is not a rotation.
-    """
-
-    start: int
-    valid: NDArray[np.bool_]
-    counts: dict[str, tuple[int, int]]
-    unrotated: NDArray[np.bool_]
-
-
-class _Columns:
-    """Arrays of a scene, filled block by block from the rows of a file, and the invalid values found in them.
-
-    Args:
-        count: Number of rows.
-        coefficients: Number of SH coefficients per color channel to load.
-        stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
-
-    Attributes:
-        arrays: float32 arrays by the names of the scene's tensors.
-        flaws: Invalid values of each block that contains any.
-    """
-
-    def __init__(self, count: int, coefficients: int, stored: RowLayout | None) -> None:
-        self._stored = stored
-        self.arrays: dict[str, NDArray[Any]] = {
-            name: np.empty((count, len(names)), np.float32) for name, names in PROPERTIES.items()
-        }
-        self.arrays["opacities"] = np.empty(count, np.float32)
-        self.arrays["sh_rest"] = np.empty((count, coefficients, 3), np.float32)
-        self._targets = {
-            prop: self.arrays[name][:, i] for name, names in PROPERTIES.items() for i, prop in enumerate(names)
-        }
-        self._targets["opacity"] = self.arrays["opacities"]
-        for i in range(3 * coefficients):
-            self._targets[f"f_rest_{i}"] = self.arrays["sh_rest"][:, i % coefficients, i // coefficients]
-        self.flaws: list[_Flaws] = []
-
-    def take(self, start: int, rows: NDArray[Any]) -> None:
-        """Copy a structured block of rows to the arrays from row `start` on. Thread-safe for different blocks."""
-        part = slice(start, start + len(rows))
-        with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite and is reported as such
-            for name, target in self._targets.items():
-                target[part] = rows[name]
-        self.check(start, len(rows), rows)
-
-    def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:
-        """Record invalid values of `count` rows from `start` on.
-
-        `rows` is required if SH coefficients stay in the file.
-        """
-        part = slice(start, start + count)
-        blocks = [array[part] for array in self.arrays.values()]
-        if self._stored is not None and rows is not None:
-            table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
-            first = self._stored.column // 4
-            blocks.append(table[:, first : first + 3 * self._stored.coefficients])
-        rotated = self.arrays["quats"][part].any(axis=1)
-        if not (rotated.all() and all(bool(np.isfinite(block).all()) for block in blocks)):
-            self.flaws.append(self._flaws_of(start, count, rows))
-
-    def _flaws_of(self, start: int, count: int, rows: NDArray[Any] | None) -> _Flaws:
-        unrotated: NDArray[np.bool_] = np.logical_not(self.arrays["quats"][start : start + count].any(axis=1))
-        valid, counts = np.logical_not(unrotated), {}
-        columns = {name: target[start : start + count] for name, target in self._targets.items()}
-        if self._stored is not None and rows is not None:
-            columns |= {name: rows[name] for name in map("f_rest_{}".format, range(3 * self._stored.coefficients))}
-        for name, column in columns.items():
-            good = np.isfinite(column)
-            valid &= good
-            nans = int(np.isnan(column).sum())
-            if not good.all():
-                counts[name] = nans, int((~good).sum()) - nans
-        return _Flaws(start, valid, counts, unrotated)
-
-
-def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: _Columns) -> None:
+def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: SceneColumns) -> None:
     """Read the vertex element in blocks. Large files are read with as many threads as PyTorch uses."""
     dtype, count = header.vertex.dtype(header.byte_order), header.vertex.count
     step = max(1, READ_BYTES // dtype.itemsize)
@@ -398,41 +268,6 @@ def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
         raise SceneError(f"{path}: cannot be read as PLY: {error}. Export the scene again.") from error
 
 
-def _valid_rows(path: Path, count: int, flaws: list[_Flaws], drop_invalid: bool) -> NDArray[np.bool_] | None:
-    """Return the mask [count] bool of valid rows, or None if all are valid.
-
-    Raises SceneError if invalid rows may not be dropped, or if no valid rows remain.
-    """
-    if not flaws:
-        return None
-    kept = np.ones(count, dtype=np.bool_)
-    totals: dict[str, list[int]] = {}
-    unrotated = np.concatenate([flaw.start + np.flatnonzero(flaw.unrotated) for flaw in flaws])
-    for flaw in flaws:
-        kept[flaw.start : flaw.start + len(flaw.valid)] = flaw.valid
-        for name, (nans, infinite) in flaw.counts.items():
-            total = totals.setdefault(name, [0, 0])
-            total[0] += nans
-            total[1] += infinite
-    rest = sorted((name for name in totals if name not in _ORDER), key=lambda name: int(name.removeprefix("f_rest_")))
-    found = []
-    for name in [*(name for name in _ORDER if name in totals), *rest]:
-        counts = dict(zip(("NaN", "infinite"), totals[name], strict=True))
-        found.append(f"{name} ({', '.join(f'{number} {what}' for what, number in counts.items() if number)})")
-    bad = int((~kept).sum())
-    flawed = [f"hold NaN or infinite values: {', '.join(found)}"] if found else []
-    if len(unrotated):
-        flawed += [
-            f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {min(unrotated)})"
-        ]
-    summary = f"{path}: {bad} of {len(kept)} Gaussians {', or '.join(flawed)}"
-    if bad == len(kept):
-        raise SceneError(f"{summary}. No valid Gaussians remain. Train or export the scene again.")
-    if not drop_invalid:
-        raise SceneError(f"{summary}. Use --drop-invalid to drop these Gaussians.")
-    return kept
-
-
 def file_stamp(path: Path) -> tuple[int, int]:
     """Return the size in bytes and the modification time in ns of a file, to detect changes."""
     try:
@@ -442,136 +277,31 @@ def file_stamp(path: Path) -> tuple[int, int]:
     return status.st_size, status.st_mtime_ns
 
 
-def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
-    """Return the source's header, with the new number of rows if Gaussians were dropped or split."""
-    raw = header.raw
-    if source.kept is None and source.copies is None:
-        return raw
-    start, stop = header.vertex.count_span
-    return raw[:start] + str(len(source.scene)).encode() + raw[stop:]
+def read_property(file: SceneFile, name: str) -> Tensor:
+    """Return a property of the scene's Gaussians, [N].
 
+    Standard 3DGS properties are float32. Other properties keep the file's dtype, except that integers become float64.
 
-#: New values of all Gaussians, by property name.
-_NewColumns = dict[str, NDArray[np.float32]]
-
-
-def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
-    """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes."""
-    columns = dict(zip(_DC, colors.numpy().T, strict=True))
-    if source.copies is not None:
-        columns["opacity"] = source.scene.opacities.numpy()
-        for names, values in ((PROPERTIES["means"], source.scene.means), (PROPERTIES["scales"], source.scene.scales)):
-            columns |= dict(zip(names, values.numpy().T, strict=True))
-    return columns
-
-
-def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
-    """Yield, for each block of file rows, its length, the number of copies of each row, and the slice of Gaussians."""
-    position = gaussian = 0
-    for start in range(0, rows, BLOCK_ROWS):
-        count = min(BLOCK_ROWS, rows - start)
-        times = np.ones(count, np.int64)
-        if source.kept is not None:
-            times[:] = source.kept[start : start + count]
-        if source.copies is not None:
-            own = times.nonzero()[0]
-            times[own] = source.copies[position : position + len(own)]
-            position += len(own)
-        following = gaussian + int(times.sum())
-        yield count, times, slice(gaussian, following)
-        gaussian = following
-
-
-def _write_binary(
-    source: SceneFile,
-    header: PlyHeader,
-    columns: _NewColumns,
-    attenuation: ShAttenuation | None,
-    file: io.BufferedReader,
-    output: BinaryIO,
-) -> None:
-    dtype = header.vertex.dtype(header.byte_order)
-    before = element_offsets(source.path, header)["vertex"] - len(header.raw)
-    file.seek(len(header.raw))
-    _copy(file, output, before)
-    buffer = bytearray(min(BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
-    for count, times, gaussians in _blocks(source, header.vertex.count):
-        part = memoryview(buffer)[: count * dtype.itemsize]
-        if file.readinto(part) != len(part):
-            raise changed(source.path)
-        rows = np.frombuffer(part, dtype)
-        if not (times == 1).all():
-            rows = np.repeat(rows, times)
-        for name, values in columns.items():
-            column = values[gaussians]
-            different = rows[name].astype(np.float32) != column
-            rows[name][different] = column[different]
-        if attenuation is not None:
-            attenuation.apply(rows)
-        output.write(rows.view(np.uint8).data)
-    _copy(file, output)
-    if file_stamp(source.path) != source.stamp:
-        raise changed(source.path)
-
-
-def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
-    """Copy `count` bytes, or all remaining bytes if it is None."""
-    while count is None or count > 0:
-        data = file.read(1 << 20 if count is None else min(count, 1 << 20))
-        if not data:
-            return
-        output.write(data)
-        count = None if count is None else count - len(data)
-
-
-def _write_text(
-    source: SceneFile,
-    header: PlyHeader,
-    columns: _NewColumns,
-    attenuation: ShAttenuation | None,
-    file: BinaryIO,
-    output: BinaryIO,
-) -> None:
-    vertex = header.vertex
-    before = header.elements[: header.elements.index(vertex)]
-    order = [prop.name for prop in vertex.properties]
-    names = (*columns, *(attenuation.names if attenuation else ()))
-    slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in names]
-    file.seek(len(header.raw))
-    # latin-1 preserves every byte, and newline="" every line end
-    lines = io.TextIOWrapper(file, "latin-1", newline="")
-    for _ in range(sum(element.count for element in before)):
-        output.write(lines.readline().encode("latin-1"))
-    for _, times, gaussians in _blocks(source, vertex.count):
-        values = iter(np.stack([column[gaussians] for column in columns.values()], axis=1))
-        for copies in times:
-            line = lines.readline()
-            for _ in range(copies):
-                output.write(_changed_line(line, slots, next(values), attenuation).encode("latin-1"))
-    for line in lines:
-        output.write(line.encode("latin-1"))
-
-
-def _changed_line(
-    line: str, slots: list[tuple[int, str]], values: NDArray[Any], attenuation: ShAttenuation | None
-) -> str:
-    """Return a row of text with new values. Tokens whose value does not change, and all spacing, stay as they are.
-
-    Args:
-        line: Row of text.
-        slots: Token index and NumPy type code of each value to replace: those of `values` first, then those to
-            attenuate.
-        values: New values of the first slots.
-        attenuation: SH attenuation of the remaining slots; None if there are none.
+    Raises:
+        SceneError: If the file has no such numeric property, or has changed since it was read.
     """
-    tokens = list(re.finditer(r"\S+", line))
-    if attenuation is not None:
-        old = np.array([tokens[slot][0] for slot, _ in slots[len(values) :]], dtype=np.float32)
-        values = np.concatenate([values, attenuation.attenuated(old)])
-    for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):
-        token = tokens[slot]
-        if np.float32(token[0]) != value:
-            # shortest text that parses to the same number in the precision that the file declares
-            text = str(value) if kind == "f4" else repr(float(value))
-            line = line[: token.start()] + text + line[token.end() :]
-    return line
+    if name in _STANDARD:
+        field, column = _STANDARD[name]
+        values: Tensor = getattr(file.scene, field)
+        return values if column is None else values[:, column]
+    header = file.header
+    others = [] if header is None else [prop.name for prop in header.vertex.properties]
+    if header is None or name not in others:
+        known = sorted({*_STANDARD, *others})
+        raise SceneError(f"{file.path}: its Gaussians have no property {name!r}. There are {', '.join(known)}.")
+    if header.text:
+        rows = text_vertices(file.path, header)[name]
+    else:
+        offset = element_offsets(file.path, header)["vertex"]
+        table = np.memmap(file.path, header.vertex.dtype(header.byte_order), "r", offset, (header.vertex.count,))
+        rows = np.array(table[name])
+    if file_stamp(file.path) != file.stamp:
+        raise changed(file.path)
+    if file.retained is not None:
+        rows = rows[file.retained]
+    return torch.from_numpy(rows.astype(np.float64 if rows.dtype.kind != "f" else rows.dtype.newbyteorder("=")))

@@ -160,10 +160,10 @@ class _Scene:
 
     def _row(self, index: int) -> int:
         """Return the row of a Gaussian in the file."""
-        return index if self.file.kept is None else int(np.flatnonzero(self.file.kept)[index])
+        return index if self.file.retained is None else int(np.flatnonzero(self.file.retained)[index])
 
     def invalid(self) -> list[Finding]:
-        kept = self.file.kept
+        kept = self.file.retained
         if kept is None:
             return []
         first = int(np.flatnonzero(~kept)[0])

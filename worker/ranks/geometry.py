@@ -114,8 +114,8 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
     stored = file.scene.sh_rest if isinstance(file.scene.sh_rest, StoredHarmonics) else None
     tensors = {name.name: getattr(file.scene, name.name) for name in fields(Scene)}
     arrays: dict[str, NDArray[Any]] = {name: value.numpy() for name, value in tensors.items() if value is not stored}
-    if file.kept is not None:
-        arrays["kept"] = file.kept
+    if file.retained is not None:
+        arrays["retained"] = file.retained
     layout: _Layout = {}
     size = 0
     for name, array in arrays.items():
@@ -129,7 +129,7 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
             memory[offset : offset + data.nbytes] = data.data
     empty = Scene(*(torch.empty(0) for _ in fields(Scene)))
     in_file = None if stored is None else stored.arguments
-    shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, kept=None), in_file)
+    shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, retained=None), in_file)
     return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared
 
 
@@ -141,11 +141,11 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
     for name, (offset, shape, kind) in shared.layout.items():
         count = int(np.prod(shape))
         arrays[name] = np.frombuffer(memory, kind, count, offset).reshape(shape) if count else np.empty(shape, kind)
-    kept = arrays.pop("kept", None)
+    retained = arrays.pop("retained", None)
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     if shared.harmonics is not None:
         tensors["sh_rest"] = StoredHarmonics(*shared.harmonics)
-    return replace(shared.file, scene=Scene(**tensors), kept=kept)
+    return replace(shared.file, scene=Scene(**tensors), retained=retained)
 
 
 def _check_room(path: Path, collectives: Collectives, sharing: int, growth: float) -> None:

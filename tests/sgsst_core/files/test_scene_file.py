@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files import scene_file
-from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
+from sgsst_core.files import scene_file, stylized_ply
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.refine.split import Refinement, parents_of, piece_counts
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held
@@ -195,7 +196,8 @@ def test_any_3dgs_ply_comes_back_with_new_colors_and_nothing_else_changed(
 def test_only_the_bytes_of_the_colors_change(
     tmp_path: Path, form: str, block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene_file, "BLOCK_ROWS", block)
+    for module in (scene_file, stylized_ply):
+        monkeypatch.setattr(module, "BLOCK_ROWS", block)
     file = simple(5, degree=1, form=form)
     behind = b"" if form == "ascii" else b"bytes behind the last element \xff\r\n"
     data = file.to_bytes() + behind
@@ -220,7 +222,8 @@ def test_only_the_bytes_of_the_colors_change(
 def test_a_cut_gaussian_has_a_row_for_each_part_with_all_that_its_row_held(
     tmp_path: Path, form: str, dropped: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene_file, "BLOCK_ROWS", 2)
+    for module in (scene_file, stylized_ply):
+        monkeypatch.setattr(module, "BLOCK_ROWS", 2)
     file = simple(5, degree=1, form=form)
     properties, rows = file.elements[0][1], file.elements[0][2]
     properties.insert(3, ("uchar", "label"))

@@ -12,9 +12,10 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files import scene_file
+from sgsst_core.files import scene_file, stylized_ply
 from sgsst_core.files.formats.spz import SPZ
-from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
@@ -26,7 +27,8 @@ FADES = (1e-9, 0.25, 0.7, 1.0)
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
-    monkeypatch.setattr(scene_file, "BLOCK_ROWS", 17)
+    for module in (scene_file, stylized_ply):
+        monkeypatch.setattr(module, "BLOCK_ROWS", 17)
 
 
 def written(folder: Path, degree: int = 3) -> Path:

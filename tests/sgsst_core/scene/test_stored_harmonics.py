@@ -18,10 +18,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files import scene_file
+from sgsst_core.files import scene_file, stylized_ply
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.scene_format import SceneHeader
-from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
@@ -36,7 +37,8 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the block size, so that small scenes have many blocks, including incomplete ones."""
     monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
     monkeypatch.setattr(scene_file, "READ_BYTES", 3000)
-    monkeypatch.setattr(scene_file, "BLOCK_ROWS", 17)
+    for module in (scene_file, stylized_ply):
+        monkeypatch.setattr(module, "BLOCK_ROWS", 17)
 
 
 def both(path: Path, *, drop: bool = False) -> tuple[Scene, Scene]:
@@ -259,7 +261,8 @@ _PEAK = textwrap.dedent("""
     import sys
     from pathlib import Path
     import torch
-    from sgsst_core.files.scene_file import read_scene, write_stylized
+    from sgsst_core.files.scene_file import read_scene
+    from sgsst_core.files.stylized_ply import write_stylized
     from sgsst_core.scene.spherical_harmonics import rest_colors
     from tests.sgsst_core.splat_scenes import camera
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held

@@ -16,7 +16,8 @@ from plyfile import PlyData, PlyElement
 
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
-from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import (
     assert_close,

@@ -17,7 +17,8 @@ from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat
 from sgsst_core.files.formats.splat import SPLAT
 from sgsst_core.files.formats.spz import SPZ
-from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.quality.packed import measure_packed
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors

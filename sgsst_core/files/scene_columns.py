@@ -1,0 +1,141 @@
+"""Arrays of a scene that is being read, and the invalid values found in them."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.formats.ply import PROPERTIES
+from sgsst_core.scene.stored_harmonics import RowLayout
+
+#: Order of the properties in messages; f_rest_* follow.
+_ORDER = (*itertools.chain(*PROPERTIES.values()), "opacity")
+
+
+@dataclass(frozen=True)
+class _Flaws:
+    """Invalid values in a block of rows.
+
+    Attributes:
+        start: First row of the block.
+        valid: Mask [n] bool of rows with valid values only.
+        counts: Numbers of NaN and of infinite values, for each property that has any.
+        unrotated: Mask [n] bool of rows with a quaternion of length 0, which is not a rotation.
+    """
+
+    start: int
+    valid: NDArray[np.bool_]
+    counts: dict[str, tuple[int, int]]
+    unrotated: NDArray[np.bool_]
+
+
+class SceneColumns:
+    """Arrays of a scene, filled block by block from the rows of a file, and the invalid values found in them.
+
+    Args:
+        count: Number of rows.
+        coefficients: Number of SH coefficients per color channel to load.
+        stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
+
+    Attributes:
+        arrays: float32 arrays by the names of the scene's tensors.
+        flaws: Invalid values of each block that contains any.
+    """
+
+    def __init__(self, count: int, coefficients: int, stored: RowLayout | None) -> None:
+        self._stored = stored
+        self.arrays: dict[str, NDArray[Any]] = {
+            name: np.empty((count, len(names)), np.float32) for name, names in PROPERTIES.items()
+        }
+        self.arrays["opacities"] = np.empty(count, np.float32)
+        self.arrays["sh_rest"] = np.empty((count, coefficients, 3), np.float32)
+        self._targets = {
+            prop: self.arrays[name][:, i] for name, names in PROPERTIES.items() for i, prop in enumerate(names)
+        }
+        self._targets["opacity"] = self.arrays["opacities"]
+        for i in range(3 * coefficients):
+            self._targets[f"f_rest_{i}"] = self.arrays["sh_rest"][:, i % coefficients, i // coefficients]
+        self.flaws: list[_Flaws] = []
+
+    def take(self, start: int, rows: NDArray[Any]) -> None:
+        """Copy a structured block of rows to the arrays from row `start` on. Thread-safe for different blocks."""
+        block = slice(start, start + len(rows))
+        with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite and is reported as such
+            for name, target in self._targets.items():
+                target[block] = rows[name]
+        self.check(start, len(rows), rows)
+
+    def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:
+        """Record invalid values of `count` rows from `start` on.
+
+        `rows` is required if SH coefficients stay in the file.
+        """
+        arrays = [array[start : start + count] for array in self.arrays.values()]
+        if self._stored is not None and rows is not None:
+            table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
+            first = self._stored.column // 4
+            arrays.append(table[:, first : first + 3 * self._stored.coefficients])
+        rotated = self.arrays["quats"][start : start + count].any(axis=1)
+        if not (rotated.all() and all(bool(np.isfinite(array).all()) for array in arrays)):
+            self.flaws.append(self._flaws_of(start, count, rows))
+
+    def _flaws_of(self, start: int, count: int, rows: NDArray[Any] | None) -> _Flaws:
+        unrotated: NDArray[np.bool_] = np.logical_not(self.arrays["quats"][start : start + count].any(axis=1))
+        valid, counts = np.logical_not(unrotated), {}
+        columns = {name: target[start : start + count] for name, target in self._targets.items()}
+        if self._stored is not None and rows is not None:
+            columns |= {name: rows[name] for name in map("f_rest_{}".format, range(3 * self._stored.coefficients))}
+        for name, column in columns.items():
+            good = np.isfinite(column)
+            valid &= good
+            nans = int(np.isnan(column).sum())
+            if not good.all():
+                counts[name] = nans, int((~good).sum()) - nans
+        return _Flaws(start, valid, counts, unrotated)
+
+    def valid_rows(self, path: Path, drop_invalid: bool) -> NDArray[np.bool_] | None:
+        """Return the mask [count] bool of valid rows; None if all are valid.
+
+        Args:
+            path: Path of the file, for messages.
+            drop_invalid: Whether rows may be invalid.
+
+        Raises:
+            SceneError: If invalid rows may not be dropped, or no valid rows remain.
+        """
+        if not self.flaws:
+            return None
+        retained = np.ones(len(self.arrays["means"]), dtype=np.bool_)
+        totals: dict[str, list[int]] = {}
+        unrotated = np.concatenate([flaw.start + np.flatnonzero(flaw.unrotated) for flaw in self.flaws])
+        for flaw in self.flaws:
+            retained[flaw.start : flaw.start + len(flaw.valid)] = flaw.valid
+            for name, (nans, infinite) in flaw.counts.items():
+                total = totals.setdefault(name, [0, 0])
+                total[0] += nans
+                total[1] += infinite
+        rest = sorted(
+            (name for name in totals if name not in _ORDER), key=lambda name: int(name.removeprefix("f_rest_"))
+        )
+        found = []
+        for name in [*(name for name in _ORDER if name in totals), *rest]:
+            counts = dict(zip(("NaN", "infinite"), totals[name], strict=True))
+            found.append(f"{name} ({', '.join(f'{number} {what}' for what, number in counts.items() if number)})")
+        bad = int((~retained).sum())
+        flawed = [f"hold NaN or infinite values: {', '.join(found)}"] if found else []
+        if len(unrotated):
+            flawed += [
+                f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {min(unrotated)})"
+            ]
+        summary = f"{path}: {bad} of {len(retained)} Gaussians {', or '.join(flawed)}"
+        if bad == len(retained):
+            raise SceneError(f"{summary}. No valid Gaussians remain. Train or export the scene again.")
+        if not drop_invalid:
+            raise SceneError(f"{summary}. Use --drop-invalid to drop these Gaussians.")
+        return retained

@@ -1,0 +1,264 @@
+"""Writer of stylized PLYs, which changes only the colors.
+
+With an SH attenuation, `f_rest_*` are multiplied by one factor in float32. The written coefficients equal those that
+the job optimized with, because `Scene.attenuated` multiplies the same float32 values by the same factor.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.formats.ply import PROPERTIES
+from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
+from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, file_stamp, write_scene
+from sgsst_core.scene.gaussians import attenuation_factor
+from sgsst_core.scene.stored_harmonics import changed
+
+
+def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
+    """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
+
+    A color keeps its bytes too if its float32 value does not change. The rest of the file changes in three cases:
+
+    - With an SH attenuation, f_rest_* change.
+    - Dropped rows are absent, and the count in the header is adjusted.
+    - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
+
+    A scene in another format is written as a PLY by `write_scene`.
+
+    Args:
+        source: File from `read_scene`.
+        target: File to write; may be the source itself.
+        sh_dc: Finite coefficients, [N, 3] with N = len(source.scene).
+        sh_attenuation: SH attenuation of f_rest_*, 0 to 1; see `Scene.attenuated`.
+
+    Raises:
+        SceneError: If the source file has changed since it was read, or cannot store attenuated coefficients.
+        OutputError: If the target cannot be written.
+        ValueError: If sh_dc has the wrong shape or non-finite values.
+    """
+    if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
+        raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
+    if file_stamp(source.path) != source.stamp:
+        raise changed(source.path)
+    if source.header is None:
+        write_scene(
+            target, replace(source.scene.attenuated(sh_attenuation), sh_dc=sh_dc.detach().to("cpu", torch.float32))
+        )
+        return
+    check_sh_attenuation(source, sh_attenuation)
+    attenuation = _ShAttenuation.of(source.header, sh_attenuation)
+    columns = _new_columns(source, sh_dc.detach().to("cpu", torch.float32))
+    with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
+        output.write(_header_for(source, source.header))
+        if source.header.text:
+            _write_text(source, source.header, columns, attenuation, file, output)
+        else:
+            _write_binary(source, source.header, columns, attenuation, file, output)
+
+
+def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
+    """Check that a file can store attenuated coefficients. Scenes of other formats than PLY become a float32 PLY.
+
+    Raises:
+        SceneError: If the coefficients are stored as integers.
+    """
+    if source.header is None or not attenuation:
+        return
+    kinds = {prop.name: prop.kind for prop in source.header.vertex.properties}
+    integers = [name for name, kind in kinds.items() if re.fullmatch(r"f_rest_\d+", name) and kind[0] != "f"]
+    if integers:
+        raise SceneError(
+            f"{source.path}: {integers[0]} is stored as integers, which cannot be attenuated. Convert it to float "
+            "first, or leave --sh-attenuation out."
+        )
+
+
+@dataclass(frozen=True)
+class _ShAttenuation:
+    """SH attenuation of the rows of a file.
+
+    Attributes:
+        names: Names of the SH properties in the file's order.
+        factor: Factor of all coefficients, rounded to float32. If it is 0, all coefficients become positive zeros.
+    """
+
+    names: tuple[str, ...]
+    factor: float
+
+    @staticmethod
+    def of(header: PlyHeader, attenuation: float) -> _ShAttenuation | None:
+        """Return the attenuation for a file's vertices; None if no coefficient changes."""
+        names = tuple(prop.name for prop in header.vertex.properties if re.fullmatch(r"f_rest_\d+", prop.name))
+        factor = attenuation_factor(attenuation)
+        return _ShAttenuation(names, factor) if names and factor != 1 else None
+
+    def apply(self, rows: NDArray[Any]) -> None:
+        """Attenuate a structured block of rows in place."""
+        if not len(rows):
+            return
+        dtype = rows.dtype
+        assert dtype.fields is not None
+        first = dtype.fields[self.names[0]][1]
+        contiguous = all(
+            dtype[name] == np.dtype("<f4") and dtype.fields[name][1] == first + 4 * index
+            for index, name in enumerate(self.names)
+        )
+        if contiguous and first % 4 == 0 and dtype.itemsize % 4 == 0:  # layout of 3DGS trainers: one pass over the rows
+            table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
+            coefficients = table[:, first // 4 : first // 4 + len(self.names)]
+            coefficients[:] = self.attenuated(coefficients)
+            return
+        for name in self.names:
+            rows[name] = self.attenuated(rows[name].astype(np.float32))
+
+    def attenuated(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the attenuated values in float32."""
+        return values * np.float32(self.factor) if self.factor else np.zeros_like(values)
+
+
+def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
+    """Return the source's header, with the new number of rows if Gaussians were dropped or split."""
+    raw = header.raw
+    if source.retained is None and source.copies is None:
+        return raw
+    start, stop = header.vertex.count_span
+    return raw[:start] + str(len(source.scene)).encode() + raw[stop:]
+
+
+#: New values of all Gaussians, by property name.
+_NewColumns = dict[str, NDArray[np.float32]]
+
+
+def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
+    """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes."""
+    columns = dict(zip(PROPERTIES["sh_dc"], colors.numpy().T, strict=True))
+    if source.copies is not None:
+        columns["opacity"] = source.scene.opacities.numpy()
+        for names, values in ((PROPERTIES["means"], source.scene.means), (PROPERTIES["scales"], source.scene.scales)):
+            columns |= dict(zip(names, values.numpy().T, strict=True))
+    return columns
+
+
+def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
+    """Yield, for each block of file rows, its length, the number of copies of each row, and the slice of Gaussians."""
+    position = gaussian = 0
+    for start in range(0, rows, BLOCK_ROWS):
+        count = min(BLOCK_ROWS, rows - start)
+        times = np.ones(count, np.int64)
+        if source.retained is not None:
+            times[:] = source.retained[start : start + count]
+        if source.copies is not None:
+            present = times.nonzero()[0]
+            times[present] = source.copies[position : position + len(present)]
+            position += len(present)
+        following = gaussian + int(times.sum())
+        yield count, times, slice(gaussian, following)
+        gaussian = following
+
+
+def _write_binary(
+    source: SceneFile,
+    header: PlyHeader,
+    columns: _NewColumns,
+    attenuation: _ShAttenuation | None,
+    file: io.BufferedReader,
+    output: BinaryIO,
+) -> None:
+    dtype = header.vertex.dtype(header.byte_order)
+    before = element_offsets(source.path, header)["vertex"] - len(header.raw)
+    file.seek(len(header.raw))
+    _copy(file, output, before)
+    buffer = bytearray(min(BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
+    for count, times, gaussians in _blocks(source, header.vertex.count):
+        part = memoryview(buffer)[: count * dtype.itemsize]
+        if file.readinto(part) != len(part):
+            raise changed(source.path)
+        rows = np.frombuffer(part, dtype)
+        if not (times == 1).all():
+            rows = np.repeat(rows, times)
+        for name, values in columns.items():
+            column = values[gaussians]
+            different = rows[name].astype(np.float32) != column
+            rows[name][different] = column[different]
+        if attenuation is not None:
+            attenuation.apply(rows)
+        output.write(rows.view(np.uint8).data)
+    _copy(file, output)
+    if file_stamp(source.path) != source.stamp:
+        raise changed(source.path)
+
+
+def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
+    """Copy `count` bytes, or all remaining bytes if it is None."""
+    while count is None or count > 0:
+        data = file.read(1 << 20 if count is None else min(count, 1 << 20))
+        if not data:
+            return
+        output.write(data)
+        count = None if count is None else count - len(data)
+
+
+def _write_text(
+    source: SceneFile,
+    header: PlyHeader,
+    columns: _NewColumns,
+    attenuation: _ShAttenuation | None,
+    file: BinaryIO,
+    output: BinaryIO,
+) -> None:
+    vertex = header.vertex
+    before = header.elements[: header.elements.index(vertex)]
+    order = [prop.name for prop in vertex.properties]
+    names = (*columns, *(attenuation.names if attenuation else ()))
+    slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in names]
+    file.seek(len(header.raw))
+    # latin-1 preserves every byte, and newline="" every line end
+    lines = io.TextIOWrapper(file, "latin-1", newline="")
+    for _ in range(sum(element.count for element in before)):
+        output.write(lines.readline().encode("latin-1"))
+    for _, times, gaussians in _blocks(source, vertex.count):
+        values = iter(np.stack([column[gaussians] for column in columns.values()], axis=1))
+        for copies in times:
+            line = lines.readline()
+            for _ in range(copies):
+                output.write(_changed_line(line, slots, next(values), attenuation).encode("latin-1"))
+    for line in lines:
+        output.write(line.encode("latin-1"))
+
+
+def _changed_line(
+    line: str, slots: list[tuple[int, str]], values: NDArray[Any], attenuation: _ShAttenuation | None
+) -> str:
+    """Return a row of text with new values. Tokens whose value does not change, and all spacing, stay as they are.
+
+    Args:
+        line: Row of text.
+        slots: Token index and NumPy type code of each value to replace: those of `values` first, then those to
+            attenuate.
+        values: New values of the first slots.
+        attenuation: SH attenuation of the remaining slots; None if there are none.
+    """
+    tokens = list(re.finditer(r"\S+", line))
+    if attenuation is not None:
+        old = np.array([tokens[slot][0] for slot, _ in slots[len(values) :]], dtype=np.float32)
+        values = np.concatenate([values, attenuation.attenuated(old)])
+    for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):
+        token = tokens[slot]
+        if np.float32(token[0]) != value:
+            # shortest text that parses to the same number in the precision that the file declares
+            text = str(value) if kind == "f4" else repr(float(value))
+            line = line[: token.start()] + text + line[token.end() :]
+    return line
