@@ -398,8 +398,9 @@ def test_arguments_are_checked_before_any_work() -> None:
 
 
 def test_unknown_rasterizers_and_devices_are_refused() -> None:
-    with pytest.raises(SettingsError, match="choose triton, cuda, cpu, cached or reference"):
+    with pytest.raises(SettingsError, match="no rasterizer is called 'fast'") as refused:
         make_rasterizer("fast", cloud(10))
+    assert all(name in str(refused.value) for name in RASTERIZERS)
     with pytest.raises(SettingsError, match="runs on the CPU"):
         make_rasterizer("cpu", cloud(10), device="cuda")
 
