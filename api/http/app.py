@@ -32,8 +32,8 @@ from api.http.threads import OwnerThreads
 from service.errors import DamagedWeightsError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
+from service.inspection.compressor import Compressor
 from service.inspection.inspector import Inspector
-from service.inspection.packer import Packer
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.weights import check_weights
@@ -65,7 +65,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             blobs=blobs,
             artifacts=results,
             inspector=Inspector(settings, store, blobs),
-            packer=Packer(settings, store, blobs, results),
+            compressor=Compressor(settings, store, blobs, results),
             hub=Hub(store),
             sign_ins=SignIns(),
             rates=Rates(),
@@ -93,7 +93,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         context.receipts.close()
         await context.hub.close()
         await context.inspector.close()
-        await context.packer.close()
+        await context.compressor.close()
         context.readiness.close()
         store.close()
 

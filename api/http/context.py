@@ -29,8 +29,8 @@ from api.http.threads import OwnerThreads
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
+from service.inspection.compressor import Compressor
 from service.inspection.inspector import Inspector
-from service.inspection.packer import Packer
 from service.settings import ServiceSettings, is_loopback
 from service.store import Store
 from service.store.quotas import NO_QUOTAS, Quotas
@@ -73,7 +73,7 @@ class Context:
     blobs: Blobs
     artifacts: Artifacts
     inspector: Inspector
-    packer: Packer
+    compressor: Compressor
     hub: Hub
     metrics: Metrics
     readiness: Readiness

@@ -37,7 +37,7 @@ _VERSION = "3"
 #: Maximum number of requests that wait for the inspecting process; further ones are rejected with `BusyError`.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
-LEFT_SECONDS = 3600.0
+LEFTOVER_SECONDS = 3600.0
 #: Additions to the limits of an inspection per byte of its files. CPU seconds: the slowest readers (text, images) read
 #: at least 30 MB/s, and the limit allows for 8 MB/s. Memory: a number in a text file takes at least two bytes (a digit
 #: and a space) and becomes a float64 (4x) and then a float32 (2x). A binary file is mapped (1x), and its numbers of one
@@ -45,7 +45,7 @@ LEFT_SECONDS = 3600.0
 _SECONDS_PER_BYTE = 120 / 1e9
 MEMORY_PER_BYTE = 6
 #: Maximum of the memory limit, as a fraction of the machine's memory.
-_MEMORY_SHARE = 0.8
+_MEMORY_FRACTION = 0.8
 #: Additions to the CPU time limit of planning, in seconds per Gaussian and view, and per pixel of each view. Actual use
 #: is less than a third of them.
 _PLAN_SECONDS_PER_GAUSSIAN = 5e-6
@@ -122,8 +122,8 @@ class InspectionProcess:
         try:
             process.stdin.write(line)
             await process.stdin.drain()
-            while said := await process.stdout.readline():
-                answer: dict[str, Any] = json.loads(said)
+            while response := await process.stdout.readline():
+                answer: dict[str, Any] = json.loads(response)
                 if "planning" not in answer:
                     return answer
                 show(answer["planning"])
@@ -144,9 +144,9 @@ class InspectionProcess:
         They contain no secrets, because the process reads untrusted files. They keep libraries from starting threads on
         import, because the process forks.
         """
-        kept = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
+        inherited = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self._threads))
-        return {**kept, **threads, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+        return {**inherited, **threads, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
 
     async def close(self) -> None:
         """Kill the process; its child that reads files dies with it."""
@@ -170,11 +170,11 @@ class Inspector:
         self._planning = Lanes([InspectionProcess(_threads_of_a_job(settings))])
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
-        for lack in missing():
-            _log.warning("files are read without %s", lack)
-        for left in self._folder.iterdir():  # left behind by a killed process
-            if time.time() - left.stat().st_mtime > LEFT_SECONDS:
-                shutil.rmtree(left, ignore_errors=True)
+        for feature in missing():
+            _log.warning("files are read without %s", feature)
+        for leftover in self._folder.iterdir():  # left behind by a killed process
+            if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
+                shutil.rmtree(leftover, ignore_errors=True)
         self._limits = {
             "gaussians": settings.max_gaussians,
             "views": settings.max_views,
@@ -191,7 +191,7 @@ class Inspector:
             RefusedInputError: If the stored finding is a rejection.
         """
         known = self._store.inputs.inspection(self._key(work, inputs, parameters))
-        return None if known is None else found_or_refused(known)
+        return None if known is None else findings_of(known)
 
     async def inspect(
         self,
@@ -221,14 +221,14 @@ class Inspector:
         if recalled is not None:
             return recalled
         if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
-            self._warming = asyncio.create_task(self._validating.places[1].warm())
+            self._warming = asyncio.create_task(self._validating.slots[1].warm())
         async with self._lanes(work, inputs).turn(owner) as process:
             answer = await self._ask_process(process, work, inputs, rows, parameters, show)
-        passing = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
-        if not passing:  # transient rejections are not stored: a later check may succeed
+        transient = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
+        if not transient:  # a later check may succeed
             key = self._key(work, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
-        return found_or_refused(answer)
+        return findings_of(answer)
 
     def _lanes(self, work: Work, inputs: Sequence[Mapping[str, Any]]) -> Lanes[InspectionProcess]:
         """Return the lanes of processes for a task."""
@@ -266,30 +266,30 @@ class Inspector:
         if work == "validate":
             return reading
         known = self.recall("validate", inputs, parameters) or {"gaussians": 0, "views": 0, "pixels": 0}
-        looking: float = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
-        looking += _PLAN_SECONDS_PER_PIXEL * known["pixels"]
-        return self._settings.dry_run_seconds + reading + looking
+        surveying: float = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
+        surveying += _PLAN_SECONDS_PER_PIXEL * known["pixels"]
+        return self._settings.dry_run_seconds + reading + surveying
 
     def _memory(self, inputs: Sequence[Mapping[str, Any]]) -> int:
         """Return the memory limit of reading in bytes; photos do not add to it, because they are read one at a time."""
         size: int = sum(entry["size"] for entry in inputs if entry["role"] != "photos")
-        least = self._settings.inspection_bytes
-        most = max(least, int(_MEMORY_SHARE * psutil.virtual_memory().total))
-        return min(least + MEMORY_PER_BYTE * size, most)
+        minimum = self._settings.inspection_bytes
+        maximum = max(minimum, int(_MEMORY_FRACTION * psutil.virtual_memory().total))
+        return min(minimum + MEMORY_PER_BYTE * size, maximum)
 
     def _key(self, work: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
         files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
-        told = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
+        values = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
         # style weights are matched to styles by their order
         styles = [entry["name"] for entry in inputs if entry["role"] == "style"]
         order = styles if len(styles) > 1 else []
-        text = json.dumps([_VERSION, work, files, order, told, self._limits], sort_keys=True)
+        text = json.dumps([_VERSION, work, files, order, values, self._limits], sort_keys=True)
         return f"{work}:{hashlib.sha256(text.encode()).hexdigest()}"
 
     async def close(self) -> None:
         """Stop all processes."""
         for lanes in (self._validating, self._validating_large, self._planning):
-            for process in lanes.places:
+            for process in lanes.slots:
                 await process.close()
 
 
@@ -299,11 +299,15 @@ def _size(inputs: Sequence[Mapping[str, Any]]) -> int:
 
 def _threads_of_a_job(settings: ServiceSettings) -> int:
     """Return a job's number of threads on this machine; planning uses as many, so that its timings are valid."""
-    told = os.environ.get("OMP_NUM_THREADS", "")
-    return int(told) if told.isdigit() and int(told) else max(1, (os.cpu_count() or 1) // (settings.parallel_jobs or 1))
+    threads = os.environ.get("OMP_NUM_THREADS", "")
+    return (
+        int(threads)
+        if threads.isdigit() and int(threads)
+        else max(1, (os.cpu_count() or 1) // (settings.parallel_jobs or 1))
+    )
 
 
-def found_or_refused(answer: Mapping[str, Any]) -> dict[str, Any]:
+def findings_of(answer: Mapping[str, Any]) -> dict[str, Any]:
     """Return the findings in a response of the inspecting process.
 
     Raises:

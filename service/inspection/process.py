@@ -72,7 +72,7 @@ class RefusedError(Exception):
 
 
 @dataclass(frozen=True)
-class _Read:
+class _Inputs:
     """Inputs of a job in memory.
 
     Attributes:
@@ -93,37 +93,38 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
         `gaussians`, `dropped`, `sh_degree`, `views`, `pixels` (of all views), `style` (width, height), `photos`.
 
     Raises:
-        RefusedError, InvalidInputError: If an input cannot be used; the error's attribute `part` is the role of the
+        RefusedError, InvalidInputError: If an input cannot be used; the error's attribute `role` is the role of the
             input.
     """
     return _read_inputs(staged, parameters, limits)[0]
 
 
-def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> tuple[dict[str, Any], _Read]:
+def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> tuple[dict[str, Any], _Inputs]:
     """Return the findings of `validate` and the inputs themselves."""
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
     found: dict[str, Any] = {}
     source = scene_request(staged, parameters)
-    with _ErrorsOf("scene"):
+    with _errors_of("scene"):
         header = read_scene_header(staged.scene)
         declared = int(header.count * settings.refine)
         if declared > limits["gaussians"]:
             raise RefusedError(
                 "too-many-gaussians",
-                f"The scene has {declared:,} Gaussians{_once(settings)}. At most {limits['gaussians']:,} are allowed.",
+                f"The scene has {declared:,} Gaussians{_refinement_note(settings)}. "
+                f"At most {limits['gaussians']:,} are allowed.",
             )
         file = read_scene(source.scene, drop_invalid=source.drop_invalid)
         check_sh_attenuation(file, settings.sh_attenuation)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
-    with _ErrorsOf("style"):
+    with _errors_of("style"):
         for path in staged.styles:
             _check_pixel_count(path, limits)
         job = stylize_request(staged, parameters)
         style = load_styles(job.styles)
         found["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
-    with _ErrorsOf("cameras"):
+    with _errors_of("cameras"):
         check_choice(source)
         if source.cameras is not None:
             _check_frames_have_sizes(source.cameras)
@@ -141,20 +142,20 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         check_scales(settings.scales, cameras, settings.coarsest_side)
         check_something_in_view(file.scene, cameras, source.near)
         found |= {"views": len(cameras), "pixels": pixels}
-    with _ErrorsOf("style"):
+    with _errors_of("style"):
         check_style_size(style, cameras, settings.style_scale)
-    with _ErrorsOf("regions"):
+    with _errors_of("regions"):
         regions = read_regions(job, file, cameras)
-    with _ErrorsOf("photos"):
+    with _errors_of("photos"):
         paths = check_photos(staged.photos, cameras) if staged.photos else []
         for path in paths:
             _check_pixel_count(path, limits)
             load_image(path)
         found["photos"] = len(paths)
-    return found, _Read(file.scene, cameras, orbit, style, regions)
+    return found, _Inputs(file.scene, cameras, orbit, style, regions)
 
 
-def _once(settings: Settings) -> str:
+def _refinement_note(settings: Settings) -> str:
     """Return the note for an error message that a number of Gaussians includes refinement; empty without refinement."""
     return f" once it is refined to at most {settings.refine:g} times as many" if settings.refine > 1 else ""
 
@@ -166,7 +167,7 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
     weights = load_network_weights(request.backbone)
     settings, regions = request.settings, read.regions
     refinement = refine(read.scene, read.cameras, read.style, settings, weights=weights, regions=regions, show=show)
-    made, _ = make_plan(
+    job_plan, _ = make_plan(
         refined(read.scene, refinement),
         read.cameras,
         settings,
@@ -179,13 +180,13 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
         refinement=refinement,
     )
     seconds = memory = on_device = None
-    if made.prediction:
-        memory, on_device = made.prediction.peak_bytes, made.prediction.device_bytes
-        coarse = made.prediction.seconds_coarse or made.prediction.seconds
-        seconds = made.prediction.seconds * request.settings.steps_sos + coarse * made.steps_coarse
+    if job_plan.prediction:
+        memory, on_device = job_plan.prediction.peak_bytes, job_plan.prediction.device_bytes
+        coarse = job_plan.prediction.seconds_coarse or job_plan.prediction.seconds
+        seconds = job_plan.prediction.seconds * request.settings.steps_sos + coarse * job_plan.steps_coarse
     return {
         **found,
-        "plan": plan_json(made),
+        "plan": plan_json(job_plan),
         "estimated_seconds": seconds,
         "memory_bytes": memory,
         "device_memory_bytes": on_device,
@@ -214,18 +215,15 @@ WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], 
 }
 
 
-class _ErrorsOf:
-    """Context manager that marks errors with the part of the request that they concern."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __enter__(self) -> None:
-        return
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if error is not None and not hasattr(error, "part"):
-            error.part = self._name  # type: ignore[attr-defined]
+@contextlib.contextmanager
+def _errors_of(role: str) -> Iterator[None]:
+    """Mark errors with the role of the input that they concern."""
+    try:
+        yield
+    except BaseException as error:
+        if not hasattr(error, "role"):
+            error.role = role  # type: ignore[attr-defined]
+        raise
 
 
 def _check_network_weights(backbone: str) -> None:
@@ -272,25 +270,25 @@ def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
         work = WORK[request["work"]]
         return {"found": work(staged, JobParameters(**request["parameters"]), request["limits"], show)}
     except (RefusedError, InvalidInputError) as error:
-        return _refusal(error.code, str(error), getattr(error, "part", None))
+        return _refusal(error.code, str(error), getattr(error, "role", None))
     except MemoryError as error:
-        return _refusal("inspection-limit", "Reading it takes more memory than allowed.", getattr(error, "part", None))
+        return _refusal("inspection-limit", "Reading it takes more memory than allowed.", getattr(error, "role", None))
     except SgsstError as error:
-        return _refusal(error.code, str(error), getattr(error, "part", None))
+        return _refusal(error.code, str(error), getattr(error, "role", None))
     except Exception as error:  # a crash of a reader is attributed to the file
         if "memory" in str(error).lower():
             return _refusal("inspection-limit", "Reading it takes more memory than allowed.", None)
-        refusal = _refusal("invalid-input", "The files cannot be read.", getattr(error, "part", None))
+        refusal = _refusal("invalid-input", "The files cannot be read.", getattr(error, "role", None))
         return {**refusal, "log": f"{type(error).__name__}: {error}"}
 
 
-def _refusal(code: str, message: str, part: str | None) -> dict[str, Any]:
-    return {"error": {"code": code, "message": message.removeprefix(f"{part}/"), "input": part}}
+def _refusal(code: str, message: str, role: str | None) -> dict[str, Any]:
+    return {"error": {"code": code, "message": message.removeprefix(f"{role}/"), "input": role}}
 
 
 def _limit_resources(seconds: float, size: int) -> None:
-    own = psutil.Process().memory_info().vms
-    resource.setrlimit(resource.RLIMIT_AS, (own + size, own + size))
+    used = psutil.Process().memory_info().vms
+    resource.setrlimit(resource.RLIMIT_AS, (used + size, used + size))
     cpu = max(1, int(seconds))
     resource.setrlimit(resource.RLIMIT_CPU, (cpu, cpu + 1))
 
@@ -338,32 +336,32 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
             torch.set_num_threads(request["threads"])
         _die_first()
         # threads that wait for each other use CPU time too
-        _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _beside_reading(request))
+        _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _memory_beside_reading(request))
         with os.fdopen(writing, "w") as file:
 
             def show(now: PlanningProgress) -> None:
-                told = {"step": now.done, "total": now.total, "fraction": now.fraction, "eta_s": now.seconds_left}
-                print(json.dumps({"planning": told}), file=file, flush=True)
+                progress = {"step": now.done, "total": now.total, "fraction": now.fraction, "eta_s": now.seconds_left}
+                print(json.dumps({"planning": progress}), file=file, flush=True)
 
             try:
-                missed = _confine(request)
+                uncompiled = _confine(request)
             except OSError as error:
                 refusal = _refusal("inspection-limit", "The files cannot be checked at the moment.", None)
                 print(json.dumps({**refusal, "log": f"cannot be confined: {error}"}), file=file)
             else:
                 answer = _inspect(request, show)
-                print(json.dumps({**answer, "compiled": bool(missed)}), file=file)
+                print(json.dumps({**answer, "compiled": bool(uncompiled)}), file=file)
     finally:
         os._exit(0)
 
 
-def _close_descriptors(kept: int = 2) -> None:
-    """Close all file descriptors except `kept`; inherited ones lead to responses to other requests and to the log."""
-    nothing = os.open(os.devnull, os.O_RDWR)
+def _close_descriptors(retained: int = 2) -> None:
+    """Close all file descriptors except `retained`; others lead to responses to other requests and to the log."""
+    null = os.open(os.devnull, os.O_RDWR)
     for descriptor in range(3):
-        os.dup2(nothing, descriptor)
-    os.closerange(3, kept)
-    os.closerange(max(3, kept + 1), resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+        os.dup2(null, descriptor)
+    os.closerange(3, retained)
+    os.closerange(max(3, retained + 1), resource.getrlimit(resource.RLIMIT_NOFILE)[0])
 
 
 def _confine(request: dict[str, Any]) -> list[None]:
@@ -380,10 +378,10 @@ def _confine(request: dict[str, Any]) -> list[None]:
         result = folder / request["limits"]["name"]
         result.touch()
         most_bytes = (folder / request["staged"]["scene"]).stat().st_size + (1 << 20)  # a compressed scene is smaller
-    missed: list[None] = []
-    keep_in_memory(lambda: missed.append(None))
+    uncompiled: list[None] = []
+    keep_in_memory(lambda: uncompiled.append(None))
     confine([folder, *linked, cache_folder(), *kernel_folders(), *installation()], result, most_bytes)
-    return missed
+    return uncompiled
 
 
 @functools.cache
@@ -416,7 +414,7 @@ def _die_first() -> None:
         Path("/proc/self/oom_score_adj").write_text("500")
 
 
-def _beside_reading(request: dict[str, Any]) -> int:
+def _memory_beside_reading(request: dict[str, Any]) -> int:
     """Return the memory limit in bytes for everything but reading: threads, and planning or compressing."""
     threads: int = request["threads"] * _THREAD_BYTES
     if request["work"] == "validate":
@@ -433,15 +431,15 @@ def _limit_text(request: dict[str, Any]) -> str:
 
 def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
     """Yield messages until the child closes the pipe or sends an invalid message, or the deadline passes."""
-    begun = b""
-    while (left := deadline - time.monotonic()) > 0 and len(begun) < MAX_ANSWER:
+    incomplete = b""
+    while (left := deadline - time.monotonic()) > 0 and len(incomplete) < MAX_ANSWER:
         if not select.select([descriptor], [], [], left)[0]:
             continue
-        part = os.read(descriptor, 1 << 16)
-        if not part:
+        data = os.read(descriptor, 1 << 16)
+        if not data:
             return
-        *whole, begun = (begun + part).split(b"\n")
-        for line in whole:
+        *lines, incomplete = (incomplete + data).split(b"\n")
+        for line in lines:
             try:
                 answer = json.loads(line)
             except (ValueError, RecursionError):
@@ -470,8 +468,8 @@ def main() -> None:
     torch.set_num_threads(1)  # a child forked from a process with threads could wait for them forever
     die_with_parent()
     for line in sys.stdin.buffer:
-        for said in _inspect_in_child(json.loads(line)):
-            sys.stdout.buffer.write(said + b"\n")
+        for response in _inspect_in_child(json.loads(line)):
+            sys.stdout.buffer.write(response + b"\n")
             sys.stdout.buffer.flush()
 
 

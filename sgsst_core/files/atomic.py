@@ -14,7 +14,7 @@ from pathlib import Path
 from sgsst_core.errors import OutputError
 
 #: Error numbers of a full disk. Other errors in an `atomic_path` block are raised unchanged.
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -25,8 +25,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
     deleted. Otherwise it is flushed to disk and renamed over the target, then the folder is flushed. After a power
     failure, the target is therefore either the old or the new file.
 
-    If the target is a symbolic link, the file it points to is replaced. The permissions of an existing target are
-    kept.
+    If the target is a symbolic link, the file it points to is replaced. An existing target's permissions are retained.
 
     Raises:
         OutputError: If the folder is missing or not writable, the target is a folder, or the disk is full.
@@ -43,7 +42,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
         temporary.replace(final)
     except OSError as error:
         temporary.unlink(missing_ok=True)
-        if error.errno in _NO_ROOM:
+        if error.errno in _DISK_FULL:
             raise OutputError(
                 f"{target}: cannot be written: {error.strerror}. Free some space and run again."
             ) from error
@@ -83,7 +82,7 @@ def _reserve(final: Path) -> Path:
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     except OSError as error:
         raise OutputError(
-            f"{final.parent}: is not writable: {error.strerror}. Create the folder, or name another place."
+            f"{final.parent}: is not writable: {error.strerror}. Create the folder, or name another one."
         ) from error
     return temporary
 

@@ -27,7 +27,7 @@ ROTATION_TOLERANCE = 1e-3
 #: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
 QUATERNION_TOLERANCE = 0.01
 
-_FORMS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
+_FORMATS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
 #: Change of camera axes from OpenGL (x right, y up, z backward) to those of `Camera`.
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -56,10 +56,10 @@ def read_cameras(path: Path) -> list[Camera]:
         return _read_colmap(path.parent)
     content = _load_json(path)
     if isinstance(content, list):
-        return _numbered(path, content, _inria_camera)
+        return _convert_entries(path, content, _inria_camera)
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         return _read_transforms(path, content)
-    raise CameraError(f"{path}: has no form that is known here. Give {_FORMS}.")
+    raise CameraError(f"{path}: is in no known camera format. Give {_FORMATS}.")
 
 
 def _read_folder(folder: Path) -> list[Camera]:
@@ -69,19 +69,19 @@ def _read_folder(folder: Path) -> list[Camera]:
     for name in ("transforms.json", "cameras.json"):
         if (folder / name).is_file():
             return read_cameras(folder / name)
-    raise CameraError(f"{folder}: holds no cameras that are known here. Give {_FORMS}.")
+    raise CameraError(f"{folder}: holds no cameras in a known format. Give {_FORMATS}.")
 
 
 def _load_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise CameraError(f"{path}: cannot be read: {error.strerror}. Check the path, or give {_FORMS}.") from error
+        raise CameraError(f"{path}: cannot be read: {error.strerror}. Check the path, or give {_FORMATS}.") from error
     except (ValueError, RecursionError) as error:  # invalid JSON, or bytes that are not UTF-8
-        raise CameraError(f"{path}: is neither JSON nor a COLMAP model ({error}). Give {_FORMS}.") from error
+        raise CameraError(f"{path}: is neither JSON nor a COLMAP model ({error}). Give {_FORMATS}.") from error
 
 
-def _numbered(path: Path, entries: list[Any], convert: Any) -> list[Camera]:
+def _convert_entries(path: Path, entries: list[Any], convert: Any) -> list[Camera]:
     """Convert the entries of a JSON list; error messages name the entry by its index."""
     if not entries:
         raise CameraError(f"{path}: holds no cameras. Export them again.")
@@ -89,7 +89,7 @@ def _numbered(path: Path, entries: list[Any], convert: Any) -> list[Camera]:
     for index, entry in enumerate(entries):
         where = f"{path}: camera {index}"
         if not isinstance(entry, dict):
-            raise CameraError(f"{where}: is not an object with named values. Give {_FORMS}.")
+            raise CameraError(f"{where}: is not an object with named values. Give {_FORMATS}.")
         cameras.append(convert(where, entry))
     return cameras
 
@@ -121,14 +121,14 @@ def _read_transforms(path: Path, content: Mapping[str, Any]) -> list[Camera]:
         pose[:3, :3] = pose[:3, :3] @ _OPENGL
         return _camera(where, name, size, _transforms_intrinsics(where, values, size), _inverse(where, pose))
 
-    return _numbered(path, content["frames"], convert)
+    return _convert_entries(path, content["frames"], convert)
 
 
 def _refuse_distortion(where: str, values: Mapping[str, Any]) -> None:
     model = values.get("camera_model")
-    bent = [key for key in _DISTORTION if values.get(key) and _number(where, values, key) != 0]
-    if model not in _PINHOLE_NAMES or values.get("is_fisheye") or bent:
-        what = f"distortion {', '.join(bent)}" if bent else f"camera model {model or 'fisheye'}"
+    nonzero = [key for key in _DISTORTION if values.get(key) and _number(where, values, key) != 0]
+    if model not in _PINHOLE_NAMES or values.get("is_fisheye") or nonzero:
+        what = f"distortion {', '.join(nonzero)}" if nonzero else f"camera model {model or 'fisheye'}"
         raise CameraError(f"{where}: has {what}, but only pinhole cameras are handled. {UNDISTORT}.")
 
 
@@ -156,10 +156,10 @@ def _transforms_intrinsics(
         if focal in values:
             focals.append(_number(where, values, focal))
         elif angle in values:
-            opening = _number(where, values, angle)
-            if not 0 < opening < math.pi:
-                raise CameraError(f"{where}: {angle} is {opening}; an angle of view lies between 0 and pi. Correct it.")
-            focals.append(side / 2 / math.tan(opening / 2))
+            radians = _number(where, values, angle)
+            if not 0 < radians < math.pi:
+                raise CameraError(f"{where}: {angle} is {radians}; an angle of view lies between 0 and pi. Correct it.")
+            focals.append(side / 2 / math.tan(radians / 2))
         else:
             focals.append(None)
     fx, fy = focals
@@ -176,26 +176,26 @@ def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
     nerfstudio stores T = T0 A and S = s0 a, where A and a (`applied_transform`, `applied_scale`) are already part of
     the file's poses. The training poses are s0 T0 pose.
     """
-    companion = path.with_name("dataparser_transforms.json")
-    if not companion.is_file():
+    dataparser = path.with_name("dataparser_transforms.json")
+    if not dataparser.is_file():
         return lambda pose: pose
-    values = _load_json(companion)
+    values = _load_json(dataparser)
     if not isinstance(values, dict):
-        raise CameraError(f"{companion}: is not what nerfstudio writes ('transform' and 'scale'). Copy it again.")
+        raise CameraError(f"{dataparser}: is not what nerfstudio writes ('transform' and 'scale'). Copy it again.")
     applied, stored = np.eye(4), np.eye(4)
-    stored[:3] = _array(str(companion), values, "transform", (3, 4))
+    stored[:3] = _array(str(dataparser), values, "transform", (3, 4))
     if "applied_transform" in content:
         applied[:3] = _array(str(path), content, "applied_transform", (3, 4), (4, 4))[:3]
-    scale = _number(str(companion), values, "scale")
+    scale = _number(str(dataparser), values, "scale")
     if "applied_scale" in content:
         scale /= _positive(str(path), "applied_scale", _number(str(path), content, "applied_scale"))
     change = stored @ np.linalg.inv(_exact_rotation(f"{path}: applied_transform", applied))
-    _positive(str(companion), "scale", scale)
+    _positive(str(dataparser), "scale", scale)
 
     def apply(pose: NDArray[Any]) -> NDArray[Any]:
-        moved = change @ pose
-        moved[:3, 3] *= scale
-        return np.asarray(moved)
+        changed = change @ pose
+        changed[:3, 3] *= scale
+        return np.asarray(changed)
 
     return apply
 
@@ -285,13 +285,13 @@ def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
 def _name(where: str, entry: Mapping[str, Any], *keys: str) -> str:
     name = next((str(entry[key]) for key in keys if key in entry), "")
     if not name:
-        raise CameraError(f"{where}: has no name ({' or '.join(map(repr, keys))}). Give {_FORMS}.")
+        raise CameraError(f"{where}: has no name ({' or '.join(map(repr, keys))}). Give {_FORMATS}.")
     return name
 
 
 def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray[Any]:
     if key not in values:
-        raise CameraError(f"{where}: has no {key!r}. Give {_FORMS}.")
+        raise CameraError(f"{where}: has no {key!r}. Give {_FORMATS}.")
     nested = [values[key]]
     while nested:  # NumPy would parse text as numbers, even `1_0`, and allocate the longest text for every entry
         entry = nested.pop()
@@ -310,7 +310,7 @@ def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, 
 
 def _number(where: str, values: Mapping[str, Any], key: str) -> float:
     if key not in values:
-        raise CameraError(f"{where}: has no {key!r}. Give {_FORMS}.")
+        raise CameraError(f"{where}: has no {key!r}. Give {_FORMATS}.")
     value = values[key]
     # no length or angle exceeds 1e100, and an integer in JSON may be too long for a float
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e100:

@@ -22,7 +22,7 @@ UNDISTORT = (
     "Undistort the photos with `colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path OUT` "
     "and give OUT/sparse"
 )
-_AGAIN = "Export the model again."
+_EXPORT_AGAIN = "Export the model again."
 
 #: COLMAP's camera models by number: name and number of parameters.
 _MODELS = {
@@ -47,7 +47,7 @@ _MODELS = {
 }
 _PARAMETERS = dict(_MODELS.values())
 #: Stricter than `int` and `float`, which accept `1_0` and digits of other scripts.
-_WHOLE = re.compile("[0-9]{1,18}")
+_INTEGER = re.compile("[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
@@ -96,19 +96,19 @@ def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]
 
 
 def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
-    found: dict[int, T] = {}
+    by_id: dict[int, T] = {}
     try:
         for number, entry in entries:
-            if number in found:
+            if number in by_id:
                 raise CameraError(f"{path}: has id {number} twice. Export the model again.")
-            found[number] = entry
+            by_id[number] = entry
     except OSError as error:
         raise CameraError(f"{path}: cannot be read: {error.strerror}. Copy the model again.") from error
     except KeyError as error:
         raise CameraError(f"{path}: has an unknown COLMAP camera model, number {error}. {UNDISTORT}.") from error
     except (struct.error, EOFError, ValueError) as error:
         raise CameraError(f"{path}: is truncated or corrupt. Copy the model again.") from error
-    return found
+    return by_id
 
 
 def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]]) -> Iterator[tuple[int, T]]:
@@ -150,8 +150,10 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
         words = line.split()
         model = words[1] if len(words) > 1 else ""
         if model not in _PARAMETERS or len(words) != 4 + _PARAMETERS[model]:
-            raise CameraError(f"{where}: expected id, COLMAP camera model, width, height and its parameters. {_AGAIN}")
-        number, width, height = (_whole(where, word) for word in (words[0], *words[2:4]))
+            raise CameraError(
+                f"{where}: expected id, COLMAP camera model, width, height and its parameters. {_EXPORT_AGAIN}"
+            )
+        number, width, height = (_integer(where, word) for word in (words[0], *words[2:4]))
         yield number, ColmapCamera(model, width, height, tuple(_number(where, word) for word in words[4:]))
 
 
@@ -164,9 +166,9 @@ def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
     for where, line in lines:
         words = line.split(maxsplit=9)
         if len(words) != 10:
-            raise CameraError(f"{where}: expected id, 7 numbers of the pose, camera id and name. {_AGAIN}")
+            raise CameraError(f"{where}: expected id, 7 numbers of the pose, camera id and name. {_EXPORT_AGAIN}")
         pose = [_number(where, word) for word in words[1:8]]
-        yield _whole(where, words[0]), _image(words[9], _whole(where, words[8]), pose)
+        yield _integer(where, words[0]), _image(words[9], _integer(where, words[8]), pose)
 
 
 def _lines(path: Path, *, points_follow: bool = False) -> Iterator[tuple[str, str]]:
@@ -189,13 +191,13 @@ def _image(name: str, camera: int, pose: Sequence[float]) -> ColmapImage:
     return ColmapImage(name, camera, (w, x, y, z), (translation[0], translation[1], translation[2]))
 
 
-def _whole(where: str, word: str) -> int:
-    if not _WHOLE.fullmatch(word):
-        raise CameraError(f"{where}: {word[:40]!r} is not a whole number. {_AGAIN}")
+def _integer(where: str, word: str) -> int:
+    if not _INTEGER.fullmatch(word):
+        raise CameraError(f"{where}: {word[:40]!r} is not a whole number. {_EXPORT_AGAIN}")
     return int(word)
 
 
 def _number(where: str, word: str) -> float:
     if not _NUMBER.fullmatch(word):
-        raise CameraError(f"{where}: {word[:40]!r} is not a number. {_AGAIN}")
+        raise CameraError(f"{where}: {word[:40]!r} is not a number. {_EXPORT_AGAIN}")
     return float(word)

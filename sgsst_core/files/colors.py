@@ -10,7 +10,7 @@ from torch import Tensor
 from sgsst_core.files.atomic import atomic_path
 
 #: Largest finite float16 value.
-_MOST = 65504.0
+_FLOAT16_MAX = 65504.0
 #: Gaussians per converted block.
 _BLOCK_ROWS = 1 << 20
 
@@ -32,4 +32,4 @@ def write_colors(path: Path, sh_dc: Tensor) -> None:
     values = sh_dc.detach().cpu().numpy()
     with atomic_path(path) as temporary, temporary.open("wb") as output:
         for start in range(0, len(values), _BLOCK_ROWS):
-            output.write(np.clip(values[start : start + _BLOCK_ROWS], -_MOST, _MOST).astype("<f2").data)
+            output.write(np.clip(values[start : start + _BLOCK_ROWS], -_FLOAT16_MAX, _FLOAT16_MAX).astype("<f2").data)

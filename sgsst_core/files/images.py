@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +38,7 @@ _JPEG_MARKER = re.compile(rb"\xff([\x01-\xfe])")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 #: Markers without a segment: TEM, restarts and the start of the image.
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
-_SHOWN = 10
+_NAMES_IN_MESSAGE = 10
 
 
 def load_image(path: Path) -> Tensor:
@@ -70,8 +71,8 @@ def image_size(path: Path) -> tuple[int, int]:
         width, height = image.size
         # the EXIF data of a PNG may follow its pixels, and Pillow would decode all of them to find it
         known = "exif" in image.info or image.format != "PNG"
-        turned = known and image.getexif().get(_EXIF_ORIENTATION, 1) in (5, 6, 7, 8)  # these swap width and height
-        return (height, width) if turned else (width, height)
+        swapped = known and image.getexif().get(_EXIF_ORIENTATION, 1) in (5, 6, 7, 8)  # these swap width and height
+        return (height, width) if swapped else (width, height)
 
 
 def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
@@ -95,7 +96,7 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
     for what, wrong in (("no photo", lambda n: n == 0), ("more than one photo", lambda n: n > 1)):
         names = [camera.name for camera, found in zip(cameras, matches, strict=True) if wrong(len(found))]
         if names:
-            shown = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+            shown = ", ".join(names[:_NAMES_IN_MESSAGE]) + (", ..." if len(names) > _NAMES_IN_MESSAGE else "")
             raise ImageError(
                 f"{folder}: holds {what} for {len(names)} of {len(cameras)} views: {shown}. Photos are found by the "
                 "cameras' names, with or without extension: give the folder that holds exactly these."
@@ -158,14 +159,12 @@ def save_png(path: Path, image: Tensor) -> None:
         OutputError: If the file cannot be written.
         ValueError: If the image has another shape, or NaN values.
     """
-    _save(path, image, lambda picture, target: picture.save(target, format="PNG"))
+    _save(path, image, format="PNG")
 
 
 def save_jpg(path: Path, image: Tensor) -> None:
     """Write an image [H, W, 3] as a high-quality JPEG without chroma subsampling; otherwise like `save_png`."""
-    _save(
-        path, image, lambda picture, target: picture.save(target, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
-    )
+    _save(path, image, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
 
 
 @contextmanager
@@ -255,14 +254,14 @@ def _matching(index: dict[tuple[str, ...], list[Path]], folder: Path, name: str)
 
     The longest matching path wins, then files outside deeper subfolders, then files with the exact extension.
     """
-    whole = PurePosixPath(name.replace("\\", "/"))
-    known = whole.suffix.lower() in Image.registered_extensions()
-    parts = tuple(part for part in (whole.with_suffix("") if known else whole).parts if part not in ("..", "/"))
+    wanted = PurePosixPath(name.replace("\\", "/"))
+    known = wanted.suffix.lower() in Image.registered_extensions()
+    parts = tuple(part for part in (wanted.with_suffix("") if known else wanted).parts if part not in ("..", "/"))
     for start in range(len(parts)):
         found = index.get(parts[start:], [])
         if found:
             direct = [path for path in found if path.parent == folder.joinpath(*parts[start:-1])] or found
-            return [path for path in direct if path.suffix == whole.suffix] or direct
+            return [path for path in direct if path.suffix == wanted.suffix] or direct
     return []
 
 
@@ -272,13 +271,13 @@ def _check_aspect(path: Path, size: tuple[int, int], camera: Camera) -> None:
     if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > allowed:
         raise ImageError(
             f"{path}: is {size[0]} x {size[1]}, but its camera {camera.name!r} {camera.width} x {camera.height}, "
-            "another aspect. Give the photos that the cameras were computed from, neither cropped nor rotated."
+            "another aspect ratio. Give the photos that the cameras were computed from, neither cropped nor rotated."
         )
 
 
-def _save(path: Path, image: Tensor, write: Callable[[Image.Image, Path], None]) -> None:
+def _save(path: Path, image: Tensor, **options: Any) -> None:
     if image.ndim != 3 or image.shape[2] != 3 or bool(torch.isnan(image).any()):
         raise ValueError(f"an image must be [H, W, 3] without NaN, got {tuple(image.shape)}")
     values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
     with atomic_path(path) as temporary:
-        write(Image.fromarray(values.numpy()), temporary)
+        Image.fromarray(values.numpy()).save(temporary, **options)

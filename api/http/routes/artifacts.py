@@ -153,7 +153,7 @@ async def _find_artifact(context: Context, job: JobRow, name: str, form: ResultN
     if form is not None and form != PLY.name:
         if name != RESULT:
             raise RefusedInputError(f"Only {RESULT} has other forms. Leave 'format' out.", "invalid-request")
-        return await context.packer.packed(job, by_name(form))
+        return await context.compressor.compressed(job, by_name(form))
     row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
     if row is None:
         raise NotFoundError(f"Job {job.id} has no file {name[:80]!r} (yet). Its artifacts list has all there are.")

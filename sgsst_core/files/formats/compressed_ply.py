@@ -41,7 +41,7 @@ def bounds(prefix: str, axes: str) -> tuple[str, ...]:
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = (*bounds("", "xyz"), *bounds("scale_", "xyz"), *bounds("", "rgb"))
-#: Largest absolute log scale: other writers of the format also clamp scales to e^-20..e^20.
+#: Maximum absolute log scale; other writers of the format clamp to it too.
 _LARGEST_SCALE = 20.0
 
 
@@ -98,8 +98,8 @@ def _read_header(start: FileStart) -> CompressedPlyHeader:
 
 
 def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:
-    found = {prop.name: prop.kind for prop in element.properties if not prop.length_kind}
-    wrong = [name for name in names if found.get(name) != kind]
+    kinds = {prop.name: prop.kind for prop in element.properties if not prop.length_kind}
+    wrong = [name for name in names if kinds.get(name) != kind]
     if wrong or element.has_lists:
         what = f"{', '.join(wrong)} missing or of another type" if wrong else "a list"
         raise SceneError(
@@ -127,42 +127,42 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     starts = element_offsets(file.path, header.ply)
     kinds = {element.name: element.dtype(header.ply.byte_order) for element in header.ply.elements}
     for start in range(0, header.count, _BLOCK_ROWS):
-        part = slice(start, min(start + _BLOCK_ROWS, header.count))
+        block = slice(start, min(start + _BLOCK_ROWS, header.count))
 
         def rows(name: str, first: int, count: int) -> NDArray[Any]:
             data = np.empty(count * kinds[name].itemsize, np.uint8)
             file.read(starts[name] + first * kinds[name].itemsize, data)
             return data.view(kinds[name])
 
-        count = part.stop - start
+        count = block.stop - start
         chunks = rows("chunk", start // CHUNK_ROWS, -(-count // CHUNK_ROWS))
-        _unpack(rows("vertex", start, count), chunks, {name: array[part] for name, array in into.items()})
+        _unpack(rows("vertex", start, count), chunks, {name: array[block] for name, array in into.items()})
         if header.coefficients:
-            _unpack_harmonics(rows("sh", start, count), into["sh_rest"][part])
+            _unpack_harmonics(rows("sh", start, count), into["sh_rest"][block])
 
 
 def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
     position, rotation, scale, color = (rows[name].astype(np.uint32) for name in _PACKED)
     chunk = np.arange(len(rows)) // CHUNK_ROWS
 
-    def between(prefix: str, axes: str, share: NDArray[np.float64]) -> NDArray[np.float64]:
+    def between(prefix: str, axes: str, fraction: NDArray[np.float64]) -> NDArray[np.float64]:
         names = bounds(prefix, axes)
         low, high = (
             np.stack([chunks[name].astype(np.float64) for name in side], axis=1)[chunk]
             for side in (names[:3], names[3:])
         )
         with np.errstate(invalid="ignore", over="ignore"):  # non-finite results are reported later
-            return low * (1 - share) + high * share
+            return low * (1 - fraction) + high * fraction
 
     with np.errstate(over="ignore"):
         into["means"][:] = between("", "xyz", _three(position))
         into["scales"][:] = between("scale_", "xyz", _three(scale))
-        share = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
-        shown = between("", "rgb", share) if "min_r" in (chunks.dtype.names or ()) else share
-        into["sh_dc"][:] = (shown - 0.5) / SH_C0
+        fraction = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
+        colors = between("", "rgb", fraction) if "min_r" in (chunks.dtype.names or ()) else fraction
+        into["sh_dc"][:] = (colors - 0.5) / SH_C0
     into["opacities"][:] = OPACITY_LOGITS[color & 255]
-    parts = np.stack([(rotation >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023
-    into["quats"][:] = with_largest(rotation >> 30, (parts - 0.5) * np.sqrt(2))
+    components = np.stack([(rotation >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023
+    into["quats"][:] = with_largest(rotation >> 30, (components - 0.5) * np.sqrt(2))
 
 
 def _three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
@@ -233,27 +233,27 @@ def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     starts = np.arange(0, len(arrays["means"]), CHUNK_ROWS)
     chunk = np.arange(len(arrays["means"])) // CHUNK_ROWS
     scales = np.clip(arrays["scales"], -_LARGEST_SCALE, _LARGEST_SCALE)
-    found, shares = [], []
+    bounds_of, fractions = [], []
     for values in (arrays["means"], scales, (arrays["sh_dc"].astype(np.float64) * SH_C0 + 0.5).astype(np.float32)):
         low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-        found += [low, high]
+        bounds_of += [low, high]
         extent = high.astype(np.float64) - low
-        shares.append((values.astype(np.float64) - low[chunk]) / np.where(extent > 0, extent, 1)[chunk])
-    color = [to_steps(shares[2][:, i], 255) for i in range(3)]
+        fractions.append((values.astype(np.float64) - low[chunk]) / np.where(extent > 0, extent, 1)[chunk])
+    color = [to_steps(fractions[2][:, i], 255) for i in range(3)]
     packed = np.stack(
         [
-            _pack_three(shares[0]),
+            _pack_three(fractions[0]),
             _pack_rotations(arrays["quats"]),
-            _pack_three(shares[1]),
+            _pack_three(fractions[1]),
             color[0] << 24 | color[1] << 16 | color[2] << 8 | opacity_bytes(arrays["opacities"]).astype(np.uint32),
         ],
         axis=1,
     )
-    return np.concatenate(found, axis=1), packed
+    return np.concatenate(bounds_of, axis=1), packed
 
 
-def _pack_three(shares: NDArray[np.float64]) -> NDArray[Any]:
-    x, y, z = (to_steps(shares[:, i], most) for i, most in enumerate((2047, 1023, 2047)))
+def _pack_three(fractions: NDArray[np.float64]) -> NDArray[Any]:
+    x, y, z = (to_steps(fractions[:, i], maximum) for i, maximum in enumerate((2047, 1023, 2047)))
     packed: NDArray[np.uint32] = x << np.uint32(21) | y << np.uint32(11) | z
     return packed
 

@@ -52,7 +52,7 @@ def _check_properties(path: Path, header: PlyHeader) -> int:
     kinds = {prop.name: prop.kind for prop in vertex.properties if not prop.length_kind} if vertex else {}
     missing = [name for names in (*PROPERTIES.values(), ("opacity",)) for name in names if name not in kinds]
     if vertex is None or missing:
-        raise SceneError(f"{path}: is not a 3DGS scene but {_what_else(header)}; missing: {', '.join(missing)}.")
+        raise SceneError(f"{path}: is not a 3DGS scene but {_likely_content(header)}; missing: {', '.join(missing)}.")
     if vertex.count == 0:
         raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
     if vertex.has_lists:
@@ -78,7 +78,7 @@ def _check_properties(path: Path, header: PlyHeader) -> int:
     return len(rest) // 3
 
 
-def _what_else(header: PlyHeader) -> str:
+def _likely_content(header: PlyHeader) -> str:
     """Guess what a PLY without Gaussians contains, for the error message."""
     vertex = header.vertex if "vertex" in header.names else None
     names = {prop.name for prop in vertex.properties} if vertex else set()

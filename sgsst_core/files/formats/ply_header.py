@@ -132,10 +132,10 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
                 stop = position + len(line.rstrip())
                 elements.append((name, int(count), (stop - len(count), stop), {}))
             case ["property", *definition] if elements and (prop := _property(definition)):
-                owner, _, _, properties = elements[-1]
+                element, _, _, properties = elements[-1]
                 if prop.name in properties:
                     raise SceneError(
-                        f"{path}: the PLY header declares {owner}.{prop.name} twice. Export the scene again."
+                        f"{path}: the PLY header declares {element}.{prop.name} twice. Export the scene again."
                     )
                 properties[prop.name] = prop
             case _:
@@ -144,9 +144,9 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
         position += len(line) + len(newline)
     if byte_order is None:
         raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")
-    found = tuple(PlyElement(name, count, span, tuple(props.values())) for name, count, span, props in elements)
-    _check_elements(path, found)
-    return PlyHeader(byte_order, raw, found)
+    parsed = tuple(PlyElement(name, count, span, tuple(props.values())) for name, count, span, props in elements)
+    _check_elements(path, parsed)
+    return PlyHeader(byte_order, raw, parsed)
 
 
 def _property(definition: list[str]) -> PlyProperty | None:

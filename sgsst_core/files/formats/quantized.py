@@ -15,8 +15,8 @@ SH_C0 = 0.28209479177387814
 
 #: Opacities of exactly 0 and 1 have no finite logit, so they are read as 0.25/255 and 1 - 0.25/255. The difference is
 #: below the rounding of these formats, and invisible in 8-bit images.
-_NEARLY = 0.25 / 255
-_LEAST_THREE = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_LEAST_OPACITY = 0.25 / 255
+_OTHER_THREE = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def byte_table(values: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -25,8 +25,8 @@ def byte_table(values: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _logits() -> NDArray[np.float64]:
-    share = np.clip(np.arange(256) / 255, _NEARLY, 1 - _NEARLY)
-    return np.log(share / (1 - share))
+    opacities = np.clip(np.arange(256) / 255, _LEAST_OPACITY, 1 - _LEAST_OPACITY)
+    return np.log(opacities / (1 - opacities))
 
 
 #: Logit of the opacity i / 255 for each byte i, [256] float32.
@@ -39,9 +39,9 @@ def opacity_bytes(logits: NDArray[Any]) -> NDArray[Any]:
     return np.rint(127.5 * (1 + np.tanh(0.5 * logits.astype(np.float64)))).astype(np.uint8)
 
 
-def to_steps(values: NDArray[Any], most: int) -> NDArray[np.uint32]:
-    """Quantize values to uint32 steps 0..most, which cover the range 0..1. Values outside it are clamped."""
-    steps: NDArray[np.uint32] = np.rint(np.clip(values, 0, 1) * most).astype(np.uint32)
+def to_steps(values: NDArray[Any], maximum: int) -> NDArray[np.uint32]:
+    """Quantize values to uint32 steps 0..maximum, which cover the range 0..1. Values outside it are clamped."""
+    steps: NDArray[np.uint32] = np.rint(np.clip(values, 0, 1) * maximum).astype(np.uint32)
     return steps
 
 
@@ -51,10 +51,10 @@ def with_largest(index: NDArray[Any], three: NDArray[np.float64]) -> NDArray[np.
     The omitted component is positive, and follows from the unit length.
     """
     rows = np.arange(len(index))
-    found = np.empty((len(index), 4))
-    found[rows[:, None], _LEAST_THREE[index]] = three
-    found[rows, index] = np.sqrt(np.maximum(0, 1 - (three**2).sum(axis=1)))
-    return found
+    quats = np.empty((len(index), 4))
+    quats[rows[:, None], _OTHER_THREE[index]] = three
+    quats[rows, index] = np.sqrt(np.maximum(0, 1 - (three**2).sum(axis=1)))
+    return quats
 
 
 def without_largest(quats: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -68,4 +68,4 @@ def without_largest(quats: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.
     rows = np.arange(len(values))
     length = np.linalg.norm(values, axis=1) * np.where(values[rows, largest] < 0, -1, 1)
     values = values / np.where(length == 0, 1, length)[:, None]
-    return largest, values[rows[:, None], _LEAST_THREE[largest]]
+    return largest, values[rows[:, None], _OTHER_THREE[largest]]

@@ -42,16 +42,16 @@ def _read_header(start: FileStart) -> SceneHeader:
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene. A standard deviation of 0 becomes a log scale of minus infinity."""
     for start in range(0, header.count, _BLOCK_ROWS):
-        part = slice(start, min(start + _BLOCK_ROWS, header.count))
-        data = np.empty((part.stop - start) * ROW.itemsize, np.uint8)
+        block = slice(start, min(start + _BLOCK_ROWS, header.count))
+        data = np.empty((block.stop - start) * ROW.itemsize, np.uint8)
         file.read(start * ROW.itemsize, data)
         rows = data.view(ROW)
-        into["means"][part] = rows["position"]
+        into["means"][block] = rows["position"]
         with np.errstate(divide="ignore", invalid="ignore"):  # invalid values are reported later
-            into["scales"][part] = np.log(rows["scale"].astype(np.float64))
-        into["sh_dc"][part] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
-        into["opacities"][part] = OPACITY_LOGITS[rows["color"][:, 3]]
-        into["quats"][part] = (rows["rotation"].astype(np.float64) - 128) / 128
+            into["scales"][block] = np.log(rows["scale"].astype(np.float64))
+        into["sh_dc"][block] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
+        into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
+        into["quats"][block] = (rows["rotation"].astype(np.float64) - 128) / 128
 
 
 SPLAT = SceneFormat(

@@ -61,7 +61,7 @@ _FIRST_BYTES = byte_table(np.arange(256) / 127.5 - 1)
 
 #: Maximum number of fractional bits in written positions. With 20 bits, positions in a scene of a few units are finer
 #: than in float32.
-_MOST_BITS = 20
+_MAX_FRACTIONAL_BITS = 20
 
 #: Compression level. Files are 2 % larger than at zlib's default level 6 but take a third of the time, because
 #: spherical harmonics are almost noise.
@@ -139,14 +139,14 @@ def _zstd_header(path: Path, head: bytes, size: int) -> SpzHeader:
         file.seek(table)
         listed = list(struct.iter_unpack("<QQ", file.read(16 * number)))
     streams, position = [], table + 16 * number
-    for (compressed, becomes), wanted in zip(listed, expected, strict=True):
-        if becomes != wanted or position + compressed > size:
+    for (compressed, decompressed), wanted in zip(listed, expected, strict=True):
+        if decompressed != wanted or position + compressed > size:
             raise SceneError(
-                f"{path}: the SPZ header declares a stream of {compressed} bytes that become {becomes}; {wanted} "
+                f"{path}: the SPZ header declares a stream of {compressed} bytes that become {decompressed}; {wanted} "
                 f"belong to {count} Gaussians, and {size - position} bytes are left. The file is truncated or its "
                 "header is wrong. Copy or export it again."
             )
-        streams.append(SpzSection(position, compressed, becomes))
+        streams.append(SpzSection(position, compressed, decompressed))
         position += compressed
     return SpzHeader(SPZ, count, COEFFICIENTS[degree], size, version, fractional_bits, sections, tuple(streams))
 
@@ -184,27 +184,27 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene; raise a SceneError if a stream is damaged or not as long as the header declares."""
     assert isinstance(spz, SpzHeader)
     path = file.path
-    unpack: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
+    decoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
         (into["means"], _halves if spz.version == 1 else lambda data: _fixed_point(data, spz.fractional_bits)),
         (into["opacities"], lambda data: OPACITY_LOGITS[data]),
         (into["sh_dc"], lambda data: _COLORS[data].reshape(-1, 3)),
         (into["scales"], lambda data: _SCALES[data].reshape(-1, 3)),
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
-        (into["sh_rest"], lambda data: _unpack_harmonics(data, spz.coefficients)),
+        (into["sh_rest"], lambda data: _decode_harmonics(data, spz.coefficients)),
     ]
     streams = (
         _zstd_streams(path, file, spz.streams)
         if spz.streams
         else _gzip_stream(path, file, spz.size, sum(map(bool, spz.sections)))
     )
-    for (array, values), size in zip(unpack, spz.sections, strict=True):
+    for (array, decode), size in zip(decoders, spz.sections, strict=True):
         if not size:
             continue
         take = next(streams)
-        each = size // spz.count
+        row_bytes = size // spz.count
         for start in range(0, spz.count, _BLOCK_ROWS):
-            part = array[start : start + _BLOCK_ROWS]
-            part[:] = values(np.frombuffer(take(len(part) * each), np.uint8))
+            block = array[start : start + _BLOCK_ROWS]
+            block[:] = decode(np.frombuffer(take(len(block) * row_bytes), np.uint8))
     next(streams, None)  # reach the end of the last stream, where its checksum is verified
 
 
@@ -229,7 +229,7 @@ def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int) -> Itera
                 break
         return bytes(found)
 
-    def whole(count: int) -> bytes:
+    def read_exactly(count: int) -> bytes:
         found = take(count)
         if len(found) < count:
             raise _ends_early(path)
@@ -237,7 +237,7 @@ def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int) -> Itera
 
     take(16)
     for _ in range(sections):
-        yield whole
+        yield read_exactly
     if len(take(_EXTENSION_BYTES)) == _EXTENSION_BYTES and not inflate.eof:
         raise _too_much(path)
     if not inflate.eof:
@@ -248,7 +248,7 @@ def _zstd_streams(path: Path, file: OpenScene, streams: tuple[SpzSection, ...]) 
     """Yield, for each section, a function that reads its own zstd stream; check that the stream ends there."""
     for stream in streams:
         decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
-        with decompressor.stream_reader(_Part(file, stream), read_size=_READ_BYTES) as reader:  # type: ignore[arg-type]
+        with decompressor.stream_reader(_StreamSource(file, stream), read_size=_READ_BYTES) as reader:  # type: ignore[arg-type]
 
             def take(count: int, reader: Any = reader) -> bytes:
                 try:
@@ -268,11 +268,11 @@ def _zstd_streams(path: Path, file: OpenScene, streams: tuple[SpzSection, ...]) 
                 raise _too_much(path)
 
 
-class _Part:
+class _StreamSource:
     """File-like object for a byte range of a file."""
 
-    def __init__(self, file: OpenScene, part: SpzSection) -> None:
-        self._file, self._position, self._end = file, part.offset, part.offset + part.compressed
+    def __init__(self, file: OpenScene, stream: SpzSection) -> None:
+        self._file, self._position, self._end = file, stream.offset, stream.offset + stream.compressed
 
     def read(self, size: int = -1) -> bytes:
         left = self._end - self._position
@@ -328,7 +328,7 @@ def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     return np.roll(with_largest(packed >> 30, values), 1, axis=1) * _FLIP_QUATS
 
 
-def _unpack_harmonics(data: NDArray[np.uint8], coefficients: int) -> NDArray[Any]:
+def _decode_harmonics(data: NDArray[np.uint8], coefficients: int) -> NDArray[Any]:
     return _HARMONICS[data].reshape(-1, coefficients, 3) * _FLIP_HARMONICS[:coefficients, None]
 
 
@@ -343,25 +343,25 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
     degree = next(degree for degree, number in COEFFICIENTS.items() if number == coefficients)
     deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
     output.write(deflate.compress(struct.pack("<4sIIBBBB", _MAGIC, 3, count, degree, bits, 0, 0)))
-    pack: list[tuple[NDArray[np.float32], Callable[[NDArray[np.float64]], NDArray[Any]]]] = [
-        (arrays["means"], lambda values: _pack_positions(values, bits)),
+    encoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.float64]], NDArray[Any]]]] = [
+        (arrays["means"], lambda values: _encode_positions(values, bits)),
         (arrays["opacities"], opacity_bytes),
         (arrays["sh_dc"], lambda values: _to_byte(values * (0.15 * 255) + 127.5)),
         (arrays["scales"], lambda values: _to_byte((values + 10) * 16)),
-        (arrays["quats"], _pack_rotations),
+        (arrays["quats"], _encode_rotations),
         (arrays["sh_rest"], lambda values: _to_byte(values * _FLIP_HARMONICS[:coefficients, None] * 128 + 128)),
     ]
-    for array, packed in pack:
+    for array, encode in encoders:
         for start in range(0, count, _BLOCK_ROWS):
             values = array[start : start + _BLOCK_ROWS].astype(np.float64)
-            output.write(deflate.compress(np.ascontiguousarray(packed(values)).tobytes()))
+            output.write(deflate.compress(np.ascontiguousarray(encode(values)).tobytes()))
     output.write(deflate.flush())
 
 
 def _fractional_bits(means: NDArray[np.float32]) -> int:
     """Return the largest number of fractional bits that can represent the position farthest from the origin."""
     farthest = max(float(np.abs(means).max()), 2.0**-30)
-    bits = min(_MOST_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
+    bits = min(_MAX_FRACTIONAL_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
     if bits < 1:
         raise OutputError(
             f"SPZ cannot hold a Gaussian {farthest:.3g} from the origin. Write a PLY, or a .compressed.ply."
@@ -369,17 +369,17 @@ def _fractional_bits(means: NDArray[np.float32]) -> int:
     return bits
 
 
-def _pack_positions(means: NDArray[np.float64], bits: int) -> NDArray[Any]:
+def _encode_positions(means: NDArray[np.float64], bits: int) -> NDArray[Any]:
     values = np.rint(np.ldexp(means * _FLIP, bits)).astype(np.int32)
     return np.stack([values & 255, values >> 8 & 255, values >> 16 & 255], axis=-1).astype(np.uint8)
 
 
-def _pack_rotations(quats: NDArray[np.float64]) -> NDArray[Any]:
+def _encode_rotations(quats: NDArray[np.float64]) -> NDArray[Any]:
     largest, three = without_largest(np.roll(quats * _FLIP_QUATS, -1, axis=1))
-    parts = np.rint(np.minimum(np.abs(three) / np.sqrt(0.5), 1) * 511).astype(np.uint32)
-    parts |= np.where(three < 0, 512, 0).astype(np.uint32)
+    components = np.rint(np.minimum(np.abs(three) / np.sqrt(0.5), 1) * 511).astype(np.uint32)
+    components |= np.where(three < 0, 512, 0).astype(np.uint32)
     packed: NDArray[np.uint32] = largest.astype(np.uint32) << np.uint32(30)
-    packed |= parts[:, 0] << 20 | parts[:, 1] << 10 | parts[:, 2]
+    packed |= components[:, 0] << 20 | components[:, 1] << 10 | components[:, 2]
     return packed.astype("<u4")
 
 

@@ -434,9 +434,9 @@ def test_a_rotation_with_few_digits_becomes_exact(tmp_path: Path) -> None:
     [
         (b"[]", "holds no cameras"),
         (b'{"frames": []}', "holds no cameras"),
-        (b"{}", "no form that is known here. Give an INRIA cameras.json, a COLMAP"),
-        (b"3", "no form that is known"),
-        (b'{"frames": 3}', "no form that is known"),
+        (b"{}", "in no known camera format. Give an INRIA cameras.json, a COLMAP"),
+        (b"3", "in no known camera format"),
+        (b'{"frames": 3}', "in no known camera format"),
         (b"[3]", "camera 0: is not an object"),
         (b"[{}]", "camera 0: has no name"),
         (b"[[1, 2]]", "camera 0: is not an object"),
@@ -456,7 +456,7 @@ def test_unknown_forms_are_refused(tmp_path: Path, data: bytes, message: str) ->
 def test_missing_files_and_folders_without_cameras(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match="No such file"):
         read_cameras(tmp_path / "none.json")
-    with pytest.raises(CameraError, match="holds no cameras that are known"):
+    with pytest.raises(CameraError, match="holds no cameras in a known format"):
         read_cameras(tmp_path)
 
 

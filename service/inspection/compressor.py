@@ -20,7 +20,7 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.names import RESULT
 from service.files.staging import Staged, stage
-from service.inspection.inspector import LEFT_SECONDS, MEMORY_PER_BYTE, InspectionProcess, found_or_refused
+from service.inspection.inspector import LEFTOVER_SECONDS, MEMORY_PER_BYTE, InspectionProcess, findings_of
 from service.parameters import stored_parameters
 from service.settings import ServiceSettings
 from service.store import Store
@@ -34,20 +34,20 @@ from sgsst_core.files.formats.scene_format import SceneFormat
 _SECONDS_PER_BYTE = 600 / 1e9
 
 
-class Packer:
+class Compressor:
     """Compressor of results, one at a time; concurrent requests for the same result share one task."""
 
     def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
         self._process = InspectionProcess()
-        self._making: dict[tuple[str, str], asyncio.Task[None]] = {}
+        self._tasks: dict[tuple[str, str], asyncio.Task[None]] = {}
         self._folder = settings.folder / "packing"
         self._folder.mkdir(parents=True, exist_ok=True)
-        for left in self._folder.iterdir():  # left behind by a killed process
-            if time.time() - left.stat().st_mtime > LEFT_SECONDS:
-                shutil.rmtree(left, ignore_errors=True)
+        for leftover in self._folder.iterdir():  # left behind by a killed process
+            if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
+                shutil.rmtree(leftover, ignore_errors=True)
 
-    async def packed(self, job: JobRow, format: SceneFormat) -> ArtifactRow:
+    async def compressed(self, job: JobRow, format: SceneFormat) -> ArtifactRow:
         """Return a job's result in a compressed format; the compression error is stored beside it as JSON.
 
         Raises:
@@ -59,20 +59,20 @@ class Packer:
         result = await asyncio.to_thread(self._store.jobs.artifact, job.id, RESULT)
         if result is None:
             raise NotFoundError(f"Job {job.id} has no file {RESULT!r} (yet). Its artifacts list has all there are.")
-        found = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
-        if found is None:
-            task = self._making.get((job.id, name))
+        row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
+        if row is None:
+            task = self._tasks.get((job.id, name))
             if task is None:
-                task = asyncio.create_task(self._make(job, result, name))
-                self._making[job.id, name] = task
-                task.add_done_callback(lambda done: self._making.pop((job.id, name), None))
+                task = asyncio.create_task(self._compress(job, result, name))
+                self._tasks[job.id, name] = task
+                task.add_done_callback(lambda done: self._tasks.pop((job.id, name), None))
             await asyncio.shield(task)
-            found = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
-        if found is None:
+            row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
+        if row is None:
             raise NotFoundError(f"The results of job {job.id} are gone.")
-        return found
+        return row
 
-    async def _make(self, job: JobRow, result: ArtifactRow, name: str) -> None:
+    async def _compress(self, job: JobRow, result: ArtifactRow, name: str) -> None:
         """Compress the result, store the files, and make them visible."""
         self._blobs.ensure_room(3 * result.size)
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
@@ -86,7 +86,7 @@ class Packer:
                 "seconds": self._settings.inspection_seconds + _SECONDS_PER_BYTE * result.size,
                 "bytes": self._settings.inspection_bytes + MEMORY_PER_BYTE * result.size,
             }
-            loss = found_or_refused(await self._process.ask(request))
+            loss = findings_of(await self._process.ask(request))
             await asyncio.to_thread(self._publish, Path(folder), job, result, name, loss)
 
     def _stage(self, folder: Path, job: JobRow, result: ArtifactRow) -> Staged:
