@@ -39,7 +39,7 @@ from sgsst_core.features.fused_statistics import (
 from sgsst_core.loss import fused_kernels as loss_kernels
 from sgsst_core.loss import fused_terms
 from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
-from sgsst_core.rasterizer import triton_cached_kernels as kept_kernels
+from sgsst_core.rasterizer import triton_cached_kernels as cached_kernels
 from sgsst_core.rasterizer import triton_kernels as kernels
 from sgsst_core.scene import spherical_harmonics_triton_kernels as harmonics_kernels
 
@@ -66,7 +66,7 @@ _TYPES = {
     **dict.fromkeys(("out_row_step", "out_column_step"), "i32"),
     **dict.fromkeys(("total", "visible", "width", "first_row", "last_row", "across"), "i32"),
 }
-_FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (kept_kernels.HALF_SCALE, "*fp16")}
+_FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (cached_kernels.HALF_SCALE, "*fp16")}
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ class Target:
 def _of_cached_weights(form: str) -> dict[str, Target]:
     scale, weights = _FORMS[form]
     types = {"weights": weights, "gaussians": "*i32"}
-    read = {"SCALE": scale, "P": kept_kernels.PIECES.value}
-    keep = Target(kept_kernels.keep_pieces, {**_CUTS, "SCALE": scale}, 8, {"weights": weights})
+    read = {"SCALE": scale, "P": cached_kernels.PIECES.value}
+    keep = Target(cached_kernels.store_pieces, {**_CUTS, "SCALE": scale}, 8, {"weights": weights})
     return {
-        f"keep_pieces_{form}": keep,
-        f"apply_pieces_{form}": Target(kept_kernels.apply_pieces, read, 1, types),
-        f"piece_gradients_{form}": Target(kept_kernels.piece_gradients, read, 1, types),
+        f"store_pieces_{form}": keep,
+        f"apply_pieces_{form}": Target(cached_kernels.apply_pieces, read, 1, types),
+        f"piece_gradients_{form}": Target(cached_kernels.piece_gradients, read, 1, types),
     }
 
 
@@ -149,7 +149,7 @@ KERNELS: dict[str, Target] = {
     "add_slots": Target(kernels.add_slots, _ADDED, 4, {"slots": "*fp32"}),
     "survey": Target(kernels.survey, _CUTS, 8, {"height": "i32"}),
     "add_slot_weights": Target(kernels.add_slot_weights, _ADDED, 4, {"slots": "*fp32"}),
-    "count_pieces": Target(kept_kernels.count_pieces, _CUTS, 8),
+    "count_pieces": Target(cached_kernels.count_pieces, _CUTS, 8),
     **_of_cached_weights("float32"),
     **_of_cached_weights("half"),
     **_of_features("float32", _WIDEST, "float32"),

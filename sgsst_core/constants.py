@@ -47,6 +47,11 @@ ALPHA_MAX = 0.99
 #: Minimum alpha, one level of an 8-bit image. Smaller contributions are skipped, which also gives a Gaussian finite
 #: support.
 ALPHA_MIN = 1.0 / 255.0
+LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
+
+#: The rasterizers compute alpha with powers of two: exp(-(u^2 + w^2) / 2) = 2^-(u'^2 + w'^2) if u' and w' are u and w
+#: times this factor.
+TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
 
 #: Blending of a pixel stops before its transmittance falls to this value: 1e-4, which two Gaussians of maximum alpha
 #: leave. It is written as a product, so that the second of two such Gaussians stops blending in float64 as well as in

@@ -117,7 +117,7 @@ class CpuRasterizer(Rasterizer):
 
     def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
         """Count a band's weights without storing them; takes about as long as one render."""
-        from sgsst_core.rasterizer.strips import CountedStrips
+        from sgsst_core.rasterizer.cpu_cached import CountedStrips
 
         return CountedStrips(self, camera, check_rows(camera, rows))
 

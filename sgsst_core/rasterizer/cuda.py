@@ -92,12 +92,12 @@ class CudaRasterizer(Rasterizer):
         Raises:
             SettingsError: If it is no GPU, or there is none.
         """
-        found = torch.device(device or "cuda")
-        if found.type != "cuda" or not torch.cuda.is_available():
+        chosen = torch.device(device or "cuda")
+        if chosen.type != "cuda" or not torch.cuda.is_available():
             raise SettingsError(
-                f"rasterizer 'cuda' on device {str(found)!r}: PyTorch sees no CUDA GPU; choose 'cpu' or 'cached'"
+                f"rasterizer 'cuda' on device {str(chosen)!r}: PyTorch sees no CUDA GPU; choose 'cpu' or 'cached'"
             )
-        return found
+        return chosen
 
     @torch.no_grad()
     def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:

@@ -41,63 +41,63 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
         bits = np.empty(count, dtype=np.int64)
         _gather(depths.view(np.int64), visible, bits)
         lowest, highest = int(bits.min()), int(bits.max())
-        wanted = min(max(count // _BUCKET, 1), _MOST_BUCKETS)
-        shift = max((highest - lowest).bit_length() - wanted.bit_length(), 0)
+        target = min(max(count // _BUCKET, 1), _MOST_BUCKETS)
+        shift = max((highest - lowest).bit_length() - target.bit_length(), 0)
         buckets = ((highest - lowest) >> shift) + 1
-        parts = np.linspace(0, count, threads + 1).astype(np.int64)
+        chunks = np.linspace(0, count, threads + 1).astype(np.int64)
         ends = np.zeros((threads, buckets), dtype=np.int64)
-        _count(bits, lowest, shift, parts, ends)
-        # First position that each part writes to in each bucket: after all lower buckets, and after the entries of all
-        # preceding parts in the same bucket.
+        _count(bits, lowest, shift, chunks, ends)
+        # First position that each chunk writes to in each bucket: after all lower buckets, and after the entries of all
+        # preceding chunks in the same bucket.
         totals = ends.sum(axis=0)
         starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(totals)])
         ends = starts[:-1] + np.cumsum(ends, axis=0) - ends
         order, keys = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int64)
-        _scatter(bits, visible, lowest, shift, parts, ends, order, keys)
-        shares = np.searchsorted(starts, parts).astype(np.int64)
-        _sort_buckets(starts, shares, keys, order)
+        _scatter(bits, visible, lowest, shift, chunks, ends, order, keys)
+        bounds = np.searchsorted(starts, chunks).astype(np.int64)
+        _sort_buckets(starts, bounds, keys, order)
     return order
 
 
 @compiled(parallel=True)
-def _gather(values, places, out):
-    for i in numba.prange(places.size):
-        out[i] = values[places[i]]
+def _gather(values, indices, out):
+    for i in numba.prange(indices.size):
+        out[i] = values[indices[i]]
 
 
 @compiled(parallel=True)
-def _count(bits, lowest, shift, parts, counts):
-    """Count the Gaussians of each part that fall into each bucket."""
-    for part in numba.prange(parts.size - 1):
-        for i in range(parts[part], parts[part + 1]):
-            counts[part, (bits[i] - lowest) >> shift] += 1
+def _count(bits, lowest, shift, chunks, counts):
+    """Count the Gaussians of each chunk that fall into each bucket."""
+    for chunk in numba.prange(chunks.size - 1):
+        for i in range(chunks[chunk], chunks[chunk + 1]):
+            counts[chunk, (bits[i] - lowest) >> shift] += 1
 
 
 @compiled(parallel=True)
-def _scatter(bits, visible, lowest, shift, parts, places, order, keys):
-    """Copy every part's Gaussians into their buckets, in input order."""
-    for part in numba.prange(parts.size - 1):
-        for i in range(parts[part], parts[part + 1]):
+def _scatter(bits, visible, lowest, shift, chunks, positions, order, keys):
+    """Copy every chunk's Gaussians into their buckets, in input order."""
+    for chunk in numba.prange(chunks.size - 1):
+        for i in range(chunks[chunk], chunks[chunk + 1]):
             bucket = (bits[i] - lowest) >> shift
-            place = places[part, bucket]
-            order[place], keys[place] = visible[i], bits[i]
-            places[part, bucket] = place + 1
+            position = positions[chunk, bucket]
+            order[position], keys[position] = visible[i], bits[i]
+            positions[chunk, bucket] = position + 1
 
 
 @compiled(parallel=True)
-def _sort_buckets(starts, shares, keys, order):
+def _sort_buckets(starts, bounds, keys, order):
     """Sort each bucket by its keys, stably."""
-    for share in numba.prange(shares.size - 1):
-        for bucket in range(shares[share], shares[share + 1]):
-            begin, end = starts[bucket], starts[bucket + 1]
-            if end - begin > _INSERTED:
-                sorted_ = np.argsort(keys[begin:end], kind="mergesort")
-                order[begin:end] = order[begin:end][sorted_]
+    for thread in numba.prange(bounds.size - 1):
+        for bucket in range(bounds[thread], bounds[thread + 1]):
+            start, end = starts[bucket], starts[bucket + 1]
+            if end - start > _INSERTED:
+                sorted_ = np.argsort(keys[start:end], kind="mergesort")
+                order[start:end] = order[start:end][sorted_]
                 continue
-            for i in range(begin + 1, end):
+            for i in range(start + 1, end):
                 key, gaussian = keys[i], order[i]
                 j = i
-                while j > begin and keys[j - 1] > key:
+                while j > start and keys[j - 1] > key:
                     keys[j], order[j] = keys[j - 1], order[j - 1]
                     j -= 1
                 keys[j], order[j] = key, gaussian

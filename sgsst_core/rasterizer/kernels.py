@@ -17,7 +17,6 @@ slot. The slots of a Gaussian are contiguous, and are then added in order.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numba
@@ -25,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled
-from sgsst_core.constants import ALPHA_MIN, RASTER_TILE
+from sgsst_core.constants import LOG2_ALPHA_MIN, RASTER_TILE
 from sgsst_core.rasterizer.vectors import (
     BLOCK_ROWS,
     LANES,
@@ -34,15 +33,14 @@ from sgsst_core.rasterizer.vectors import (
     blend_row,
     dot_pieces,
     dot_pixels,
-    keep_vector,
     prefetch,
+    store_vector,
     sum_lanes,
     sum_weights,
 )
 
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
-_SUPPORT = -math.log2(ALPHA_MIN)
 _TILE = RASTER_TILE
 _LAST = RASTER_TILE - 1
 _PIXELS = RASTER_TILE**2
@@ -76,7 +74,7 @@ def _blend(block, alive, value, x, y, low, high, alpha_max):
             continue
         dy = top + row
         w = dy * w_scale
-        rest = log2_opacity + _SUPPORT - w * w
+        rest = log2_opacity - LOG2_ALPHA_MIN - w * w
         u = (dx - skew * dy) * u_scale
         u_end = u + _LAST * u_scale
         nearest = max(u, -u_end)
@@ -88,11 +86,11 @@ def _blend(block, alive, value, x, y, low, high, alpha_max):
         for gap in range(stop, row):
             for i in range(_TILE):
                 block[1, gap, i] = _ZERO
-        going_on = blend_row(block, row, u, u_scale, log2_opacity - w * w, alpha_max)
+        unfinished = blend_row(block, row, u, u_scale, log2_opacity - w * w, alpha_max)
         stop = row + 1
-        if going_on == 0:
+        if unfinished == 0:
             alive[_TILE] -= 1
-        alive[row] = going_on
+        alive[row] = unfinished
     return first, stop
 
 
@@ -164,10 +162,10 @@ def render(entries, starts, values, gaussians, colors, background, first_row, al
     flat = values.reshape(values.size)
     tiles = (last_row + _LAST) // _TILE * across - first_tile
     for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
-        place = _scattered(step, tiles)
-        if place >= tiles:
+        index = _scattered(step, tiles)
+        if index >= tiles:
             continue
-        tile = first_tile + place
+        tile = first_tile + index
         x, y = tile % across * _TILE, tile // across * _TILE
         low, high, columns = max(first_row - y, 0), min(last_row - y, _TILE), min(width - x, _TILE)
         block = np.empty((2, _TILE, _TILE), dtype=np.float32)
@@ -341,17 +339,17 @@ def count_weights(entries, slots, starts, values, band, width, alpha_max, items,
             first, stop = _blend(block, alive, values[entries[position]], x, y, low, high, alpha_max)
             _fill_blocks(block, first, stop)
             for side in range(_STRIPS):
-                strip, found = tile * _STRIPS + side, 0
+                strip, used = tile * _STRIPS + side, 0
                 for row in range(first // BLOCK_ROWS * BLOCK_ROWS, stop, BLOCK_ROWS):
                     if _has_weight(block, row, side * STRIP):
                         pieces[strip * BLOCKS + row // BLOCK_ROWS] += 1
-                        found = 1
-                items[strip] += found
-                slot_items[slots[position]] += found
+                        used = 1
+                items[strip] += used
+                slot_items[slots[position]] += used
 
 
 @compiled(parallel=True)
-def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slot_starts, strips, transmittance):
+def store_weights(entries, slots, starts, values, gaussians, band, alpha_max, slot_starts, strips, transmittance):
     """Store the items and weights counted by `count_weights`, and the final transmittance [h, width] of the band."""
     item_starts, piece_starts, item_gaussians, item_slots, piece_items, weights = strips
     width = transmittance.shape[1]
@@ -372,7 +370,7 @@ def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slo
             first, stop = _blend(block, alive, values[rank], x, y, low, high, alpha_max)
             _fill_blocks(block, first, stop)
             for side in range(_STRIPS):
-                item, found = items[side], 0
+                item, used = items[side], 0
                 for row in range(first // BLOCK_ROWS * BLOCK_ROWS, stop, BLOCK_ROWS):
                     if not _has_weight(block, row, side * STRIP):
                         continue
@@ -381,9 +379,9 @@ def keep_weights(entries, slots, starts, values, gaussians, band, alpha_max, slo
                     piece_items[piece] = item - item_starts[tile * _STRIPS + side]
                     for down in range(BLOCK_ROWS):
                         source = _PIXELS + (row + down) * _TILE + side * STRIP
-                        keep_vector(blended, source, weights, piece * PIECE + down * STRIP)
-                    found = 1
-                if found:
+                        store_vector(blended, source, weights, piece * PIECE + down * STRIP)
+                    used = 1
+                if used:
                     item_gaussians[item], item_slots[item] = gaussians[rank], slot
                     items[side] += 1
                     slot += 1
@@ -407,10 +405,10 @@ def apply_weights(strips, colors, background, transmittance, first_row, image):
             gaussian = item_gaussians[item]
             for channel in range(3):
                 strip_colors[item - begin, channel] = colors[gaussian, channel]
-        for part in range(BLOCKS):
-            piece = piece_starts[strip * BLOCKS + part]
-            count = piece_starts[strip * BLOCKS + part + 1] - piece
-            add_pieces(weights, piece_items, piece, count, strip_colors, pixels, part * BLOCK_ROWS)
+        for block in range(BLOCKS):
+            piece = piece_starts[strip * BLOCKS + block]
+            count = piece_starts[strip * BLOCKS + block + 1] - piece
+            add_pieces(weights, piece_items, piece, count, strip_colors, pixels, block * BLOCK_ROWS)
         low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
         columns = min(width - x, STRIP)
         _store_pixels(pixels, transmittance, background, y - first_row, x, low, high, columns, image)
@@ -429,10 +427,10 @@ def apply_transposed_weights(strips, image_gradient, first_row, slot_gradients):
         sums = np.zeros((end - begin, 3, LANES), dtype=np.float32)
         low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
         _load_pixels(image_gradient, y - first_row, x, low, high, min(width - x, STRIP), pixels)
-        for part in range(BLOCKS):
-            piece = piece_starts[strip * BLOCKS + part]
-            count = piece_starts[strip * BLOCKS + part + 1] - piece
-            dot_pieces(weights, piece_items, piece, count, pixels, part * BLOCK_ROWS, sums)
+        for block in range(BLOCKS):
+            piece = piece_starts[strip * BLOCKS + block]
+            count = piece_starts[strip * BLOCKS + block + 1] - piece
+            dot_pieces(weights, piece_items, piece, count, pixels, block * BLOCK_ROWS, sums)
         for item in range(begin, end):
             slot = item_slots[item]
             for channel in range(3):

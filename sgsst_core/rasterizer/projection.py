@@ -29,18 +29,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled, kernel_threads
-from sgsst_core.constants import ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR
+from sgsst_core.constants import EPS2D, FRUSTUM_MARGIN, LOG2_ALPHA_MIN, NEAR, TO_POWER_OF_TWO
 from sgsst_core.rasterizer.depth_order import depth_order
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-_LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
-#: exp(-power) = 2^-(u'^2 + w'^2) if u and w are scaled by this factor. The kernels use powers of two.
-_TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
 #: Upper bound of float64 rounding errors: in pixels for positions in an image, and relative for extents.
 _ROUNDING = 1e-6
-#: Number of parts of the scene that each thread projects, one after the other.
-_PARTS = 16
+#: Number of chunks of the scene that each thread projects, one after the other.
+_CHUNKS = 16
 
 
 class Column(IntEnum):
@@ -109,7 +106,7 @@ class Shapes:
         shapes = cls(np.empty((len(scene), 3)), np.empty(len(scene)))
         scales, logits = (np.ascontiguousarray(t.numpy()) for t in (scene.scales, scene.opacities))
         with kernel_threads():
-            _find_shapes(scales, logits, shapes.deviations, shapes.log2_opacities)
+            _compute_shapes(scales, logits, shapes.deviations, shapes.log2_opacities)
         return shapes
 
 
@@ -134,33 +131,33 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float64)
     with kernel_threads():
         threads = numba.get_num_threads()
-        parts = np.linspace(0, count, threads * _PARTS + 1).astype(np.int64)
-        tallies = np.zeros((len(parts) - 1, len(Outcome)), dtype=np.int64)
-        _project_parts(
+        chunks = np.linspace(0, count, threads * _CHUNKS + 1).astype(np.int64)
+        tallies = np.zeros((len(chunks) - 1, len(Outcome)), dtype=np.int64)
+        _project_chunks(
             *(np.ascontiguousarray(t.numpy()) for t in (scene.means, scene.quats)),
             shapes.deviations,
             shapes.log2_opacities,
             np.ascontiguousarray(camera.world_to_camera.double().numpy()),
             intrinsics,
             near,
-            parts,
+            chunks,
             threads,
             values,
             depths,
             gaussians,
             tallies,
         )
-        ends = parts[:-1] + tallies[:, Outcome.VISIBLE]
-        packed = [np.arange(start, end) for start, end in zip(parts[:-1], ends, strict=True)]
-        order = depth_order(depths, np.concatenate(packed))
-        found = Projection(
+        ends = chunks[:-1] + tallies[:, Outcome.VISIBLE]
+        visible = [np.arange(start, end) for start, end in zip(chunks[:-1], ends, strict=True)]
+        order = depth_order(depths, np.concatenate(visible))
+        projection = Projection(
             gaussians=np.empty(len(order), dtype=np.int32),
             values=np.empty((len(order), len(Column))),
             outcomes={outcome: int(tallies[:, outcome].sum()) for outcome in Outcome},
         )
-        take_places(gaussians, order, found.gaussians)
-        take_rows(values, order, found.values)
-    return found
+        take_elements(gaussians, order, projection.gaussians)
+        take_rows(values, order, projection.values)
+    return projection
 
 
 @compiled()
@@ -203,12 +200,12 @@ def _surely_outside(center, size, row, deviation, support):
     Its extent is bounded by that of a ball whose standard deviation is the largest of the Gaussian's. Return True only
     if the distance to the image exceeds this bound by more than the rounding error of the exact test that follows.
     """
-    beside = max(0.5 - center, center - (size - 0.5)) - _ROUNDING
-    if not beside > 0:
+    distance = max(0.5 - center, center - (size - 0.5)) - _ROUNDING
+    if not distance > 0:
         return False
     largest = max(deviation[0], deviation[1], deviation[2])
     trace = (row[0] * row[0] + row[1] * row[1] + row[2] * row[2]) * largest * largest + EPS2D
-    return beside * beside * (_TO_POWER_OF_TWO * _TO_POWER_OF_TWO) > (1 + _ROUNDING) * support * trace
+    return distance * distance * (TO_POWER_OF_TWO * TO_POWER_OF_TWO) > (1 + _ROUNDING) * support * trace
 
 
 @compiled()
@@ -234,7 +231,7 @@ def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, value):
     z = pose[2, 0] * mean[0] + pose[2, 1] * mean[1] + pose[2, 2] * mean[2] + pose[2, 3]
     if z < near:
         return _NEAR, z
-    support = opacity - _LOG2_ALPHA_MIN
+    support = opacity - LOG2_ALPHA_MIN
     if support < 0:
         return _FAINT, z
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
@@ -249,8 +246,8 @@ def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, value):
     m0 = _factor_row(row0, rotation, deviation)
     m1 = _factor_row(row1, rotation, deviation)
     p, q, r, det = _covariance(m0, m1)
-    u_scale = _TO_POWER_OF_TWO * math.sqrt(r / det)
-    reach = math.sqrt(support) / _TO_POWER_OF_TWO
+    u_scale = TO_POWER_OF_TWO * math.sqrt(r / det)
+    reach = math.sqrt(support) / TO_POWER_OF_TWO
     extent_x, extent_y = reach * math.sqrt(p), reach * math.sqrt(r)
     if not math.isfinite(u + v + q / r + u_scale + extent_x + extent_y + det):
         return _INVALID, z
@@ -259,12 +256,12 @@ def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, value):
     if np.ceil(v - extent_y - 0.5) > min(np.floor(v + extent_y - 0.5), height - 1) or v + extent_y < 0.5:
         return _OUTSIDE, z
     value[0], value[1], value[2], value[3] = u, v, q / r, u_scale
-    value[4], value[5], value[6], value[7] = _TO_POWER_OF_TWO / math.sqrt(r), opacity, extent_x, extent_y
+    value[4], value[5], value[6], value[7] = TO_POWER_OF_TWO / math.sqrt(r), opacity, extent_x, extent_y
     return _VISIBLE, z
 
 
 @compiled(parallel=True)
-def _find_shapes(scales, logits, deviations, log2_opacities):
+def _compute_shapes(scales, logits, deviations, log2_opacities):
     """Compute `Shapes` from log scales [N, 3] and logits [N], as files store them."""
     for i in numba.prange(logits.size):
         for axis in range(3):
@@ -273,36 +270,36 @@ def _find_shapes(scales, logits, deviations, log2_opacities):
 
 
 @compiled(parallel=True)
-def _project_parts(
-    means, quats, deviations, opacities, pose, intrinsics, near, parts, threads, values, depths, gaussians, tallies
+def _project_chunks(
+    means, quats, deviations, opacities, pose, intrinsics, near, chunks, threads, values, depths, gaussians, tallies
 ):
-    """Project each part of the scene, and count the outcomes.
+    """Project each chunk of the scene, and count the outcomes.
 
-    Results of visible Gaussians are written contiguously from the start of each part.
+    Results of visible Gaussians are written contiguously from the start of each chunk.
     """
-    for step in numba.prange(parts.size - 1):
-        part = step % _PARTS * threads + step // _PARTS  # gives every thread parts from all over the scene
-        place = parts[part]
-        for i in range(parts[part], parts[part + 1]):
+    for step in numba.prange(chunks.size - 1):
+        chunk = step % _CHUNKS * threads + step // _CHUNKS  # gives every thread chunks from all over the scene
+        position = chunks[chunk]
+        for i in range(chunks[chunk], chunks[chunk + 1]):
             outcome, depth = _project_one(
-                means[i], quats[i], deviations[i], opacities[i], pose, intrinsics, near, values[place]
+                means[i], quats[i], deviations[i], opacities[i], pose, intrinsics, near, values[position]
             )
-            tallies[part, outcome] += 1
+            tallies[chunk, outcome] += 1
             if outcome == _VISIBLE:
-                depths[place], gaussians[place] = depth, i
-                place += 1
+                depths[position], gaussians[position] = depth, i
+                position += 1
 
 
 @compiled(parallel=True)
-def take_rows(values, places, out) -> None:
-    """Write values[places] to `out` for values [N, C], on all cores."""
-    for i in numba.prange(places.size):
+def take_rows(values, indices, out) -> None:
+    """Write values[indices] to `out` for values [N, C], on all cores."""
+    for i in numba.prange(indices.size):
         for column in range(values.shape[1]):
-            out[i, column] = values[places[i], column]
+            out[i, column] = values[indices[i], column]
 
 
 @compiled(parallel=True)
-def take_places(values, places, out) -> None:
-    """Write values[places] to `out` for values [N], on all cores."""
-    for i in numba.prange(places.size):
-        out[i] = values[places[i]]
+def take_elements(values, indices, out) -> None:
+    """Write values[indices] to `out` for values [N], on all cores."""
+    for i in numba.prange(indices.size):
+        out[i] = values[indices[i]]

@@ -91,9 +91,9 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
     )
     # If the determinant overflows, u_scale is 0, which is finite. So test the determinant too, as `projection` does.
     usable = columns.isfinite().all(0) & det.isfinite()
-    keep = torch.nonzero(usable & (opacity >= ALPHA_MIN))[:, 0]
-    keep = keep[torch.sort(centers[keep, 2], stable=True).indices]
-    return Splats(index[keep], *columns[:, keep])
+    order = torch.nonzero(usable & (opacity >= ALPHA_MIN))[:, 0]
+    order = order[torch.sort(centers[order, 2], stable=True).indices]
+    return Splats(index[order], *columns[:, order])
 
 
 class ReferenceRasterizer(Rasterizer):
@@ -164,11 +164,11 @@ class ReferenceRasterizer(Rasterizer):
             alpha = self._alpha(splats, pixels, camera, band[0])
             alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
             after = (1 - alpha).cumprod(-1)
-            going_on = after > TRANSMITTANCE_MIN
+            unfinished = after > TRANSMITTANCE_MIN
             before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
-            weights = torch.where(going_on, alpha * before, 0)
+            weights = torch.where(unfinished, alpha * before, 0)
             # transmittance only decreases, so its last value is its minimum
-            left = torch.where(going_on, after, 1).amin(-1)
+            left = torch.where(unfinished, after, 1).amin(-1)
             yield pixels, splats.gaussians, weights, left
 
     def _alpha(self, splats: Splats, pixels: Tensor, camera: Camera, first_row: int) -> Tensor:
@@ -190,8 +190,8 @@ class ReferenceRasterizer(Rasterizer):
         while len(order) > 0:
             longest = int(counts[order[0]])
             tiles, order = order.tensor_split([max(1, _BATCH_PAIRS // (longest * RASTER_TILE**2))])
-            place = torch.arange(longest)
-            listed = ranks[torch.where(place < counts[tiles, None], starts[tiles, None] + place, len(ranks) - 1)]
+            position = torch.arange(longest)
+            listed = ranks[torch.where(position < counts[tiles, None], starts[tiles, None] + position, len(ranks) - 1)]
             batch = Splats(*(getattr(splats, field)[listed] for field in Splats.__dataclass_fields__))
             at_once = max(1, _BATCH_PAIRS // (longest * len(tiles)))
             for pixels in tile_pixels(tiles, camera, band).split(at_once, dim=1):
@@ -233,8 +233,8 @@ def tile_intersections(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
     top, height = tiles(splats.y, splats.extent_y, down)
     touched = width * height
     ranks = torch.arange(len(touched)).repeat_interleave(touched)
-    place = torch.arange(len(ranks)) - (touched.cumsum(0) - touched)[ranks]
-    tile = (top[ranks] + place // width[ranks]) * across + left[ranks] + place % width[ranks]
+    offset = torch.arange(len(ranks)) - (touched.cumsum(0) - touched)[ranks]
+    tile = (top[ranks] + offset // width[ranks]) * across + left[ranks] + offset % width[ranks]
     tile, order = torch.sort(tile, stable=True)
     return ranks[order], torch.bincount(tile, minlength=across * down)
 
@@ -245,8 +245,8 @@ def tile_pixels(tiles: Tensor, camera: Camera, band: Rows) -> Tensor:
     Pixels outside the view or the band get the index one past the end.
     """
     across = -(-camera.width // RASTER_TILE)
-    place = torch.arange(RASTER_TILE**2)
-    x = (tiles % across * RASTER_TILE)[:, None] + place % RASTER_TILE
-    y = (tiles // across * RASTER_TILE)[:, None] + place // RASTER_TILE
+    offset = torch.arange(RASTER_TILE**2)
+    x = (tiles % across * RASTER_TILE)[:, None] + offset % RASTER_TILE
+    y = (tiles // across * RASTER_TILE)[:, None] + offset // RASTER_TILE
     inside = (x < camera.width) & (y >= band[0]) & (y < band[1])
     return torch.where(inside, (y - band[0]) * camera.width + x, (band[1] - band[0]) * camera.width)

@@ -17,9 +17,9 @@ import psutil
 from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled, kernel_threads
-from sgsst_core.constants import ALPHA_MIN, NEAR, RASTER_TILE
+from sgsst_core.constants import LOG2_ALPHA_MIN, NEAR, RASTER_TILE
 from sgsst_core.errors import TooManyIntersectionsError
-from sgsst_core.rasterizer.projection import Outcome, Projection, Shapes, project, take_places, take_rows
+from sgsst_core.rasterizer.projection import Outcome, Projection, Shapes, project, take_elements, take_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -27,10 +27,9 @@ from sgsst_core.scene.gaussians import Scene
 MAX_INTERSECTIONS = 2**31 - 1
 #: Bytes per pair of Gaussian and raster tile: rank, slot, and the slot's gradient in the backward pass.
 _PAIR_BYTES = 4 + 4 + 12
-#: Number of parts of the scene that each thread processes, one after the other.
-_PARTS = 4
+#: Number of chunks of the scene that each thread processes, one after the other.
+_CHUNKS = 4
 _TILE = RASTER_TILE
-_SUPPORT_BITS = -math.log2(ALPHA_MIN)
 
 
 @dataclass(frozen=True)
@@ -95,49 +94,51 @@ def build_tile_intersections(
     counts = np.empty(len(values), dtype=np.int64)
     with kernel_threads():
         threads = numba.get_num_threads()
-        parts = np.linspace(0, len(values), threads * _PARTS + 1).astype(np.int64)
-        places = np.zeros((len(parts) - 1, across * down), dtype=np.int64)
-        _count_tiles(values, *size, parts, threads, counts, places)
+        chunks = np.linspace(0, len(values), threads * _CHUNKS + 1).astype(np.int64)
+        positions = np.zeros((len(chunks) - 1, across * down), dtype=np.int64)
+        _count_tiles(values, *size, chunks, threads, counts, positions)
     first_slots = run_starts(counts)
     total = int(first_slots[-1])
     check_intersections(total, len(counts), camera)
     _check_memory(total, len(counts), camera)
-    starts = run_starts(places.sum(axis=0))
-    # First position that each part writes to in each tile: after the entries of all preceding parts.
-    places = starts[:-1] + np.cumsum(places, axis=0) - places
+    starts = run_starts(positions.sum(axis=0))
+    # First position that each chunk writes to in each tile: after the entries of all preceding chunks.
+    positions = starts[:-1] + np.cumsum(positions, axis=0) - positions
     ranks, slots = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
     with kernel_threads():
-        _fill_tiles(values, *size, parts, threads, first_slots, places, ranks, slots)
+        _fill_tiles(values, *size, chunks, threads, first_slots, positions, ranks, slots)
     return TileIntersections(projection, starts, ranks, slots, first_slots)
 
 
-def intersections_of_subset(isects: TileIntersections, places: NDArray[np.int32]) -> TileIntersections:
+def intersections_of_subset(isects: TileIntersections, indices: NDArray[np.int32]) -> TileIntersections:
     """Restrict tile intersections to a subset of the Gaussians.
 
     The arrays are the same as those of `build_tile_intersections` for the subset.
 
     Args:
         isects: Intersections of the whole scene.
-        places: [N] int32, each Gaussian's index in the subset, in unchanged order; -1 if it is not in the subset.
+        indices: [N] int32, each Gaussian's index in the subset, in unchanged order; -1 if it is not in the subset.
     """
     projection = isects.projection
     with kernel_threads():
         gaussians = np.empty(len(projection.gaussians), dtype=np.int32)
-        take_places(places, projection.gaussians, gaussians)
-        kept = gaussians >= 0
+        take_elements(indices, projection.gaussians, gaussians)
+        remains = gaussians >= 0
         # For every rank: its new rank (-1 if removed), and the number of positions by which its slots move down.
-        ranks = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
-        first_slots = run_starts(np.where(kept, np.diff(isects.first_slots), 0))
-        moves = (isects.first_slots - first_slots)[:-1]
+        ranks = np.where(remains, np.cumsum(remains, dtype=np.int32) - np.int32(1), np.int32(-1))
+        first_slots = run_starts(np.where(remains, np.diff(isects.first_slots), 0))
+        shifts = (isects.first_slots - first_slots)[:-1]
         counts = np.empty(len(isects.starts) - 1, dtype=np.int64)
-        _count_kept(isects.ranks, isects.starts, ranks, counts)
+        _count_remaining(isects.ranks, isects.starts, ranks, counts)
         starts = run_starts(counts)
-        values = np.empty((int(kept.sum()), projection.values.shape[1]))
-        take_rows(projection.values, np.flatnonzero(kept), values)
-        own_ranks, own_slots = np.empty(starts[-1], dtype=np.int32), np.empty(starts[-1], dtype=np.int32)
-        _take_kept(isects.ranks, isects.slots, isects.starts, ranks, moves, starts, own_ranks, own_slots)
-    own = Projection(gaussians[kept], values, {Outcome.VISIBLE: len(values)})
-    return TileIntersections(own, starts, own_ranks, own_slots, np.append(first_slots[:-1][kept], first_slots[-1]))
+        values = np.empty((int(remains.sum()), projection.values.shape[1]))
+        take_rows(projection.values, np.flatnonzero(remains), values)
+        subset_ranks, subset_slots = np.empty(starts[-1], dtype=np.int32), np.empty(starts[-1], dtype=np.int32)
+        _copy_remaining(isects.ranks, isects.slots, isects.starts, ranks, shifts, starts, subset_ranks, subset_slots)
+    subset = Projection(gaussians[remains], values, {Outcome.VISIBLE: len(values)})
+    return TileIntersections(
+        subset, starts, subset_ranks, subset_slots, np.append(first_slots[:-1][remains], first_slots[-1])
+    )
 
 
 def run_starts(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -190,7 +191,7 @@ def _tile_span(value, first, last, width):
     """
     top, bottom = first + 0.5 - value[1], last + 0.5 - value[1]
     widest = value[2] * value[7] * (value[7] / value[6]) if value[6] > 0 else 0.0
-    support = value[5] + _SUPPORT_BITS
+    support = value[5] - LOG2_ALPHA_MIN
     right = min(max(widest, top), bottom)
     left = min(max(-widest, top), bottom)
     half_right = math.sqrt(max(support - (right * value[4]) ** 2, 0.0)) / value[3]
@@ -203,21 +204,21 @@ def _tile_span(value, first, last, width):
 
 
 @compiled()
-def _own_part(step, threads):
-    """Return the part of the Gaussians for a step of a parallel loop.
+def _chunk_of(step, threads):
+    """Return the chunk of the Gaussians for a step of a parallel loop.
 
-    Every thread gets parts from all depths, because nearer parts take more work.
+    Every thread gets chunks from all depths, because nearer chunks take more work.
     """
-    return step % _PARTS * threads + step // _PARTS
+    return step % _CHUNKS * threads + step // _CHUNKS
 
 
 @compiled(parallel=True)
-def _count_tiles(values, width, height, parts, threads, counts, places):
-    """Count the tiles that each Gaussian intersects, and for each tile the Gaussians of each part that intersect it."""
+def _count_tiles(values, width, height, chunks, threads, counts, positions):
+    """Count the tiles that each Gaussian intersects, and the Gaussians of each chunk that intersect each tile."""
     across = (width + _TILE - 1) // _TILE
-    for step in numba.prange(parts.size - 1):
-        part = _own_part(step, threads)
-        for rank in range(parts[part], parts[part + 1]):
+    for step in numba.prange(chunks.size - 1):
+        chunk = _chunk_of(step, threads)
+        for rank in range(chunks[chunk], chunks[chunk + 1]):
             first, last = _tile_rows(values[rank], height)
             total = 0
             for down in range(first // _TILE, last // _TILE + 1):
@@ -225,34 +226,34 @@ def _count_tiles(values, width, height, parts, threads, counts, places):
                 begin, end = _tile_span(values[rank], top, bottom, width)
                 total += end - begin
                 for tile in range(down * across + begin, down * across + end):
-                    places[part, tile] += 1
+                    positions[chunk, tile] += 1
             counts[rank] = total
 
 
 @compiled(parallel=True)
-def _fill_tiles(values, width, height, parts, threads, first_slots, places, ranks, slots):
+def _fill_tiles(values, width, height, chunks, threads, first_slots, positions, ranks, slots):
     """Sort all pairs of Gaussian and tile by tile (counting sort).
 
     Gaussians are processed in depth order, so the entries of every tile are sorted by depth.
     """
     across = (width + _TILE - 1) // _TILE
-    for step in numba.prange(parts.size - 1):
-        part = _own_part(step, threads)
-        for rank in range(parts[part], parts[part + 1]):
+    for step in numba.prange(chunks.size - 1):
+        chunk = _chunk_of(step, threads)
+        for rank in range(chunks[chunk], chunks[chunk + 1]):
             first, last = _tile_rows(values[rank], height)
             slot = first_slots[rank]
             for down in range(first // _TILE, last // _TILE + 1):
                 top, bottom = max(first, down * _TILE), min(last, down * _TILE + _TILE - 1)
                 begin, end = _tile_span(values[rank], top, bottom, width)
                 for tile in range(down * across + begin, down * across + end):
-                    place = places[part, tile]
-                    ranks[place], slots[place] = rank, slot
-                    places[part, tile] = place + 1
+                    position = positions[chunk, tile]
+                    ranks[position], slots[position] = rank, slot
+                    positions[chunk, tile] = position + 1
                     slot += 1
 
 
 @compiled(parallel=True)
-def _count_kept(ranks, starts, new_ranks, counts):
+def _count_remaining(ranks, starts, new_ranks, counts):
     """Count the remaining entries of each tile."""
     for tile in numba.prange(starts.size - 1):
         total = 0
@@ -262,12 +263,12 @@ def _count_kept(ranks, starts, new_ranks, counts):
 
 
 @compiled(parallel=True)
-def _take_kept(ranks, slots, starts, new_ranks, moves, new_starts, out_ranks, out_slots):
+def _copy_remaining(ranks, slots, starts, new_ranks, shifts, new_starts, out_ranks, out_slots):
     """Copy the remaining entries of each tile with their new ranks and slots."""
     for tile in numba.prange(starts.size - 1):
-        place = new_starts[tile]
+        target = new_starts[tile]
         for position in range(starts[tile], starts[tile + 1]):
             rank = ranks[position]
             if new_ranks[rank] >= 0:
-                out_ranks[place], out_slots[place] = new_ranks[rank], slots[position] - moves[rank]
-                place += 1
+                out_ranks[target], out_slots[target] = new_ranks[rank], slots[position] - shifts[rank]
+                target += 1

@@ -10,14 +10,22 @@ of equal float32 depth keep the order of their float64 depths.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, RASTER_TILE, TRANSMITTANCE_MIN
+from sgsst_core.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    EPS2D,
+    FRUSTUM_MARGIN,
+    LOG2_ALPHA_MIN,
+    RASTER_TILE,
+    TO_POWER_OF_TWO,
+    TRANSMITTANCE_MIN,
+)
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, Rows, check_rows
 from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
@@ -25,9 +33,6 @@ from sgsst_core.rasterizer.view_cache import ViewCache
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: exp(-power) = 2^-(u^2 + w^2) if u and w are scaled by this factor, as in `projection`.
-_TO_POWER_OF_TWO = math.sqrt(0.5 * math.log2(math.e))
-_SUPPORT_BITS = -math.log2(ALPHA_MIN)
 #: Default budget for tile intersections in bytes. They take about 80 bytes per visible Gaussian and 8 bytes per pair of
 #: Gaussian and tile.
 DEFAULT_INTERSECTION_BYTES = 4 << 30
@@ -127,17 +132,17 @@ class TritonRasterizer(Rasterizer):
         interpreted = triton.knobs.runtime.interpret
         if device is None:
             device = "cpu" if interpreted and not torch.cuda.is_available() else "cuda"
-        found = torch.device(device)
-        if found.type == "cuda":
+        chosen = torch.device(device)
+        if chosen.type == "cuda":
             if not torch.cuda.is_available():
                 raise SettingsError(f"rasterizer 'triton' on device {str(device)!r}: PyTorch sees no GPU; choose 'cpu'")
-            return torch.device("cuda", torch.cuda.current_device() if found.index is None else found.index)
-        if found.type == "cpu" and not interpreted:
+            return torch.device("cuda", torch.cuda.current_device() if chosen.index is None else chosen.index)
+        if chosen.type == "cpu" and not interpreted:
             raise SettingsError(
                 "rasterizer 'triton' runs on the CPU in Triton's interpreter only: set TRITON_INTERPRET=1 before the "
                 "program starts, or choose 'cpu' or 'cached'."
             )
-        return found
+        return chosen
 
     def beside(self, scene: Scene) -> TritonRasterizer:
         """Return a rasterizer of another scene that shares the budget for tile intersections, with lower priority."""
@@ -247,7 +252,7 @@ class TritonRasterizer(Rasterizer):
         if count:
             kernels.project[(-(-count // block),)](
                 *self._geometry, view, values, depths, counts, count,
-                EPS2D=EPS2D, MARGIN=FRUSTUM_MARGIN, SUPPORT=_SUPPORT_BITS, POWER=_TO_POWER_OF_TWO, BLOCK=block,
+                EPS2D=EPS2D, MARGIN=FRUSTUM_MARGIN, SUPPORT=-LOG2_ALPHA_MIN, POWER=TO_POWER_OF_TWO, BLOCK=block,
             )  # fmt: skip
         ordered, order = torch.sort(depths, stable=True)
         first_slots = torch.zeros(count + 1, dtype=torch.int64, device=self.device)
@@ -259,7 +264,7 @@ class TritonRasterizer(Rasterizer):
         ranks = torch.empty(total, dtype=torch.int32, device=self.device)
         if visible:
             kernels.list_tiles[(-(-visible // block),)](
-                order, values, first_slots, view, tiles, ranks, visible, SUPPORT=_SUPPORT_BITS, BLOCK=block
+                order, values, first_slots, view, tiles, ranks, visible, SUPPORT=-LOG2_ALPHA_MIN, BLOCK=block
             )
         tiles, slots = torch.sort(tiles, stable=True)
         across, down = tile_grid(camera)

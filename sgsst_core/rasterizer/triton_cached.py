@@ -99,7 +99,7 @@ class WeightPieces:
         self.piece_slots = empty(counted.pieces, dtype=index_type)
         self.weights = empty(counted.pieces * kernels.PIECE.value, dtype=_DTYPES[precision])
         self.transmittance = empty(self.band[1] - self.band[0], self.camera.width, dtype=torch.float32)
-        kernels.keep_pieces[(counted.tiles,)](
+        kernels.store_pieces[(counted.tiles,)](
             isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
             slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights, self.transmittance,
             self.camera.width, *self.band, counted.across,
@@ -109,11 +109,11 @@ class WeightPieces:
     @property
     def nbytes(self) -> int:
         """Size of the weights on the device in bytes."""
-        kept = (
+        tensors = (
             *(self.block_starts, self.piece_gaussians, self.piece_slots, self.weights),
             *(self.first_slots, self.gaussians, self.transmittance),
         )
-        return sum(tensor.nbytes for tensor in kept)
+        return sum(tensor.nbytes for tensor in tensors)
 
     def render(self, colors: Tensor) -> Tensor:
         """Return the image [h, width, 3] of colors [N, 3] over the background."""
@@ -122,7 +122,7 @@ class WeightPieces:
         image = torch.empty((*self.transmittance.shape, 3), device=colors.device)
         kernels.apply_pieces[self._grid()](
             self.block_starts, self.piece_gaussians, self.weights, colors, self._rasterizer.background,
-            self.transmittance, image, *self._place(),
+            self.transmittance, image, *self._band_arguments(),
             SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
         )  # fmt: skip
         return image
@@ -136,7 +136,7 @@ class WeightPieces:
             return gradient
         slots = torch.empty((len(self.piece_slots), 3), device=image_gradient.device)
         kernels.piece_gradients[self._grid()](
-            self.block_starts, self.piece_slots, self.weights, image_gradient, slots, *self._place(),
+            self.block_starts, self.piece_slots, self.weights, image_gradient, slots, *self._band_arguments(),
             SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
         )  # fmt: skip
         add_slots_(gradient, slots, self.first_slots, self.gaussians)
@@ -146,7 +146,7 @@ class WeightPieces:
         """Return the launch grid: one program per block."""
         return (len(self.block_starts) - 1,)
 
-    def _place(self) -> tuple[int, int, int, int]:
+    def _band_arguments(self) -> tuple[int, int, int, int]:
         """Return the kernel arguments that describe the band."""
         return self.camera.width, *self.band, tiles_of(self.camera, self.band)[0]
 

@@ -6,7 +6,7 @@ needs, as one stream, and accumulates in registers. Blocks of 4 x 4 have the lea
 trained scenes, larger blocks take up to a third more memory, and smaller blocks do not take less.
 
 Weights are those of `triton_kernels.blend_weights`. They are computed twice, by two kernels whose rounding may differ
-after compilation. Therefore only `count_pieces` decides which blocks have a weight, and `keep_pieces` uses its masks.
+after compilation. Therefore only `count_pieces` decides which blocks have a weight, and `store_pieces` uses its masks.
 In float16, weights are multiplied by `HALF_SCALE`, which makes even the smallest weight (4e-7) a normal number, with a
 relative error of at most 2^-11.
 
@@ -83,12 +83,12 @@ def count_pieces(
     going = tl.max(left, 0)
     while (k < end) & (going > 0):
         weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
-        found = (tl.max(_by_block(weights, K), 2) > 0).to(tl.int32)  # [K, 16]
+        present = (tl.max(_by_block(weights, K), 2) > 0).to(tl.int32)  # [K, 16]
         j = k + tl.arange(0, K)
         there = j < end
-        tl.store(masks + j, tl.sum(found << block[None, :], 1), mask=there)
-        tl.store(slot_pieces + tl.load(slots + j, mask=there, other=0), tl.sum(found, 1), mask=there)
-        pieces += tl.sum(found, 0)
+        tl.store(masks + j, tl.sum(present << block[None, :], 1), mask=there)
+        tl.store(slot_pieces + tl.load(slots + j, mask=there, other=0), tl.sum(present, 1), mask=there)
+        pieces += tl.sum(present, 0)
         going = tl.max(left, 0)
         k += K
     tl.store(block_pieces + tl.program_id(0) * BLOCKS + block, pieces)
@@ -96,7 +96,7 @@ def count_pieces(
 
 
 @triton.jit
-def keep_pieces(
+def store_pieces(
     ranks, slots, starts, values, gaussians, masks, ends, slot_starts, block_starts, piece_gaussians, piece_slots,
     weights, transmittances, width, first_row, last_row, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr, SCALE: tl.constexpr,
@@ -111,7 +111,7 @@ def keep_pieces(
         weights: Output [16 P] float32, or float16 multiplied by SCALE.
     """
     tile = first_row // _TILE * across + tl.program_id(0)
-    x0, y0, inside, place = _tile_pixels(tile, width, first_row, last_row, across)
+    x0, y0, inside, pixel = _tile_pixels(tile, width, first_row, last_row, across)
     block = tl.arange(0, BLOCKS)
     left = tl.where(inside, 1.0, 0.0)
     piece = tl.load(block_starts + tl.program_id(0) * BLOCKS + block).to(tl.int64)
@@ -120,20 +120,20 @@ def keep_pieces(
         blended, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
         j = k + tl.arange(0, K)
         there = j < end
-        found = (tl.load(masks + j, mask=there, other=0)[:, None] >> block[None, :]) & 1  # [K, 16]
-        kept = found > 0
-        target = piece[None, :] + tl.cumsum(found, 0) - found
+        present = (tl.load(masks + j, mask=there, other=0)[:, None] >> block[None, :]) & 1  # [K, 16]
+        has_piece = present > 0
+        target = piece[None, :] + tl.cumsum(present, 0) - present
         gaussian = tl.load(gaussians + tl.load(ranks + j, mask=there, other=0), mask=there, other=0)
         first_slot = tl.load(slot_starts + tl.load(slots + j, mask=there, other=0), mask=there, other=0)
-        slot = first_slot[:, None] + tl.cumsum(found, 1) - found
-        tl.store(piece_gaussians + target, tl.broadcast_to(gaussian[:, None], [K, BLOCKS]).to(tl.int32), mask=kept)
-        tl.store(piece_slots + target, slot.to(piece_slots.dtype.element_ty), mask=kept)
+        slot = first_slot[:, None] + tl.cumsum(present, 1) - present
+        tl.store(piece_gaussians + target, tl.broadcast_to(gaussian[:, None], [K, BLOCKS]).to(tl.int32), mask=has_piece)
+        tl.store(piece_slots + target, slot.to(piece_slots.dtype.element_ty), mask=has_piece)
         cells = weights + PIECE * target[:, :, None] + tl.arange(0, PIECE)[None, None, :]
         scaled = (_by_block(blended, K) * SCALE).to(weights.dtype.element_ty)
-        tl.store(cells, scaled, mask=tl.broadcast_to(kept[:, :, None], [K, BLOCKS, PIECE]))
-        piece += tl.sum(found, 0)
+        tl.store(cells, scaled, mask=tl.broadcast_to(has_piece[:, :, None], [K, BLOCKS, PIECE]))
+        piece += tl.sum(present, 0)
         k += K
-    tl.store(transmittances + place, tl.abs(left), mask=inside)
+    tl.store(transmittances + pixel, tl.abs(left), mask=inside)
 
 
 @triton.jit
@@ -151,7 +151,7 @@ def apply_pieces(
     SCALE: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
     """Render the image [h, width, 3] from cached weights; one program per block."""
-    inside, place = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
+    inside, pixel = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
     k, end = tl.load(block_starts + tl.program_id(0)), tl.load(block_starts + tl.program_id(0) + 1)
     red, green, blue = (
         tl.zeros([P, PIECE], tl.float32),
@@ -159,16 +159,16 @@ def apply_pieces(
         tl.zeros([P, PIECE], tl.float32),
     )
     while k < end:
-        kept, j, there = _load_pieces(weights, k, end, P)
+        piece_weights, j, there = _load_pieces(weights, k, end, P)
         color = colors + 3 * tl.load(gaussians + j, mask=there, other=0).to(tl.int64)
-        red += kept * tl.load(color, mask=there, other=0.0)[:, None]
-        green += kept * tl.load(color + 1, mask=there, other=0.0)[:, None]
-        blue += kept * tl.load(color + 2, mask=there, other=0.0)[:, None]
+        red += piece_weights * tl.load(color, mask=there, other=0.0)[:, None]
+        green += piece_weights * tl.load(color + 1, mask=there, other=0.0)[:, None]
+        blue += piece_weights * tl.load(color + 2, mask=there, other=0.0)[:, None]
         k += P
-    left = tl.load(transmittances + place, mask=inside, other=0.0)
-    tl.store(image + 3 * place, tl.sum(red, 0) * (1.0 / SCALE) + left * tl.load(background), mask=inside)
-    tl.store(image + 3 * place + 1, tl.sum(green, 0) * (1.0 / SCALE) + left * tl.load(background + 1), mask=inside)
-    tl.store(image + 3 * place + 2, tl.sum(blue, 0) * (1.0 / SCALE) + left * tl.load(background + 2), mask=inside)
+    left = tl.load(transmittances + pixel, mask=inside, other=0.0)
+    tl.store(image + 3 * pixel, tl.sum(red, 0) * (1.0 / SCALE) + left * tl.load(background), mask=inside)
+    tl.store(image + 3 * pixel + 1, tl.sum(green, 0) * (1.0 / SCALE) + left * tl.load(background + 1), mask=inside)
+    tl.store(image + 3 * pixel + 2, tl.sum(blue, 0) * (1.0 / SCALE) + left * tl.load(background + 2), mask=inside)
 
 
 @triton.jit
@@ -177,15 +177,15 @@ def piece_gradients(
     SCALE: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
     """Write dL/dcolor of every piece to its slot [P, 3]; one program per block."""
-    inside, place = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
-    red = tl.load(image_gradient + 3 * place, mask=inside, other=0.0)
-    green = tl.load(image_gradient + 3 * place + 1, mask=inside, other=0.0)
-    blue = tl.load(image_gradient + 3 * place + 2, mask=inside, other=0.0)
+    inside, pixel = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
+    red = tl.load(image_gradient + 3 * pixel, mask=inside, other=0.0)
+    green = tl.load(image_gradient + 3 * pixel + 1, mask=inside, other=0.0)
+    blue = tl.load(image_gradient + 3 * pixel + 2, mask=inside, other=0.0)
     k, end = tl.load(block_starts + tl.program_id(0)), tl.load(block_starts + tl.program_id(0) + 1)
     while k < end:
-        kept, j, there = _load_pieces(weights, k, end, P)
+        piece_weights, j, there = _load_pieces(weights, k, end, P)
         slot = out + 3 * tl.load(slots + j, mask=there, other=0).to(tl.int64)
-        tl.store(slot, tl.sum(kept * red[None, :], 1) * (1.0 / SCALE), mask=there)
-        tl.store(slot + 1, tl.sum(kept * green[None, :], 1) * (1.0 / SCALE), mask=there)
-        tl.store(slot + 2, tl.sum(kept * blue[None, :], 1) * (1.0 / SCALE), mask=there)
+        tl.store(slot, tl.sum(piece_weights * red[None, :], 1) * (1.0 / SCALE), mask=there)
+        tl.store(slot + 1, tl.sum(piece_weights * green[None, :], 1) * (1.0 / SCALE), mask=there)
+        tl.store(slot + 2, tl.sum(piece_weights * blue[None, :], 1) * (1.0 / SCALE), mask=there)
         k += P

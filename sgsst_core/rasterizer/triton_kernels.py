@@ -212,14 +212,14 @@ def list_tiles(
     while step < rows:
         down = first // _TILE + step
         begin, end = _span_of_row(down, first, last, x, y, skew, u_scale, w_scale, support, extent_x, extent_y, width)
-        place = tl.zeros([], tl.int32)
+        column = tl.zeros([], tl.int32)
         widest = tl.max(end - begin, 0)
-        while place < widest:
-            own = begin + place < end
-            tl.store(tiles + slot, down * across + begin + place, mask=own)
-            tl.store(ranks + slot, rank, mask=own)
-            slot += own.to(tl.int64)
-            place += 1
+        while column < widest:
+            valid = begin + column < end
+            tl.store(tiles + slot, down * across + begin + column, mask=valid)
+            tl.store(ranks + slot, rank, mask=valid)
+            slot += valid.to(tl.int64)
+            column += 1
         step += 1
 
 
@@ -290,11 +290,11 @@ def render(
         going = tl.max(left, 0)
         k += K
     left = tl.abs(left)
-    place = (y - first_row).to(tl.int64) * width + x
-    tl.store(image + 3 * place, red + left * tl.load(background), mask=inside)
-    tl.store(image + 3 * place + 1, green + left * tl.load(background + 1), mask=inside)
-    tl.store(image + 3 * place + 2, blue + left * tl.load(background + 2), mask=inside)
-    tl.store(transmittances + place, left, mask=inside)
+    pixel = (y - first_row).to(tl.int64) * width + x
+    tl.store(image + 3 * pixel, red + left * tl.load(background), mask=inside)
+    tl.store(image + 3 * pixel + 1, green + left * tl.load(background + 1), mask=inside)
+    tl.store(image + 3 * pixel + 2, blue + left * tl.load(background + 2), mask=inside)
+    tl.store(transmittances + pixel, left, mask=inside)
 
 
 @triton.jit
@@ -305,10 +305,10 @@ def slot_gradients(
     """Write dL/dcolor of every (Gaussian, tile) pair to its slot [E, 3], which must be zero on entry."""
     tile = first_row // _TILE * across + tl.program_id(0)
     x0, y0, x, y, inside = tile_pixels(tile, across, width, first_row, last_row)
-    place = (y - first_row).to(tl.int64) * width + x
-    red = tl.load(image_gradient + 3 * place, mask=inside, other=0.0)
-    green = tl.load(image_gradient + 3 * place + 1, mask=inside, other=0.0)
-    blue = tl.load(image_gradient + 3 * place + 2, mask=inside, other=0.0)
+    pixel = (y - first_row).to(tl.int64) * width + x
+    red = tl.load(image_gradient + 3 * pixel, mask=inside, other=0.0)
+    green = tl.load(image_gradient + 3 * pixel + 1, mask=inside, other=0.0)
+    blue = tl.load(image_gradient + 3 * pixel + 2, mask=inside, other=0.0)
     left = tl.where(inside, 1.0, 0.0)
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     going = tl.max(left, 0)
@@ -338,10 +338,10 @@ def add_slots(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, 
     blue = tl.zeros([BLOCK, SLOTS], tl.float64)
     while tl.max(end - slot, 0) > 0:
         j = slot[:, None] + tl.arange(0, SLOTS)[None, :]
-        own = j < end[:, None]
-        red += tl.load(slots + 3 * j, mask=own, other=0.0).to(tl.float64)
-        green += tl.load(slots + 3 * j + 1, mask=own, other=0.0).to(tl.float64)
-        blue += tl.load(slots + 3 * j + 2, mask=own, other=0.0).to(tl.float64)
+        valid = j < end[:, None]
+        red += tl.load(slots + 3 * j, mask=valid, other=0.0).to(tl.float64)
+        green += tl.load(slots + 3 * j + 1, mask=valid, other=0.0).to(tl.float64)
+        blue += tl.load(slots + 3 * j + 2, mask=valid, other=0.0).to(tl.float64)
         slot += SLOTS
     row = out + 3 * tl.load(gaussians + rank, mask=there, other=0).to(tl.int64)
     tl.store(row, tl.sum(red, 1).to(tl.float32), mask=there)

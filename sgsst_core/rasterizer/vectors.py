@@ -11,7 +11,6 @@ bounds are not checked.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -22,7 +21,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from sgsst_core.constants import ALPHA_MIN, RASTER_TILE, TRANSMITTANCE_MIN
+from sgsst_core.constants import LOG2_ALPHA_MIN, RASTER_TILE, TRANSMITTANCE_MIN
 
 LANES = 8
 #: Rows of a block of cached weights: 4 rows and 3 channels are 12 vectors of sums, which fit in registers.
@@ -94,11 +93,11 @@ def _is_weights(array: Any) -> bool:
     return isinstance(array, types.Array) and array.layout == "C" and array.dtype in (types.float32, types.uint16)
 
 
-def as_float(kept: NDArray[Any]) -> NDArray[np.float32]:
-    """Convert weights stored by `keep_vector` (float32, or half-precision bits in uint16) to float32 in NumPy."""
-    if kept.dtype == np.float32:
-        return kept
-    return (kept.astype(np.uint32) << HALF_SHIFT).view(np.float32) * np.float32(2.0 ** (HALF_BIAS - HALF_EXPONENT))
+def as_float(weights: NDArray[Any]) -> NDArray[np.float32]:
+    """Convert weights stored by `store_vector` (float32, or half-precision bits in uint16) to float32 in NumPy."""
+    if weights.dtype == np.float32:
+        return weights
+    return (weights.astype(np.uint32) << HALF_SHIFT).view(np.float32) * np.float32(2.0 ** (HALF_BIAS - HALF_EXPONENT))
 
 
 @intrinsic
@@ -117,24 +116,25 @@ def blend_row(typingctx, block, row, u, u_scale, log2_alpha, alpha_max):
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         block_, row_, *numbers = args
         start, scale, log2_alpha_, alpha_max_ = (_splat(builder, n, _ROW) for n in numbers)
-        held = _data(context, builder, sig.args[0], block_, builder.mul(row_, _number(RASTER_TILE)))
-        kept = builder.gep(held, [_number(RASTER_TILE**2)])
+        transmittances = _data(context, builder, sig.args[0], block_, builder.mul(row_, _number(RASTER_TILE)))
+        output = builder.gep(transmittances, [_number(RASTER_TILE**2)])
 
         offset = builder.fadd(start, builder.fmul(scale, _row(range(RASTER_TILE)), flags=_FUSED), flags=_FUSED)
         power = builder.fsub(log2_alpha_, builder.fmul(offset, offset, flags=_FUSED), flags=_FUSED)
         alpha = _exp2(builder, power)
         alpha = builder.select(builder.fcmp_ordered("<", alpha, alpha_max_), alpha, alpha_max_)
-        seen = builder.fcmp_ordered(">=", power, _row([math.log2(ALPHA_MIN)]))
+        seen = builder.fcmp_ordered(">=", power, _row([LOG2_ALPHA_MIN]))
         alpha = builder.select(seen, alpha, _row([0.0]))  # also discards invalid results of `_exp2` for low powers
 
-        before = _load(builder, held, _ROW)
+        before = _load(builder, transmittances, _ROW)
         after = builder.fmul(before, builder.fsub(_row([1.0]), alpha))
         passes = builder.fcmp_ordered(">", after, _row([TRANSMITTANCE_MIN]))
         sign = ir.Constant(_ROW_BITS, [-(2**31)] * RASTER_TILE)
         finished = builder.bitcast(builder.or_(builder.bitcast(before, _ROW_BITS), sign), _ROW)
         weights = builder.select(passes, builder.fmul(alpha, before), _row([0.0]))
-        builder.store(weights, builder.bitcast(kept, _ROW.as_pointer()), align=4)
-        builder.store(builder.select(passes, after, finished), builder.bitcast(held, _ROW.as_pointer()), align=4)
+        builder.store(weights, builder.bitcast(output, _ROW.as_pointer()), align=4)
+        left = builder.select(passes, after, finished)
+        builder.store(left, builder.bitcast(transmittances, _ROW.as_pointer()), align=4)
         some = builder.bitcast(passes, ir.IntType(RASTER_TILE))
         return builder.zext(builder.icmp_unsigned("!=", some, some.type(0)), ir.IntType(64))
 
@@ -157,13 +157,13 @@ def _exp2(builder: Any, power: Any) -> Any:
     series = _row([_EXP2_SERIES[-1]])
     for coefficient in _EXP2_SERIES[-2::-1]:
         series = builder.fadd(builder.fmul(series, rest, flags=_FUSED), _row([coefficient]), flags=_FUSED)
-    whole = builder.add(builder.bitcast(rounded, _ROW_BITS), ir.Constant(_ROW_BITS, [127] * RASTER_TILE))
-    exponent = builder.shl(whole, ir.Constant(_ROW_BITS, [23] * RASTER_TILE))
+    biased = builder.add(builder.bitcast(rounded, _ROW_BITS), ir.Constant(_ROW_BITS, [127] * RASTER_TILE))
+    exponent = builder.shl(biased, ir.Constant(_ROW_BITS, [23] * RASTER_TILE))
     return builder.fmul(series, builder.bitcast(exponent, _ROW))
 
 
 @intrinsic
-def keep_vector(typingctx, source, begin, weights, target):
+def store_vector(typingctx, source, begin, weights, target):
     """Store weights[target + i] = source[begin + i] for 8 floats, rounded to nearest even in half precision."""
     if not _is_weights(weights):
         return None
@@ -177,14 +177,14 @@ def keep_vector(typingctx, source, begin, weights, target):
         if sig.args[2].dtype == types.uint16:
             wide = ir.VectorType(ir.IntType(32), LANES)
 
-            def every(number: int) -> Any:
+            def constant(number: int) -> Any:
                 return ir.Constant(wide, [number] * LANES)
 
             scale = ir.Constant(_VECTOR, [2.0 ** (HALF_EXPONENT - HALF_BIAS)] * LANES)
             bits = builder.bitcast(builder.fmul(values, scale), wide)
-            odd = builder.and_(builder.lshr(bits, every(HALF_SHIFT)), every(1))
-            bits = builder.add(bits, builder.add(odd, every((1 << (HALF_SHIFT - 1)) - 1)))
-            values = builder.trunc(builder.lshr(bits, every(HALF_SHIFT)), ir.VectorType(ir.IntType(16), LANES))
+            odd = builder.and_(builder.lshr(bits, constant(HALF_SHIFT)), constant(1))
+            bits = builder.add(bits, builder.add(odd, constant((1 << (HALF_SHIFT - 1)) - 1)))
+            values = builder.trunc(builder.lshr(bits, constant(HALF_SHIFT)), ir.VectorType(ir.IntType(16), LANES))
             align = 2
         builder.store(values, builder.bitcast(pointer, values.type.as_pointer()), align=align)
         return context.get_dummy_value()
@@ -209,11 +209,11 @@ def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, b
         target = _data(context, builder, sig.args[3], pixels_, builder.mul(offset_, _number(_CHANNELS * LANES)))
         colors = [_splat(builder, c) for c in color]
         with cgutils.for_range(builder, vectors_) as loop:
-            place = builder.mul(loop.index, _number(LANES))
-            w = _load_weights(builder, sig.args[0], builder.gep(source, [place]))
-            place = builder.mul(place, _number(_CHANNELS))
+            position = builder.mul(loop.index, _number(LANES))
+            w = _load_weights(builder, sig.args[0], builder.gep(source, [position]))
+            position = builder.mul(position, _number(_CHANNELS))
             for channel, c in enumerate(colors):
-                pointer = builder.gep(target, [builder.add(place, _number(channel * LANES))])
+                pointer = builder.gep(target, [builder.add(position, _number(channel * LANES))])
                 total = builder.fadd(_load(builder, pointer), builder.fmul(w, c, flags=_FUSED), flags=_FUSED)
                 builder.store(total, builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
         return context.get_dummy_value()
@@ -241,11 +241,11 @@ def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
         for total in sums:
             builder.store(zero, total)
         with cgutils.for_range(builder, vectors_) as loop:
-            place = builder.mul(loop.index, _number(LANES))
-            w = _load_weights(builder, sig.args[0], builder.gep(source, [place]))
-            place = builder.mul(place, _number(_CHANNELS))
+            position = builder.mul(loop.index, _number(LANES))
+            w = _load_weights(builder, sig.args[0], builder.gep(source, [position]))
+            position = builder.mul(position, _number(_CHANNELS))
             for channel, total in enumerate(sums):
-                pointer = builder.gep(other, [builder.add(place, _number(channel * LANES))])
+                pointer = builder.gep(other, [builder.add(position, _number(channel * LANES))])
                 product = builder.fmul(w, _load(builder, pointer), flags=_FUSED)
                 builder.store(builder.fadd(builder.load(total), product, flags=_FUSED), total)
         return context.make_tuple(builder, sig.return_type, [_lane_sum(builder, builder.load(s)) for s in sums])
@@ -277,7 +277,7 @@ def sum_weights(typingctx, weights, begin, vectors):
 
 
 @intrinsic
-def prefetch(typingctx, values, place):
+def prefetch(typingctx, values, index):
     """Prefetch the cache line of an element of the flat array `values`. This is only a hint and cannot fail."""
     if not isinstance(values, types.Array) or values.layout != "C":
         return None
@@ -312,13 +312,11 @@ def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         weights_, items_, first_, count_, colors_, pixels_, offset_ = args
         target = _data(context, builder, sig.args[5], pixels_, builder.mul(offset_, _number(_CHANNELS * LANES)))
-        places = [(row, c) for row in range(BLOCK_ROWS) for c in range(_CHANNELS)]
-        pointers = {
-            place: builder.gep(target, [_number((place[0] * _CHANNELS + place[1]) * LANES)]) for place in places
-        }
-        sums = {place: cgutils.alloca_once(builder, _VECTOR) for place in places}
-        for place in places:
-            builder.store(_load(builder, pointers[place]), sums[place])
+        cells = [(row, c) for row in range(BLOCK_ROWS) for c in range(_CHANNELS)]
+        pointers = {cell: builder.gep(target, [_number((cell[0] * _CHANNELS + cell[1]) * LANES)]) for cell in cells}
+        sums = {cell: cgutils.alloca_once(builder, _VECTOR) for cell in cells}
+        for cell in cells:
+            builder.store(_load(builder, pointers[cell]), sums[cell])
         with cgutils.for_range(builder, count_) as loop:
             piece = builder.add(first_, loop.index)
             item = builder.zext(builder.load(_data(context, builder, sig.args[1], items_, piece)), ir.IntType(64))
@@ -330,8 +328,8 @@ def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
                 for c in range(_CHANNELS):
                     product = builder.fmul(w, channels[c], flags=_FUSED)
                     builder.store(builder.fadd(builder.load(sums[row, c]), product, flags=_FUSED), sums[row, c])
-        for place in places:
-            builder.store(builder.load(sums[place]), builder.bitcast(pointers[place], _VECTOR.as_pointer()), align=4)
+        for cell in cells:
+            builder.store(builder.load(sums[cell]), builder.bitcast(pointers[cell], _VECTOR.as_pointer()), align=4)
         return context.get_dummy_value()
 
     return signature, generate
@@ -357,12 +355,12 @@ def dot_pieces(typingctx, weights, items, first, count, pixels, offset, sums):
             target = _data(context, builder, sig.args[6], sums_, builder.mul(item, _number(_CHANNELS * LANES)))
             source = _data(context, builder, sig.args[0], weights_, builder.mul(piece, _number(BLOCK_ROWS * LANES)))
             rows = [builder.gep(source, [_number(row * LANES)]) for row in range(BLOCK_ROWS)]
-            kept = [_load_weights(builder, sig.args[0], row) for row in rows]
+            weights_of_rows = [_load_weights(builder, sig.args[0], row) for row in rows]
             for c in range(_CHANNELS):
                 pointer = builder.gep(target, [_number(c * LANES)])
                 total = _load(builder, pointer)
                 for row in range(BLOCK_ROWS):
-                    product = builder.fmul(kept[row], factors[row * _CHANNELS + c], flags=_FUSED)
+                    product = builder.fmul(weights_of_rows[row], factors[row * _CHANNELS + c], flags=_FUSED)
                     total = builder.fadd(total, product, flags=_FUSED)
                 builder.store(total, builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
         return context.get_dummy_value()

@@ -31,10 +31,10 @@ class ViewCache(Generic[L]):
 
     Args:
         build: Function that computes the data of a view.
-        max_bytes: Memory budget in bytes, including the data that remain in `before`.
-        before: Earlier cache. At the first use of a view, its data are moved from `before` instead of being built. Data
-            that remain in `before` count toward the budget.
-        adapt: Function applied to data from `before`; must not make them larger.
+        max_bytes: Memory budget in bytes, including the data that remain in `previous`.
+        previous: Earlier cache. At the first use of a view, its data are moved from there instead of being built. Data
+            that remain there count toward the budget.
+        adapt: Function applied to data from `previous`; must not make them larger.
         host: Cache whose budget is shared, instead of using `max_bytes`. The host has priority: it removes entries from
             this cache if it needs the space.
     """
@@ -43,13 +43,13 @@ class ViewCache(Generic[L]):
         self,
         build: Callable[[Camera], L],
         max_bytes: int,
-        before: ViewCache[L] | None = None,
+        previous: ViewCache[L] | None = None,
         adapt: Callable[[L], L] = lambda data: data,
         host: ViewCache[Any] | None = None,
     ) -> None:
         self._build = build
         self._max_bytes = max_bytes
-        self._before = before
+        self._previous = previous
         self._adapt = adapt
         self._host = host
         self._guests: WeakSet[ViewCache[Any]] = WeakSet()
@@ -62,8 +62,8 @@ class ViewCache(Generic[L]):
 
     @property
     def cached_bytes(self) -> int:
-        """Size in bytes of the data within the budget, including those in `before`."""
-        return self._cached_bytes + (self._before.cached_bytes if self._before else 0)
+        """Size in bytes of the data within the budget, including those in `previous`."""
+        return self._cached_bytes + (self._previous.cached_bytes if self._previous else 0)
 
     def of(self, camera: Camera) -> L:
         """Return the data of a view, cached or newly built. Exceptions of `build` propagate."""
@@ -74,12 +74,12 @@ class ViewCache(Generic[L]):
             if self._latest is not None and self._latest[0] == key:
                 return self._latest[1]
             self._latest = None  # free its memory before the next one is built
-            given = self._before.take(camera) if self._before else None
-            data = self._build(camera) if given is None else self._adapt(given)
-            if self.cached_bytes + data.nbytes <= self._bound():
+            moved = self._previous.take(camera) if self._previous else None
+            data = self._build(camera) if moved is None else self._adapt(moved)
+            if self.cached_bytes + data.nbytes <= self._budget():
                 self._cached[key] = data
                 self._cached_bytes += data.nbytes
-                self._make_room()
+                self._evict_guests()
             else:
                 self._latest = (key, data)
             return data
@@ -87,7 +87,7 @@ class ViewCache(Generic[L]):
     def holds(self, camera: Camera) -> bool:
         """Return whether the data of a view are cached, so they need not be built."""
         key = camera_key(camera)
-        return key in self._cached or (self._before is not None and self._before.holds(camera))
+        return key in self._cached or (self._previous is not None and self._previous.holds(camera))
 
     def take(self, camera: Camera) -> L | None:
         """Remove the data of a view from the cache and return them; None if they are not cached.
@@ -103,22 +103,22 @@ class ViewCache(Generic[L]):
             if data is not None:
                 self._cached_bytes -= data.nbytes
                 return data
-            return self._before.take(camera) if self._before else None
+            return self._previous.take(camera) if self._previous else None
 
     def limit(self, max_bytes: int) -> None:
         """Set the memory budget, and evict the most recent entries until the rest fits."""
         with self._lock:
             self._max_bytes = max_bytes
-            self._let_go(max_bytes)
-            self._make_room()
+            self._evict(max_bytes)
+            self._evict_guests()
 
-    def _let_go(self, max_bytes: int) -> None:
-        if self._before is not None:
-            self._before.limit(max(max_bytes - self._cached_bytes, 0))
+    def _evict(self, max_bytes: int) -> None:
+        if self._previous is not None:
+            self._previous.limit(max(max_bytes - self._cached_bytes, 0))
         while self._cached_bytes > max_bytes:
             self._cached_bytes -= self._cached.popitem()[1].nbytes
 
-    def _bound(self) -> int:
+    def _budget(self) -> int:
         """Return the current budget in bytes.
 
         If there is a host, return the host's budget minus the data of the host and of other caches that share it.
@@ -128,8 +128,8 @@ class ViewCache(Generic[L]):
         others = sum(guest.cached_bytes for guest in self._host._guests if guest is not self)
         return self._host._max_bytes - self._host.cached_bytes - others
 
-    def _make_room(self) -> None:
+    def _evict_guests(self) -> None:
         """Remove entries of caches that share this cache's budget until they fit in the rest of it."""
         for guest in list(self._guests):
             with guest._lock:
-                guest._let_go(max(guest._bound(), 0))
+                guest._evict(max(guest._budget(), 0))

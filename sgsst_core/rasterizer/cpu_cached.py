@@ -91,7 +91,7 @@ class WeightStrips:
         self._slot_gradients = np.empty((items, 3), dtype=np.float32)
         tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values, self.gaussians)
         with kernel_threads():
-            kernels.keep_weights(*tiles, band, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
+            kernels.store_weights(*tiles, band, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
 
     def render(self, colors: Tensor) -> Tensor:
         """Return the image [h, width, 3] of colors [N, 3] over the background."""
