@@ -80,7 +80,11 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_styles(request.styles))
     scene_file, reader = read_shared_scene(
-        source.scene, collectives, drop_invalid=source.drop_invalid, growth=settings.refine
+        source.scene,
+        collectives,
+        drop_invalid=source.drop_invalid,
+        growth=settings.refine,
+        spz_axes=source.spz_axes,
     )
     together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
     found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
@@ -151,7 +155,7 @@ def read_scene_and_cameras(source: SceneRequest) -> tuple[SceneFile, list[Camera
         SceneError: If the scene cannot be used.
         CameraError: If the cameras cannot be used.
     """
-    file = read_scene(source.scene, drop_invalid=source.drop_invalid)
+    file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes)
     return file, *read_cameras_of(source, file.scene)
 
 

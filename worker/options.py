@@ -13,6 +13,7 @@ from annotated_types import Ge, Le
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from sgsst_core.constants import NEAR
+from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.options import Option, declared
 from sgsst_core.settings import (
     BY_PRESET,
@@ -56,6 +57,11 @@ class ViewOptions(BaseModel):
     resolution: Resolution = None
     near: Near = NEAR
     drop_invalid: bool = Field(False, description="Drop Gaussians with NaN or infinite values, or without a rotation.")
+    spz_axes: SpzAxes = Field(
+        "auto",
+        description="Axes of an SPZ scene: rub (y up, z backward) or rdf (y down, z forward, as in a PLY); auto: as "
+        "the file states, else rdf.",
+    )
 
 
 def _settings_to_choose() -> dict[str, Any]:

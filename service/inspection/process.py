@@ -115,7 +115,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
                 f"The scene has {declared:,} Gaussians{_refinement_note(settings)}. "
                 f"At most {limits['gaussians']:,} are allowed.",
             )
-        file = read_scene(source.scene, drop_invalid=source.drop_invalid)
+        file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes)
         check_sh_attenuation(file, settings.sh_attenuation)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _errors_of("style"):

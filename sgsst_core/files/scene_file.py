@@ -25,6 +25,7 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
 from sgsst_core.files.formats.scene_format import SceneFormat, SceneHeader
+from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.scene_columns import SceneColumns
 from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import Scene
@@ -99,7 +100,9 @@ class SceneFile:
         return 0 if self.retained is None else int(len(self.retained) - self.retained.sum())
 
 
-def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None = None) -> SceneFile:
+def read_scene(
+    path: Path, *, drop_invalid: bool = False, held_bytes: int | None = None, spz_axes: SpzAxes = "auto"
+) -> SceneFile:
     """Read a 3DGS scene of SH degree 0 to 3. The format is detected from the file's content.
 
     Scenes of other formats than PLY are decompressed into memory.
@@ -111,12 +114,15 @@ def read_scene(path: Path, *, drop_invalid: bool = False, held_bytes: int | None
             checked.
         held_bytes: Maximum bytes of SH coefficients above degree 0 in memory. If they take more, they stay in the file
             (`StoredHarmonics`), provided that its layout allows this; see `stays_in_file`. None for `HELD_BYTES`.
+        spz_axes: Axes of an SPZ file, "rub" or "rdf"; "auto" for those that the file states, else "rdf".
 
     Raises:
         SceneError: If the file cannot be read, is truncated, is not a 3DGS scene, has a wrong header, no Gaussians or
             invalid values, or has changed while it was read.
     """
     header = read_scene_header(path)
+    if isinstance(header, SpzHeader):
+        header = replace(header, axes=spz_axes)
     ply = header.ply if isinstance(header, PlySceneHeader) else None
     offset = element_offsets(path, ply).get("vertex", 0) if ply else 0
     file = RowFile(path)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneTooLargeError, SgsstError
 from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_scene, stays_in_file
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.cost import OPTIMIZER_BYTES
@@ -53,7 +54,12 @@ class _Shared:
 
 
 def read_shared_scene(
-    path: Path, collectives: Collectives, *, drop_invalid: bool = False, growth: float = 1.0
+    path: Path,
+    collectives: Collectives,
+    *,
+    drop_invalid: bool = False,
+    growth: float = 1.0,
+    spz_axes: SpzAxes = "auto",
 ) -> tuple[SceneFile, bool]:
     """Read a scene once on each machine. Every rank must call this function.
 
@@ -63,6 +69,7 @@ def read_shared_scene(
         drop_invalid: Whether to drop invalid Gaussians; see `read_scene`.
         growth: Factor by which refinement may increase the number of Gaussians. It scales the memory requirement, and
             lowers the size up to which spherical harmonics are loaded into memory.
+        spz_axes: Axes of an SPZ file; see `read_scene`.
 
     Returns:
         The scene, and whether this rank read the file itself. Exactly one rank of each machine does.
@@ -80,7 +87,7 @@ def read_shared_scene(
     shared: _Shared | None = None
     if collectives.rank == reader:
         try:
-            own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth))
+            own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
             if sharing > 1:
                 own, shared = _share(own)
         except SgsstError as raised:
@@ -96,7 +103,7 @@ def read_shared_scene(
             try:
                 own = _mapped(offer, f"/proc/{offer.process}/fd/{offer.descriptor}")
             except OSError:  # some systems hide even the user's own processes in /proc
-                own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth))
+                own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
         collectives.all_gather(None)  # barrier: the reader closes its memory file after all ranks have opened it
     finally:
         if shared is not None:

@@ -134,10 +134,13 @@ function unpackRow({ bounds, rows }, i, order, into, o) {
 
 // --- SPZ -------------------------------------------------------------------------------------------------------------
 
+/** Type of the extension record that states the axes, and maximum bytes of records. */
+const AXES_EXTENSION = 0xadbe0003, MAX_EXTENSIONS = 1 << 20;
 /**
- * Signs of the harmonics' coefficients of degree 1 to 3 under a half rotation about x: SPZ has y up and z backwards.
+ * Signs of the harmonics' coefficients of degree 1 to 3 under a half rotation about x, from axes with y up and z
+ * backward (RUB) to those of a PLY.
  */
-const TURNED = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
+const ROTATED = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
 
 /**
  * @param {ByteReader} zipped
@@ -147,25 +150,52 @@ export async function spz(zipped) {
   const reader = zipped.piped(/** @type {any} */ (new DecompressionStream("gzip")));
   const head = new DataView((await reader.take(16)).buffer), count = head.getUint32(8, true), degree = head.getUint8(12);
   if (head.getUint32(0, true) !== 0x5053474e) throw new SceneError(words.scene.notScene);
-  const version = head.getUint32(4, true), unit = 2 ** -head.getUint8(13);
+  const version = head.getUint32(4, true), unit = 2 ** -head.getUint8(13), extended = head.getUint8(14) & 2;
   if (version < 1 || version > 3) throw new SceneError(words.scene.newSpz);
   if (!count || degree > 3) throw new SceneError(words.scene.notGaussians);
   const rest = ((degree + 1) ** 2 - 1) * 3;
   /** @type {Uint8Array<ArrayBuffer>[] | null} */
-  let sections = null;
+  let sections = null, rotated = false;
   return unpacked(count, degree, async (begin, into, width, some) => {
     if (!sections) {
       sections = [];
-      for (const each of [version === 1 ? 6 : 9, 1, 3, 3, version < 3 ? 3 : 4]) sections.push(await reader.take(each * count));
+      for (const each of [version === 1 ? 6 : 9, 1, 3, 3, version < 3 ? 3 : 4, rest]) sections.push(await reader.take(each * count));
+      rotated = Boolean(extended) && statesRub(await reader.peek(MAX_EXTENSIONS));
     }
-    for (let i = 0; i < some; i++) unpackSpz(sections, begin + i, version, unit, into, i * width);
-    if (!rest) return;
-    const bytes = await reader.take(some * rest), coefficients = rest / 3;
-    for (let i = 0; i < some; i++) for (let n = 0; n < rest; n++) {
-      const coefficient = Math.floor(n / 3);
-      into[i * width + HARMONICS + (n % 3) * coefficients + coefficient] = (TURNED[coefficient] * (bytes[i * rest + n] - 128)) / 128;
+    const harmonics = sections[5], coefficients = rest / 3;
+    for (let i = 0; i < some; i++) {
+      unpackSpz(sections, begin + i, version, unit, into, i * width);
+      for (let n = 0; n < rest; n++) {
+        into[i * width + HARMONICS + (n % 3) * coefficients + Math.floor(n / 3)] = (harmonics[(begin + i) * rest + n] - 128) / 128;
+      }
+      if (rotated) rotate(into, i * width, coefficients);
     }
   });
+}
+
+/**
+ * Return whether extension records state that the axes are RUB. A record has a type, a length in bytes, and content.
+ *
+ * @param {Uint8Array} records
+ */
+function statesRub(records) {
+  const view = new DataView(records.buffer, records.byteOffset, records.length);
+  for (let o = 0; o + 12 <= records.length; o += 8 + view.getUint32(o + 4, true)) {
+    if (view.getUint32(o, true) === AXES_EXTENSION) return [0, 4].includes(view.getUint32(o + 8, true));
+  }
+  return false;
+}
+
+/**
+ * Rotate a Gaussian by 180 degrees about x.
+ *
+ * @param {Float32Array} into
+ * @param {number} o offset of its row
+ * @param {number} coefficients number of harmonics per color channel
+ */
+function rotate(into, o, coefficients) {
+  for (const value of [1, 2, ROTATION + 2, ROTATION + 3]) into[o + value] *= -1;
+  for (let n = 0; n < 3 * coefficients; n++) into[o + HARMONICS + n] *= ROTATED[n % coefficients];
 }
 
 /**
@@ -178,10 +208,10 @@ export async function spz(zipped) {
  */
 function unpackSpz([positions, opacities, colors, scales, rotations], i, version, unit, into, o) {
   for (let axis = 0; axis < 3; axis++) {
-    const sign = axis ? -1 : 1, p = 9 * i + 3 * axis;
-    into[o + axis] = sign * (version === 1
+    const p = 9 * i + 3 * axis;
+    into[o + axis] = version === 1
       ? fromHalf(positions[6 * i + 2 * axis] | (positions[6 * i + 2 * axis + 1] << 8))
-      : (((positions[p] | (positions[p + 1] << 8) | (positions[p + 2] << 16)) << 8) >> 8) * unit);
+      : (((positions[p] | (positions[p + 1] << 8) | (positions[p + 2] << 16)) << 8) >> 8) * unit;
     into[o + SCALES + axis] = scales[3 * i + axis] / 16 - 10;
     into[o + COLOR + axis] = (colors[3 * i + axis] / 255 - 0.5) / 0.15;
   }
@@ -192,8 +222,6 @@ function unpackSpz([positions, opacities, colors, scales, rotations], i, version
     const part = (/** @type {number} */ bits) => ((bits & 512 ? -1 : 1) * (bits & 511) * Math.SQRT1_2) / 511;
     setRotation(into, o + ROTATION, packed >>> 30, [20, 10, 0].map((shift) => part((packed >>> shift) & 1023)), 1);
   }
-  into[o + ROTATION + 2] *= -1;
-  into[o + ROTATION + 3] *= -1;
 }
 
 /** @param {number} half bits of a half */

@@ -6,8 +6,9 @@ bits, or of 10 bits from version 3 on. The file stores one attribute after the o
 decompression, so the decompressed data is never in memory as a whole. The layout is that of
 https://github.com/nianticlabs/spz.
 
-The axes of SPZ are x right, y up, z backward; those of a 3DGS PLY are x right, y down, z forward. Positions, rotations
-and spherical harmonics are therefore rotated by 180 degrees about x when they are read or written.
+Axes are a matter of convention. Most programs store those of the PLY (RDF: x right, y down, z forward) unchanged; the
+format's library stores RUB (x right, y up, z backward) by default. An extension of the format states them. Written
+files have the axes of the PLY, and say so. Files that state nothing are read as RDF.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import zstandard
@@ -35,6 +36,10 @@ from sgsst_core.files.formats.scene_format import (
 )
 from sgsst_core.files.formats.unsupported import advice
 
+Axes = Literal["rub", "rdf"]
+#: Requested axes; "auto" for those that the file states, else RDF.
+SpzAxes = Literal["auto", "rub", "rdf"]
+
 _MAGIC = b"NGSP"
 _GZIP_MAGIC = b"\x1f\x8b"
 #: Maximum compression ratio of deflate: 258 bytes for every two bits.
@@ -42,13 +47,19 @@ _DEFLATE_RATIO = 1032
 
 _BLOCK_ROWS = 1 << 16
 _READ_BYTES = 1 << 18
-#: Maximum bytes of extensions after the Gaussians in a gzip stream. Extensions are skipped.
+#: Maximum bytes of extensions.
 _EXTENSION_BYTES = 1 << 20
 #: Maximum window of zstd, the default limit of its command-line program.
 _WINDOW_BYTES = 1 << 27
 
-#: Sign changes of a rotation by 180 degrees about x: for positions, rotations (wxyz), and real spherical harmonics of
-#: degree 1 to 3. An SH function changes its sign if its polynomial has an odd total power of y and z.
+#: Type of the extension record that states the axes, and its numbers for them; 0 stands for the library's default.
+_AXES_EXTENSION = 0xADBE0003
+_AXES_NUMBERS: dict[int, Axes] = {0: "rub", 4: "rub", 6: "rdf"}
+_HAS_EXTENSIONS = 2
+
+#: Sign changes of a rotation by 180 degrees about x, which converts between RDF and RUB: for positions, rotations
+#: (wxyz), and real spherical harmonics of degree 1 to 3. An SH function changes its sign if its polynomial has an odd
+#: total power of y and z.
 _FLIP = np.array([1, -1, -1], np.float32)
 _FLIP_QUATS = np.array([1, 1, -1, -1], np.float32)
 _FLIP_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
@@ -91,6 +102,9 @@ class SpzHeader(SceneHeader):
             harmonics.
         streams: Streams of version 4, one per section that is not empty. Empty for other versions, which have one gzip
             stream.
+        extended: Whether extension records follow the Gaussians of version 1 to 3.
+        stated_axes: Axes that a file of version 4 states; None if it does not, and for other versions.
+        axes: Requested axes.
     """
 
     size: int
@@ -98,6 +112,9 @@ class SpzHeader(SceneHeader):
     fractional_bits: int
     sections: tuple[int, ...]
     streams: tuple[SpzSection, ...] = ()
+    extended: bool = False
+    stated_axes: Axes | None = None
+    axes: SpzAxes = "auto"
 
 
 def _read_header(start: FileStart) -> SpzHeader:
@@ -120,7 +137,8 @@ def _gzip_header(path: Path, head: bytes, size: int) -> SpzHeader:
             f"{path}: the header declares {count} Gaussians, which take {needed} bytes, more than the file's {size} "
             "compressed bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
         )
-    return SpzHeader(SPZ, count, COEFFICIENTS[degree], size, version, fractional_bits, sections)
+    extended = bool(start[14] & _HAS_EXTENSIONS)
+    return SpzHeader(SPZ, count, COEFFICIENTS[degree], size, version, fractional_bits, sections, extended=extended)
 
 
 def _zstd_header(path: Path, head: bytes, size: int) -> SpzHeader:
@@ -136,6 +154,9 @@ def _zstd_header(path: Path, head: bytes, size: int) -> SpzHeader:
             f"{len(expected)} in the {size} bytes. The file is truncated or its header is wrong. Copy it again."
         )
     with path.open("rb") as file:
+        file.seek(32)
+        records = file.read(min(table - 32, _EXTENSION_BYTES)) if head[14] & _HAS_EXTENSIONS else b""
+        axes = _stated_axes(path, records)
         file.seek(table)
         listed = list(struct.iter_unpack("<QQ", file.read(16 * number)))
     streams, position = [], table + 16 * number
@@ -148,7 +169,35 @@ def _zstd_header(path: Path, head: bytes, size: int) -> SpzHeader:
             )
         streams.append(SpzSection(position, compressed, decompressed))
         position += compressed
-    return SpzHeader(SPZ, count, COEFFICIENTS[degree], size, version, fractional_bits, sections, tuple(streams))
+    return SpzHeader(
+        SPZ,
+        count,
+        COEFFICIENTS[degree],
+        size,
+        version,
+        fractional_bits,
+        sections,
+        tuple(streams),
+        stated_axes=axes,
+    )
+
+
+def _stated_axes(path: Path, records: bytes) -> Axes | None:
+    """Return the axes that extension records state: type (uint32), length in bytes (uint32) and content of each."""
+    position = 0
+    while position + 8 <= len(records):
+        kind, length = struct.unpack_from("<II", records, position)
+        content = records[position + 8 : position + 8 + length]
+        if kind == _AXES_EXTENSION and len(content) == length >= 4:
+            number = int.from_bytes(content[:4], "little")
+            if number not in _AXES_NUMBERS:
+                raise SceneError(
+                    f"{path}: has the axes of SPZ's coordinate system {number}; RUB (4) and RDF (6) can be read. "
+                    f"{advice('scene.spz')}"
+                )
+            return _AXES_NUMBERS[number]
+        position += 8 + length
+    return None
 
 
 def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, tuple[int, ...]]:
@@ -192,10 +241,11 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> None:
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
         (into["sh_rest"], lambda data: _decode_harmonics(data, spz.coefficients)),
     ]
+    records = bytearray()
     streams = (
         _zstd_streams(path, file, spz.streams)
         if spz.streams
-        else _gzip_stream(path, file, spz.size, sum(map(bool, spz.sections)))
+        else _gzip_stream(path, file, spz.size, sum(map(bool, spz.sections)), records)
     )
     for (array, decode), size in zip(decoders, spz.sections, strict=True):
         if not size:
@@ -206,10 +256,25 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> None:
             block = array[start : start + _BLOCK_ROWS]
             block[:] = decode(np.frombuffer(take(len(block) * row_bytes), np.uint8))
     next(streams, None)  # reach the end of the last stream, where its checksum is verified
+    axes = spz.axes
+    if axes == "auto":
+        axes = spz.stated_axes or (_stated_axes(path, bytes(records)) if spz.extended else None) or "rdf"
+    if axes == "rub":
+        _rotate(into)
 
 
-def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int) -> Iterator[Take]:
-    """Yield, for each section, a function that reads its bytes from the common gzip stream."""
+def _rotate(arrays: Arrays) -> None:
+    """Rotate a scene by 180 degrees about x, in place."""
+    arrays["means"] *= _FLIP
+    arrays["quats"] *= _FLIP_QUATS
+    arrays["sh_rest"] *= _FLIP_HARMONICS[: arrays["sh_rest"].shape[1], None]
+
+
+def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int, records: bytearray) -> Iterator[Take]:
+    """Yield, for each section, a function that reads its bytes from the common gzip stream.
+
+    `records` receives the bytes after the last section, in which extensions are stored.
+    """
     inflate = zlib.decompressobj(31)
     position = 0
 
@@ -238,7 +303,8 @@ def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int) -> Itera
     take(16)
     for _ in range(sections):
         yield read_exactly
-    if len(take(_EXTENSION_BYTES)) == _EXTENSION_BYTES and not inflate.eof:
+    records += take(_EXTENSION_BYTES)
+    if len(records) == _EXTENSION_BYTES and not inflate.eof:
         raise _too_much(path)
     if not inflate.eof:
         raise _ends_early(path)
@@ -306,18 +372,18 @@ def _too_much(path: Path) -> SceneError:
 
 
 def _halves(data: NDArray[np.uint8]) -> NDArray[Any]:
-    return data.view("<f2").reshape(-1, 3).astype(np.float32) * _FLIP
+    return data.view("<f2").reshape(-1, 3).astype(np.float32)
 
 
 def _fixed_point(data: NDArray[np.uint8], fractional_bits: int) -> NDArray[Any]:
     low, middle, high = data.reshape(-1, 3).astype(np.int32).T
     values = (low | middle << 8 | high << 16) << 8 >> 8  # bit 23 is the sign
-    return np.ldexp(values.astype(np.float32), -fractional_bits).reshape(-1, 3) * _FLIP
+    return np.ldexp(values.astype(np.float32), -fractional_bits).reshape(-1, 3)
 
 
 def _first_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     xyz = _FIRST_BYTES[data].reshape(-1, 3).astype(np.float64)
-    return with_largest(np.zeros(len(xyz), np.int64), xyz) * _FLIP_QUATS
+    return with_largest(np.zeros(len(xyz), np.int64), xyz)
 
 
 def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
@@ -325,11 +391,11 @@ def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     packed = data.view("<u4")
     three = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1)
     values = np.where(three & 512, -1.0, 1.0) * (three & 511) / 511 * np.sqrt(0.5)
-    return np.roll(with_largest(packed >> 30, values), 1, axis=1) * _FLIP_QUATS
+    return np.roll(with_largest(packed >> 30, values), 1, axis=1)
 
 
 def _decode_harmonics(data: NDArray[np.uint8], coefficients: int) -> NDArray[Any]:
-    return _HARMONICS[data].reshape(-1, coefficients, 3) * _FLIP_HARMONICS[:coefficients, None]
+    return _HARMONICS[data].reshape(-1, coefficients, 3)
 
 
 def _write(output: BinaryIO, arrays: Arrays) -> None:
@@ -342,19 +408,20 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
     bits = _fractional_bits(arrays["means"])
     degree = next(degree for degree, number in COEFFICIENTS.items() if number == coefficients)
     deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
-    output.write(deflate.compress(struct.pack("<4sIIBBBB", _MAGIC, 3, count, degree, bits, 0, 0)))
+    output.write(deflate.compress(struct.pack("<4sIIBBBB", _MAGIC, 3, count, degree, bits, _HAS_EXTENSIONS, 0)))
     encoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.float64]], NDArray[Any]]]] = [
         (arrays["means"], lambda values: _encode_positions(values, bits)),
         (arrays["opacities"], opacity_bytes),
         (arrays["sh_dc"], lambda values: _to_byte(values * (0.15 * 255) + 127.5)),
         (arrays["scales"], lambda values: _to_byte((values + 10) * 16)),
         (arrays["quats"], _encode_rotations),
-        (arrays["sh_rest"], lambda values: _to_byte(values * _FLIP_HARMONICS[:coefficients, None] * 128 + 128)),
+        (arrays["sh_rest"], lambda values: _to_byte(values * 128 + 128)),
     ]
     for array, encode in encoders:
         for start in range(0, count, _BLOCK_ROWS):
             values = array[start : start + _BLOCK_ROWS].astype(np.float64)
             output.write(deflate.compress(np.ascontiguousarray(encode(values)).tobytes()))
+    output.write(deflate.compress(struct.pack("<III", _AXES_EXTENSION, 4, 6)))  # RDF
     output.write(deflate.flush())
 
 
@@ -370,12 +437,12 @@ def _fractional_bits(means: NDArray[np.float32]) -> int:
 
 
 def _encode_positions(means: NDArray[np.float64], bits: int) -> NDArray[Any]:
-    values = np.rint(np.ldexp(means * _FLIP, bits)).astype(np.int32)
+    values = np.rint(np.ldexp(means, bits)).astype(np.int32)
     return np.stack([values & 255, values >> 8 & 255, values >> 16 & 255], axis=-1).astype(np.uint8)
 
 
 def _encode_rotations(quats: NDArray[np.float64]) -> NDArray[Any]:
-    largest, three = without_largest(np.roll(quats * _FLIP_QUATS, -1, axis=1))
+    largest, three = without_largest(np.roll(quats, -1, axis=1))
     components = np.rint(np.minimum(np.abs(three) / np.sqrt(0.5), 1) * 511).astype(np.uint32)
     components |= np.where(three < 0, 512, 0).astype(np.uint32)
     packed: NDArray[np.uint32] = largest.astype(np.uint32) << np.uint32(30)

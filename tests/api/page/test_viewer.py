@@ -97,20 +97,21 @@ def splat_bytes(scene: Scene) -> bytes:
     return rows.tobytes()
 
 
+@pytest.mark.parametrize("stated", [False, True])
 @pytest.mark.parametrize("version", [1, 2])
-def test_old_spz_is_shown(visit: Visit, tmp_path: Path, version: int) -> None:
+def test_old_spz_is_shown(visit: Visit, tmp_path: Path, version: int, stated: bool) -> None:
     scene = wall()
     ply, _, _ = write_files(tmp_path, scene)
-    ply.write_bytes(old_spz(scene, version))
+    ply.write_bytes(old_spz(scene, version, stated))
     watched, camera = visit("/#/jobs"), cameras()[0]
     found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
     assert psnr(found, rendered(ply, camera)) >= FAITHFUL
     watched.check()
 
 
-def old_spz(scene: Scene, version: int) -> bytes:
-    """Encode a scene as SPZ of version 1 or 2, without spherical harmonics, with y pointing up."""
-    flip = np.array([1, -1, -1])
+def old_spz(scene: Scene, version: int, rub: bool) -> bytes:
+    """Encode a scene as SPZ of version 1 or 2, without spherical harmonics; `rub` states axes with y up, z backward."""
+    flip = np.array([1, -1, -1] if rub else [1, 1, 1])
     means = scene.means.double().numpy() * flip
     fixed = np.rint(means * 2**12).astype("<i4")
     position = (
@@ -125,8 +126,9 @@ def old_spz(scene: Scene, version: int) -> bytes:
         (vectors + 1) * 127.5,
     ]
     packed = [np.clip(np.rint(part), 0, 255).astype(np.uint8).tobytes() for part in parts]
-    head = struct.pack("<4sIIBBBB", b"NGSP", version, len(scene), 0, 12, 0, 0)
-    return gzip.compress(b"".join([head, position, *packed]))
+    head = struct.pack("<4sIIBBBB", b"NGSP", version, len(scene), 0, 12, 2 * rub, 0)
+    extension = struct.pack("<III", 0xADBE0003, 4, 4) if rub else b""
+    return gzip.compress(b"".join([head, position, *packed, extension]))
 
 
 def test_less_memory_shows_fewer_harmonics_and_says_so(visit: Visit, tmp_path: Path) -> None:

@@ -31,12 +31,12 @@ from tests.sgsst_core.files.formats.samples import (
 from tests.sgsst_core.splat_scenes import cloud
 from tests.small_scenes import wall
 
-#: Half a turn about x, from the axes of a PLY to those of SPZ.
+#: Half a turn about x, from the axes of a PLY (RDF) to RUB.
 TURN = torch.tensor([1.0, -1.0, -1.0])
 
 
 def rotated(scene: Scene) -> Scene:
-    """Return the same Gaussians in SPZ's coordinate system, with SH coefficients fitted to give the same colors."""
+    """Return the same Gaussians in the axes RUB, with SH coefficients fitted to give the same colors."""
     turn = torch.diag(TURN.double())
     directions = torch.nn.functional.normalize(
         torch.randn(200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1
@@ -54,22 +54,71 @@ def rotated(scene: Scene) -> Scene:
 
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_file_of_gsply_is_read_as_gsply_reads_it_but_for_the_axes(tmp_path: Path, degree: int, version: int) -> None:
+def test_file_of_gsply_is_read_as_gsply_reads_it(tmp_path: Path, degree: int, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=degree)), version=version)
     assert read_scene_header(path).format is SPZ
     found = read_scene(path)
     assert found.scene.sh_degree == degree
-    assert_close(rotated(found.scene), scene_of(read_spz(path)))
+    assert_close(found.scene, scene_of(read_spz(path)))
+    assert_close(rotated(read_scene(path, spz_axes="rub").scene), scene_of(read_spz(path)))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gsply_reads_what_is_written_but_for_the_axes(tmp_path: Path, degree: int) -> None:
+def test_gsply_reads_what_is_written(tmp_path: Path, degree: int) -> None:
     path = tmp_path / "scene"
     write_scene(path, cloud(700, degree=degree), SPZ)
     found = read_scene(path).scene
     assert found.sh_degree == degree
-    assert_close(rotated(found), scene_of(read_spz(path)))
+    assert_close(found, scene_of(read_spz(path)))
+
+
+def axes_record(number: int) -> bytes:
+    """Return the extension record that states the axes."""
+    return struct.pack("<III", 0xADBE0003, 4, number)
+
+
+def with_records(data: bytes, records: bytes) -> bytes:
+    """Return an SPZ file of version 3 or 4 with other extension records."""
+    if data.startswith(b"NGSP"):
+        table = int.from_bytes(data[16:20], "little")
+        head = data[:14] + b"\x02" + data[15:16] + struct.pack("<I", 32 + len(records)) + data[20:32]
+        return head + records + data[table:]
+    raw = bytearray(gzip.decompress(data))
+    raw[14] = 2
+    return gzip.compress(bytes(raw) + records)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_stated_axes_are_followed_unless_others_are_requested(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "scene"
+    write_spz(path, gsply_of(cloud(700, degree=2)), version=version)
+    plain, data = read_scene(path).scene, path.read_bytes()
+    other = struct.pack("<II", 0x12340001, 5) + bytes(5)
+    for number, rub in ((6, False), (4, True), (0, True)):
+        path.write_bytes(with_records(data, other + axes_record(number)))
+        found = read_scene(path).scene
+        assert_close(rotated(found) if rub else found, plain)
+        assert_close(read_scene(path, spz_axes="rdf").scene, plain)
+        assert_close(rotated(read_scene(path, spz_axes="rub").scene), plain)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_unknown_axes_and_broken_records(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "scene"
+    write_spz(path, gsply_of(cloud(700, degree=1)), version=version)
+    data = path.read_bytes()
+    refused(tmp_path, with_records(data, axes_record(12)), "coordinate system 12; RUB .4. and RDF .6. can be read")
+    plain = read_scene(path).scene
+    for records in (axes_record(4)[:-1], struct.pack("<II", 7, 2**32 - 1) + axes_record(4), b"\0" * 7):
+        path.write_bytes(with_records(data, records))
+        assert_close(read_scene(path).scene, plain)
+
+
+def test_written_file_states_the_axes_of_a_ply(tmp_path: Path) -> None:
+    raw = gzip.decompress(encoded(tmp_path, SPZ))
+    assert raw[14] == 2
+    assert raw.endswith(axes_record(6))
 
 
 def spz_bytes(version: int, count: int = 1, degree: int = 0, sections: bytes = b"", *, flags: int = 0) -> bytes:
@@ -81,7 +130,7 @@ def test_values_computed_by_hand(tmp_path: Path, version: int) -> None:
     position = struct.pack("<3e", 1.5, -2, 0.25)
     if version > 1:
         position = b"".join(round(value * 4096).to_bytes(3, "little", signed=True) for value in (1.5, -2, 0.25))
-    # Half a turn about an axis between x and y: w = 0.6, x = 0, y = 0.8, z = 0, and the sign of y inverted.
+    # Half a turn about an axis between x and y: w = 0.6, x = 0, y = 0.8, z = 0, as RUB: the sign of y inverted.
     rotation = bytes([128, 26, 128])
     if version == 3:
         packed = 1 << 30  # y is the largest; x, z and w follow
@@ -90,7 +139,7 @@ def test_values_computed_by_hand(tmp_path: Path, version: int) -> None:
     body = position + bytes([128]) + bytes([128, 0, 255]) + bytes([160, 176, 96]) + rotation
     path = tmp_path / "scene"
     path.write_bytes(spz_bytes(version, sections=body))
-    scene = read_scene(path).scene
+    scene = read_scene(path, spz_axes="rub").scene
     assert scene.means.tolist() == [[1.5, 2, -0.25]]
     assert scene.opacities.sigmoid().tolist() == pytest.approx([128 / 255])
     assert scene.sh_dc[0].tolist() == pytest.approx([0.5 / 255 / 0.15, -0.5 / 0.15, 0.5 / 0.15], rel=1e-5)
