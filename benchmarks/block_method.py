@@ -8,16 +8,15 @@ differs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.statistics import layer_statistics, merge_all
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.sos import ScaleTarget
-from sgsst_core.loss.terms import ContentDifference, content_factor, style_loss
+from sgsst_core.loss.content import ContentDifference, content_factor
+from sgsst_core.loss.statistics_terms import style_loss
+from sgsst_core.loss.targets import StyleTarget, StyleTargets
 from sgsst_core.scene.pyramid import add_upscaled_, downscale, scale_count
 
 BLOCK = 512
@@ -41,17 +40,17 @@ def blocks(height: int, width: int) -> list[PartitionTile]:
     ]
 
 
-def block_gradient(network: FeatureNetwork, image: Tensor, style: Mapping[int, ScaleTarget], content: Tensor) -> Tensor:
+def block_gradient(network: FeatureNetwork, image: Tensor, style: StyleTargets, content: Tensor) -> Tensor:
     """Compute the gradient [H, W, 3] of the SOS loss with lambda_c = 1, for image and content image [H, W, 3]."""
     scales = range(scale_count(image.shape[0], image.shape[1]))
     total = torch.zeros(image.shape)
     for scale in scales:
-        gradient = _scale(network, downscale(image, scale), style[scale], downscale(content, scale))
+        gradient = _scale(network, downscale(image, scale), style[scale][0], downscale(content, scale))
         add_upscaled_(total, gradient, scale, 1 / len(scales))
     return total
 
 
-def _scale(network: FeatureNetwork, image: Tensor, style: ScaleTarget, content: Tensor) -> Tensor:
+def _scale(network: FeatureNetwork, image: Tensor, style: StyleTarget, content: Tensor) -> Tensor:
     size = (image.shape[0], image.shape[1])
     tiles = blocks(*size)
     parts: dict[str, list] = {layer: [] for layer in STYLE_LAYERS}

@@ -24,6 +24,7 @@ from benchmarks.machine import write_result
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.settings import Precision, make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import comparing_pixels, tiny_weights
 from tests.pretend_cuda.counts import Counts
@@ -71,10 +72,10 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
 
 def launches_of(loss: SosLoss, counts: Counts, size: tuple[int, int], scan: bool) -> int:
     """Count the kernel launches of loss and gradient of a view at three scales; `size` is (height, width)."""
-    assert loss.scale_count(*size) == 3
+    assert loss.tiling.scale_count(size) == 3
     image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0)).to("cuda")
-    view = loss.view_target(image.flip(0), image[..., 0] if scan else None)
-    targets = loss.style_targets(image.flip(1), size)
+    view = loss.targets.of_view(image.flip(0), image[..., 0] if scan else None)
+    targets = loss.targets.of_style(Style.of(image.flip(1)), size)
     counts.clear()
     loss.evaluate(image, targets, view)
     return counts.launches.total()

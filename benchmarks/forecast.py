@@ -26,8 +26,8 @@ from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.content import ContentDifference
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.terms import ContentDifference
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import rasterizer_options
 from sgsst_core.planning.cost import content_bytes
@@ -173,7 +173,7 @@ class Passes:
     def __init__(self, loss: SosLoss, size: Size, scales: Sequence[int]) -> None:
         self.loss, self.size = loss, size
         self.sizes = {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
-        tiles = {scale: loss.tiles(*scaled) for scale, scaled in self.sizes.items()}
+        tiles = {scale: loss.divider.tiles(scaled) for scale, scaled in self.sizes.items()}
         self.tiles = [(tile, self.sizes[scale]) for scale, own in tiles.items() for tile in own]
         self.kept = loss.tiling.kept([tile.outer.pixels for tile, _ in self.tiles])
 
@@ -318,7 +318,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
         everything_kept: Whether content features, intersections and frozen colors of all views are cached.
     """
     loss = make_loss(precision)
-    count = loss.scale_count(*job.size)
+    count = loss.tiling.scale_count(job.size)
     passes = Passes(loss, job.size, [count - 1] if coarse else range(count))
     forward, backward = passes.network()
     moments, style = passes.style()
@@ -347,7 +347,7 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     """Return the fractions of views whose content features, tile intersections and frozen colors fit the caches."""
     views = memory_for("views", int(memory_limit()))
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
-    count = loss.scale_count(*job.size)
+    count = loss.tiling.scale_count(job.size)
     size = (job.size[0] >> count - 1, job.size[1] >> count - 1) if coarse else job.size
     of_a_view = {
         "content": (views / 2, content_bytes([size], loss.tiling, cell)),

@@ -25,6 +25,7 @@ from benchmarks.pictures import picture
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork, layer_stride
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.style import Style
 
 #: Last convolution that the loss needs.
 _DEEPEST = "conv5_1"
@@ -53,8 +54,8 @@ def _measure(weights: BackboneWeights, precision: str, size: int, repeats: int) 
     dtype = getattr(torch, precision)
     operations, alone = _convolutions_alone(weights, dtype, size, repeats)
     loss = SosLoss(FeatureNetwork(weights, dtype=dtype), memory=1 << 40, coarsest=size)
-    style = loss.style_targets(picture("immunohistochemistry", size, size), (size, size))
-    view, image = loss.view_target(picture("coffee", size, size)), picture("astronaut", size, size)
+    style = loss.targets.of_style(Style.of(picture("immunohistochemistry", size, size)), (size, size))
+    view, image = loss.targets.of_view(picture("coffee", size, size)), picture("astronaut", size, size)
     best: dict[str, Any] = {}
     for _ in range(repeats):
         loss.timer.clear()

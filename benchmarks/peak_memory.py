@@ -14,6 +14,7 @@ from sgsst_core.budget import device_peak, forget_device_peak
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork, use_whole_float32
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.style import Style
 from sgsst_core.timing import Timer
 
 
@@ -29,8 +30,8 @@ def main() -> None:
     size = (arguments.height, arguments.width)
     network = FeatureNetwork(load_network_weights("auto"), device=arguments.device)
     loss = SosLoss(network, memory=int(arguments.memory * 1e9))
-    targets = loss.style_targets(picture("immunohistochemistry", *size), size)
-    view = loss.view_target(picture("coffee", *size))
+    targets = loss.targets.of_style(Style.of(picture("immunohistochemistry", *size)), size)
+    view = loss.targets.of_view(picture("coffee", *size))
     forget_device_peak(network.device)
     timer = Timer(network.device)
     with timer("gradient"):
@@ -39,7 +40,7 @@ def main() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
     on_device = device_peak(network.device)
     gpu = f" and {on_device / 1e9:.2f} GB of the GPU's memory" if on_device is not None else ""
-    tiles = len(loss.tiles(*size))
+    tiles = len(loss.divider.tiles(size))
     print(f"{size[1]}x{size[0]}: {tiles} tiles at full size, {seconds:.3g} s, loss {result.loss:.4g}")
     print(f"peak {peak:.2f} GB{gpu}")
     write_result(

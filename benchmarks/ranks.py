@@ -130,7 +130,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
     loss = alone.loss
     camera = alone.views.cameras[0]
     pieces = pieces_of((camera.height, camera.width), loss.tiling, None)
-    areas = [[tile.outer.pixels for tile in loss.tiles(*piece.size)] for piece in pieces]
+    areas = [[tile.outer.pixels for tile in loss.divider.tiles(piece.size)] for piece in pieces]
     halo = loss.network.halo
     one, shared = (divide(pieces, halo, (1.0,) * count) for count in (1, collectives.size))
     return {

@@ -19,6 +19,7 @@ from benchmarks.pictures import picture
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.style import Style
 
 #: Memory limit in bytes: enough to cache the activations of a 2048x2048 view, 1.3 KB per pixel in float32.
 MEMORY = 12 << 30
@@ -37,12 +38,12 @@ def main() -> None:
     methods: dict[str, Callable[[], Tensor]] = {}
 
     exact = FeatureNetwork(weights)
-    targets = SosLoss(exact, memory=MEMORY).style_targets(style_image, (size, size))
+    targets = SosLoss(exact, memory=MEMORY).targets.of_style(Style.of(style_image), (size, size))
     methods["blocks, float32"] = lambda: block_gradient(exact, image, targets, content)
     for precision in ("float32", "bfloat16"):
         loss = SosLoss(FeatureNetwork(weights, dtype=getattr(torch, precision)), memory=MEMORY)
-        own_targets = loss.style_targets(style_image, (size, size))
-        view = loss.view_target(content)
+        own_targets = loss.targets.of_style(Style.of(style_image), (size, size))
+        view = loss.targets.of_view(content)
 
         def ours(loss=loss, own_targets=own_targets, view=view) -> Tensor:
             gradient = loss.evaluate(image, own_targets, view).image_gradient

@@ -38,7 +38,7 @@ from sgsst_core.features.fused_statistics import (
 )
 from sgsst_core.loss import fused_kernels as loss_kernels
 from sgsst_core.loss import fused_terms
-from sgsst_core.loss.terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
+from sgsst_core.loss.statistics_terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
 from sgsst_core.rasterizer import triton_cached_kernels as cached_kernels
 from sgsst_core.rasterizer import triton_kernels as kernels
 from sgsst_core.scene import spherical_harmonics_triton_kernels as harmonics_kernels

@@ -56,9 +56,9 @@ def _describe_views(job: Job) -> str:
     text = f"{len(views)} of {sizes[0][0]}x{sizes[0][1]}"
     if len(sizes) > 1:
         text = f"{len(views)} of {len(sizes)} sizes, {sizes[0][0]}x{sizes[0][1]} to {sizes[-1][0]}x{sizes[-1][1]}"
-    loss = job.stylizer.loss
-    scales = max(loss.scale_count(height, width) for width, height in sizes)
-    chosen = max(len(loss.scales(height, width)) for width, height in sizes)
+    tiling = job.stylizer.loss.tiling
+    scales = max(tiling.scale_count((height, width)) for width, height in sizes)
+    chosen = max(len(tiling.scales((height, width))) for width, height in sizes)
     text += f", {f'{chosen} of ' if chosen < scales else ''}{scales} scale{'s' if scales > 1 else ''}"
     return text + f"; content from {'the photos' if job.request.images else 'unstylized renders'}"
 

@@ -20,16 +20,16 @@ def compare(
     GRAM: tl.constexpr, MEAN: tl.constexpr, STD: tl.constexpr, EPS: tl.constexpr, CHANNELS: tl.constexpr,
     ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Compute `terms.style_loss` in float64.
+    """Compute `statistics_terms.style_loss` in float64.
 
     Each program computes ROWS rows of the Gram matrix. COLUMNS must be at least CHANNELS.
 
     Args:
         count, mean, centered: Statistics of the view.
         target_gram, target_mean, target_std: Statistics of the style.
-        terms: Output [CHANNELS, 5] float64, contribution of each channel to each term.
+        terms: Output [CHANNELS, 3] float64, contribution of each channel to each term.
         matrix, own_mean, offset: Outputs [CHANNELS, CHANNELS], [CHANNELS] and [CHANNELS] float32, the fields of
-            `terms.StyleGradient`.
+            `statistics_terms.StyleGradient`.
     """
     i = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     j = tl.arange(0, COLUMNS)
@@ -58,11 +58,9 @@ def compare(
     tl.store(offset + i, drawn.to(tl.float32), mask=row)
     present = tl.where(some, 1.0, 0.0).to(tl.float64)
     squares = tl.sum(gram_error * gram_error, 1) / (CHANNELS * CHANNELS)
-    tl.store(terms + 5 * i, present * weight * squares, mask=row)
-    tl.store(terms + 5 * i + 1, present * (MEAN / CHANNELS) * mean_error * mean_error, mask=row)
-    tl.store(terms + 5 * i + 2, present * (STD / CHANNELS) * std_error * std_error, mask=row)
-    tl.store(terms + 5 * i + 3, 0.0 * own, mask=row)
-    tl.store(terms + 5 * i + 4, 0.0 * own, mask=row)
+    tl.store(terms + 3 * i, present * weight * squares, mask=row)
+    tl.store(terms + 3 * i + 1, present * (MEAN / CHANNELS) * mean_error * mean_error, mask=row)
+    tl.store(terms + 3 * i + 2, present * (STD / CHANNELS) * std_error * std_error, mask=row)
 
 
 @triton.jit

@@ -1,6 +1,6 @@
 """GPU versions of `style_loss` and `StyleGradient.add_to`, one kernel launch each.
 
-The float64 references are the CPU versions in `terms`.
+The float64 references are the CPU versions in `statistics_terms`.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ def fused_style_loss(
     weights: tuple[float, float, float],
     feature_eps: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Compute `terms.style_loss` on a GPU.
+    """Compute `statistics_terms.style_loss` on a GPU.
 
     Args:
         statistics: Statistics of the view's features.
         target: Gram matrix, mean and standard deviation of the style, float64.
         weights: c^2 w_G, w_m and w_s.
-        feature_eps: Relative rounding error of the features, as in `terms.style_loss`.
+        feature_eps: Relative rounding error of the features, as in `statistics_terms.style_loss`.
 
     Returns:
-        Terms [5] float64, and the gradient's matrix [c, c], mean [c] and offset [c] in float32.
+        Terms [3] float64, and the gradient's matrix [c, c], mean [c] and offset [c] in float32.
     """
     from sgsst_core.loss import fused_kernels as kernels
 
     device, channels = statistics.mean.device, len(statistics.mean)
-    terms = torch.empty((channels, 5), dtype=torch.float64, device=device)
+    terms = torch.empty((channels, 3), dtype=torch.float64, device=device)
     matrix = torch.empty((channels, channels), device=device)
     mean, offset = torch.empty(channels, device=device), torch.empty(channels, device=device)
     gram_weight, mean_weight, std_weight = weights

@@ -6,7 +6,7 @@ addresses, so inputs that differ between views are first copied to these address
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.partition import PartitionTile
-from sgsst_core.loss.sos import ScaleTarget, Share, SosLoss, SosResult, ViewTarget
+from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.loss.terms import TERMS
-from sgsst_core.loss.tiling import Tiling
+from sgsst_core.loss.tiling import Division, Tiling
 from sgsst_core.timing import Timer
 
 #: Maximum number of cached graphs. Each takes about 1 MB, in addition to the memory pool that all graphs share.
@@ -74,8 +75,8 @@ class _Graph:
     def replay(self, image: Tensor, view: ViewTarget) -> SosResult:
         """Evaluate an image and view whose key matches that of the graph."""
         scales = self.result.scales
-        for place, value in zip(_inputs(self.image, self.view, scales), _inputs(image, view, scales), strict=True):
-            place.copy_(value)
+        for slot, value in zip(_inputs(self.image, self.view, scales), _inputs(image, view, scales), strict=True):
+            slot.copy_(value)
         self.graph.replay()
         return replace(self.result, values=self.result.values.clone())
 
@@ -97,12 +98,12 @@ class LossGraphs:
 
     def __init__(self, loss: SosLoss, most: int = MOST_GRAPHS) -> None:
         if loss.collectives.size > 1:
-            raise ValueError("a graph cannot hold what ranks tell each other")
+            raise ValueError("a graph cannot contain communication between ranks")
         self.loss = loss
         self.problem: str | None = None
         self._most = most
         #: Style targets by key. A key contains their `id`, which Python could reuse if they were not referenced here.
-        self._visited: dict[_Key, Mapping[int, ScaleTarget]] = {}
+        self._visited: dict[_Key, StyleTargets] = {}
         self._graphs: dict[_Key, _Graph] = {}
         self._static: dict[tuple[object, ...], Tensor] = {}
         self._stream = torch.cuda.Stream(loss.network.device)
@@ -116,7 +117,7 @@ class LossGraphs:
     def evaluate(
         self,
         image: Tensor,
-        style: Mapping[int, ScaleTarget],
+        style: StyleTargets,
         view: ViewTarget,
         scales: Sequence[int],
         *,
@@ -141,25 +142,27 @@ class LossGraphs:
     def _key(
         self,
         image: Tensor,
-        style: Mapping[int, ScaleTarget],
+        style: StyleTargets,
         view: ViewTarget,
         scales: Sequence[int],
         image_scale: int,
     ) -> _Key | None:
         """Return the graph key of an evaluation; None if the evaluation cannot be captured."""
-        share = view.share
-        if share is None or share.tiles.keys() != set(scales) or any(len(own) != 1 for own in share.tiles.values()):
+        division = view.division
+        if division is None or division.tiles.keys() != set(scales):
+            return None
+        if any(len(own) != 1 for own in division.tiles.values()):
             return None
         if self.loss.content_weight and any(scale not in view.content for scale in scales):
             return None
-        tiles = tuple((scale, share.tiles[scale][0]) for scale in scales)
+        tiles = tuple((scale, division.tiles[scale][0]) for scale in scales)
         if not can_be_captured(self.loss.tiling, [tile.outer.pixels for _, tile in tiles]):
             return None
         coverage = tuple(view.coverage[0].shape) if view.coverage else None
         regions = len(view.regions or ())
         return _Key(tuple(image.shape), image.dtype, image_scale, tiles, coverage, regions, id(style))
 
-    def _captured(self, key: _Key, image: Tensor, style: Mapping[int, ScaleTarget], view: ViewTarget) -> _Graph | None:
+    def _captured(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph | None:
         """Capture, cache and return the graph for a key; return None if capturing fails."""
         try:
             found = self._graphs[key] = self._capture(key, image, style, view)
@@ -170,13 +173,13 @@ class LossGraphs:
             return None
         return found
 
-    def _capture(self, key: _Key, image: Tensor, style: Mapping[int, ScaleTarget], view: ViewTarget) -> _Graph:
+    def _capture(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph:
         loss, device = self.loss, self.loss.network.device
         scales = [scale for scale, _ in key.tiles]
-        own_image, own_view = self._places(key, image, view)
+        static_image, static_view = self._static_inputs(key, image, view)
         values = torch.empty((len(scales), len(TERMS)), dtype=torch.float64, device=device)
         dtype = torch.promote_types(loss.network.dtype, torch.float32)
-        gradient = self._place("gradient", torch.empty(image.shape, dtype=dtype, device=device))
+        gradient = self._static_tensor("gradient", torch.empty(image.shape, dtype=dtype, device=device))
         graph = torch.cuda.CUDAGraph()
         timer, loss.timer = loss.timer, Timer()  # events inside a graph cannot be timed
         try:
@@ -186,31 +189,33 @@ class LossGraphs:
                 torch.cuda.stream(self._stream),
                 torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"),
             ):
-                found = loss.evaluate(own_image, style, own_view, scales, image_scale=key.image_scale)
+                found = loss.evaluate(static_image, style, static_view, scales, image_scale=key.image_scale)
                 assert found.image_gradient is not None
                 # Copy to memory that other graphs do not reuse for activations.
                 values.copy_(found.values)
                 gradient.copy_(found.image_gradient)
         finally:
             loss.timer = timer
-        return _Graph(graph, own_image, own_view, SosResult(found.scales, values, gradient, found.weights))
+        return _Graph(graph, static_image, static_view, SosResult(found.scales, values, gradient, found.weights))
 
-    def _places(self, key: _Key, image: Tensor, view: ViewTarget) -> tuple[Tensor, ViewTarget]:
+    def _static_inputs(self, key: _Key, image: Tensor, view: ViewTarget) -> tuple[Tensor, ViewTarget]:
         """Return static tensors in the formats of an image and of its view's targets; their values are not set."""
         content = {
-            scale: {tile: self._place(("content", scale), view.content[scale][tile])}
+            scale: {tile: self._static_tensor(("content", scale), view.content[scale][tile])}
             for scale, tile in key.tiles
             if scale in view.content
         }
-        coverage = view.coverage and [self._place(("coverage", k), level) for k, level in enumerate(view.coverage)]
+        coverage = view.coverage and [
+            self._static_tensor(("coverage", k), level) for k, level in enumerate(view.coverage)
+        ]
         regions = view.regions and [
-            [self._place(("region", number, k), level) for k, level in enumerate(pyramid)]
+            [self._static_tensor(("region", number, k), level) for k, level in enumerate(pyramid)]
             for number, pyramid in enumerate(view.regions)
         ]
         tiles = {scale: [tile] for scale, tile in key.tiles}
-        return self._place("image", image), ViewTarget(None, content, coverage, Share({}, tiles), regions)
+        return self._static_tensor("image", image), ViewTarget(None, content, coverage, Division({}, tiles), regions)
 
-    def _place(self, name: object, like: Tensor) -> Tensor:
+    def _static_tensor(self, name: object, like: Tensor) -> Tensor:
         """Return a tensor at a fixed address. Graphs share it if its name, shape, layout and dtype are the same."""
         key = (name, like.shape, like.stride(), like.dtype)
         if key not in self._static:
@@ -220,6 +225,6 @@ class LossGraphs:
 
 def _inputs(image: Tensor, view: ViewTarget, scales: Sequence[int]) -> list[Tensor]:
     """Return all input tensors whose values may differ between evaluations with the same key, in a fixed order."""
-    features = [part for scale in scales if scale in view.content for part in view.content[scale].values()]
+    features = [tile for scale in scales if scale in view.content for tile in view.content[scale].values()]
     regions = [level for pyramid in view.regions or [] for level in pyramid]
     return [image, *features, *(view.coverage or []), *regions]

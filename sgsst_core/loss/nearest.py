@@ -14,13 +14,29 @@ a blocked matrix product. As in ARF, features are not centered.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import reduce
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from sgsst_core.features.partition import Rectangle
+from sgsst_core.features.network_sources import BLOCKS
+from sgsst_core.features.partition import PartitionTile, Rectangle
+from sgsst_core.features.vgg import CONTENT_LAYER
+from sgsst_core.loss.position_term import (
+    Objective,
+    PositionTerm,
+    PositionWeights,
+    ReferenceInputs,
+    ScaledView,
+    TermInputs,
+)
+from sgsst_core.loss.targets import StyleVectors, at_least_float32
+from sgsst_core.settings import StyleLossName
+from sgsst_core.timing import Timer
 
 #: Maximum number of style vectors to search. Style images larger than 360 x 360 pixels have more vectors, and are
 #: subsampled evenly. Little is lost, because the receptive fields of neighboring vectors overlap almost completely. A
@@ -33,33 +49,38 @@ _BLOCK = {"cpu": (1 << 10, 1 << 10), "cuda": (1 << 13, 1 << 13)}
 MATCH_BYTES = 8 + 4 + 4
 #: Fractional part of the golden ratio; its multiples modulo 1 fill the unit interval evenly.
 _GOLDEN = 0.6180339887498949
+#: Factor from features of ImageNet-normalized input, for which ARF's weights are meant, to features of a 0-255 input.
+_FEATURE_UNITS = 255 * 0.226
+#: w_n for `nnfm`. With content_weight 1, the nearest-neighbor and content terms are balanced as in ARF for 360-degree
+#: scenes (content weight 5e-3 in units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
+NNFM_WEIGHT = _FEATURE_UNITS**2 / 5e-3
+#: w_n for `mixed`. Within 20 to 30 steps, the color gradient of the statistics terms falls to a tenth. With this
+#: weight, the color gradient of the nearest-neighbor term then has the same norm. Four pairs of scene and painting need
+#: 1.8e8 to 1.7e9; the constant is their geometric mean. It does not depend on the scene, so that a job has the same
+#: loss wherever it runs or resumes.
+MIXED_WEIGHT = 5e8
+#: w_n of each loss for features in units of a 0-255 input; 0 if the loss matches no features.
+NEAREST_WEIGHTS: dict[StyleLossName, float] = {"sos": 0.0, "nnfm": NNFM_WEIGHT, "mixed": MIXED_WEIGHT}
 
 
-@dataclass(frozen=True)
-class StyleVectors:
-    """Style vectors to match with the positions of a view.
+def nearest_weight(style_loss: StyleLossName, unit: float = 1.0) -> float:
+    """Return w_n, the weight of the nearest-neighbor term.
 
-    Attributes:
-        units: Unit vectors [k, c], float32 or float64; 0 where the style's features are 0.
-        parts: Slice of the c channels for each layer, in layer order.
-        length: Scalar, largest norm of a vector before normalization.
+    It is scaled by the square of the feature unit (`FeatureNetwork.unit`), because the terms that it is balanced
+    against grow by this factor.
     """
+    return NEAREST_WEIGHTS[style_loss] * unit**2
 
-    units: Tensor
-    parts: Mapping[str, slice]
-    length: Tensor
 
-    @staticmethod
-    def of(features: Mapping[str, Tensor]) -> StyleVectors:
-        """Create style vectors from features [k, c_l] by layer, all at the same k > 0 positions."""
-        vectors = torch.cat([_at_least_float32(part) for part in features.values()], dim=1)
-        lengths = vectors.norm(dim=1)
-        units = vectors * torch.where(lengths > 0, lengths, torch.inf).reciprocal()[:, None]
-        parts, first = {}, 0
-        for layer, part in features.items():
-            parts[layer] = slice(first, first + part.shape[1])
-            first += part.shape[1]
-        return StyleVectors(units, parts, lengths.max())
+def nearest_layers(style_loss: StyleLossName, network: str) -> tuple[str, ...]:
+    """Return the layers whose features are matched: all of the third block, as in ARF, or none.
+
+    Args:
+        style_loss: Style loss.
+        network: "vgg16" or "vgg19".
+    """
+    count = BLOCKS[network][2] if NEAREST_WEIGHTS[style_loss] else 0
+    return tuple(f"relu3_{index}" for index in range(1, count + 1))
 
 
 def chosen_places(count: int, most: int = MOST_VECTORS) -> Tensor:
@@ -75,7 +96,7 @@ def chosen_places(count: int, most: int = MOST_VECTORS) -> Tensor:
     return ((part + (part * _GOLDEN).frac()) * (count / most)).long().clamp_max(count - 1)
 
 
-def positions_per_image(counts: Sequence[int], weights: Sequence[float], most: int = MOST_VECTORS) -> list[int]:
+def positions_per_image(counts: Sequence[int], weights: Sequence[float], most: int) -> list[int]:
     """Return how many positions to take from each image of a style.
 
     If there are at most `most` positions in total, all are taken. Otherwise each image contributes in proportion to its
@@ -131,7 +152,7 @@ class Matches:
         rows = max(1, _BLOCK[units.device.type][0] // max(width, 1))
         for top in range(0, height, rows):
             part = slice(top, min(top + rows, height))
-            block = torch.cat([_at_least_float32(features[layer][part]) for layer in style.parts], dim=2)
+            block = torch.cat([at_least_float32(features[layer][part]) for layer in style.parts], dim=2)
             lengths = block.norm(dim=2)
             # NaN fails this comparison, so NaN features keep a NaN norm.
             inverse[part] = torch.where(lengths <= rounding * style.length, torch.inf, lengths).reciprocal()
@@ -176,7 +197,7 @@ class Matches:
             scale = inverse * factor.to(inverse)
             if position_weights is not None:
                 scale = scale * position_weights[part]
-            own = _at_least_float32(features[part]) * (self.cosine[part] * inverse)[:, :, None]
+            own = at_least_float32(features[part]) * (self.cosine[part] * inverse)[:, :, None]
             gradient[part] += (own - units[self.nearest[part]]) * scale[:, :, None]
 
 
@@ -231,5 +252,89 @@ def nearest_reference(features: Sequence[Tensor], style: Sequence[Tensor], weigh
     return result
 
 
-def _at_least_float32(values: Tensor) -> Tensor:
-    return values.to(torch.promote_types(values.dtype, torch.float32))
+class _MatchedRegion(NamedTuple):
+    """Style vectors of a region, factor of its distances, and its position weights."""
+
+    vectors: StyleVectors
+    factor: Tensor
+    weights: PositionWeights
+
+
+@dataclass(frozen=True)
+class NearestTerm(PositionTerm):
+    """Nearest-neighbor term of one scale of a view.
+
+    The matches of each tile are stored for the second pass: they take a few bytes per cell, while the search is slow.
+
+    Attributes:
+        view: Scale of the view.
+        layer: First of the matched layers, which all have the same cells.
+        rounding: Relative rounding error of the features.
+        timer: Timer of the search.
+        regions: Regions whose features are matched.
+        matches: Matches of each tile, by region.
+    """
+
+    name = "nearest"
+    label = "nearest neighbors"
+
+    view: ScaledView
+    layer: str
+    rounding: float
+    timer: Timer
+    regions: list[_MatchedRegion]
+    matches: dict[PartitionTile, list[Matches]] = field(default_factory=dict)
+
+    @staticmethod
+    def layers(objective: Objective) -> tuple[str, ...]:
+        """Return the matched layers."""
+        return nearest_layers(objective.style_loss, objective.network)
+
+    @classmethod
+    def of(cls, inputs: TermInputs) -> Self | None:
+        """Return the term of one scale of a view; None if the loss does not have it."""
+        network, layers = inputs.network, cls.layers(inputs.objective)
+        regions = []
+        for style, weights in inputs.regions if layers else ():
+            if style.vectors is not None:
+                count = inputs.view.count(layers[0], weights)
+                weight = style.weight * nearest_weight(inputs.objective.style_loss, network.unit)
+                factor = weight / torch.where(count > 0, count, torch.inf)
+                regions.append(_MatchedRegion(style.vectors, factor, weights))
+        return cls(inputs.view, layers[0], network.rounding, inputs.timer, regions) if regions else None
+
+    def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
+        """Return the contribution of the cells that a tile owns, float64 scalar."""
+        in_view, in_tile = tile.owned_cells(self.layer, self.view.size)
+        self.matches[tile] = []
+        sums = []
+        for vectors, factor, pyramid in self.regions:
+            weights = self.view.weights(self.layer, in_view, pyramid)
+            owned = {layer: features[layer][in_tile.slices] for layer in vectors.parts}
+            with self.timer("matching"):
+                matches = Matches.of(owned, vectors, self.rounding, weights)
+                sums.append(factor * matches.distance(weights))
+            self.matches[tile].append(matches)
+        return reduce(operator.add, sums)
+
+    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> None:
+        """Add the derivative of `value` with respect to a layer's features to a gradient in place."""
+        for (vectors, factor, pyramid), matches in zip(self.regions, self.matches[tile], strict=True):
+            if layer in vectors.parts:
+                in_view, in_tile = tile.owned_cells(layer, self.view.size)
+                weights = self.view.weights(layer, in_view, pyramid)
+                owned = gradient[in_tile.slices], features[in_tile.slices]
+                matches.add_gradient(*owned, layer, vectors, factor, weights)
+
+    @staticmethod
+    def reference(inputs: ReferenceInputs) -> Tensor | None:
+        """Compute the term from its definition; None if the loss does not have it."""
+        layers = NearestTerm.layers(inputs.objective)
+        if not layers:
+            return None
+        weight = nearest_weight(inputs.objective.style_loss, inputs.weights.scales.get(CONTENT_LAYER, 1.0))
+        total = torch.zeros((), dtype=torch.float64)
+        for region in inputs.regions:
+            view, style = ([features[layer] for layer in layers] for features in (inputs.features, region.style))
+            total = total + region.factor * weight * nearest_reference(view, style, region.weights(layers[0]))
+        return total

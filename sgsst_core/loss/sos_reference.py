@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,28 +11,29 @@ from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import CONTENT_LAYER, PIXEL_UNIT, PIXELS, layer_stride
-from sgsst_core.loss.nearest import nearest_reference
-from sgsst_core.loss.style_losses import nearest_layers, nearest_weight, statistics_layers, term_weights
-from sgsst_core.loss.terms import PAPERS_WEIGHTS, LayerTarget, TermWeights
+from sgsst_core.features.vgg import PIXEL_UNIT, PIXELS, layer_stride
+from sgsst_core.loss.position_term import Objective, ReferenceInputs, RegionReference
+from sgsst_core.loss.statistics_terms import PAPERS_WEIGHTS, TermWeights, statistics_layers, term_weights
+from sgsst_core.loss.targets import LayerTarget
+from sgsst_core.loss.terms import POSITION_TERMS
 from sgsst_core.scene.luminance import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import StyleLossName
 
 
 @dataclass(frozen=True)
-class RegionReference:
+class StyledWeights:
     """Region of a view.
 
     Attributes:
         style: Style image [H', W', 3].
-        share: Position weights [H, W], the region's fraction of the blend weights; None for equal weights.
-        weight: Weight of the region's style loss.
+        weights: Position weights [H, W], the region's fraction of the blend weights; None for equal weights.
+        factor: Weight of the region's style loss.
     """
 
     style: Tensor
-    share: Tensor | None
-    weight: float = 1.0
+    weights: Tensor | None
+    factor: float = 1.0
 
 
 def features_reference(network_weights: BackboneWeights, rgb: Tensor) -> dict[str, Tensor]:
@@ -67,7 +68,7 @@ def style_loss_reference(
     *,
     weights: TermWeights = PAPERS_WEIGHTS,
 ) -> Tensor:
-    """Compute the style loss of one layer from its definition; reference of `terms.style_loss`.
+    """Compute the style loss of one layer from its definition; reference of `statistics_terms.style_loss`.
 
     The computation is in float64 and differentiable.
 
@@ -91,7 +92,7 @@ def _statistics(features: Tensor, position_weights: Tensor | None = None) -> Lay
     gram = (a[:, None] * flat).T @ flat / a.sum()
     variance = (a[:, None] * (flat - mean) ** 2).sum(0) / a.sum()
     # The derivative of the square root is infinite at 0 (a dead channel) and huge at the rounding error of a constant
-    # channel. Such channels are excluded, as in `terms.style_loss`.
+    # channel. Such channels are excluded, as in `statistics_terms.style_loss`.
     alive = variance > (1e-12 * mean).square()
     return LayerTarget(gram, mean, torch.where(alive, variance, 1.0).sqrt() * alive)
 
@@ -99,7 +100,7 @@ def _statistics(features: Tensor, position_weights: Tensor | None = None) -> Lay
 def sos_reference(
     network_weights: BackboneWeights,
     image: Tensor,
-    style: Tensor | Sequence[RegionReference],
+    style: Tensor | Sequence[StyledWeights],
     content: Tensor | None = None,
     *,
     content_weight: float = 1.0,
@@ -117,61 +118,64 @@ def sos_reference(
         content: [H, W, 3] in 0..1; None for no content term.
         content_weight: lambda_c.
         coverage: [H, W] position weights; None for equal weights.
-        style_loss: Style loss; see `style_losses`. If it matches features, the style may have at most
+        style_loss: Style loss; see `terms`. If it matches features, the style may have at most
             `nearest.MOST_VECTORS` positions.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         scales: Weight of each scale from full size downwards; empty for equal weights.
     """
-    parts = [RegionReference(style, coverage)] if isinstance(style, Tensor) else style
+    regions = [StyledWeights(style, coverage)] if isinstance(style, Tensor) else style
     x = image.double().clone().requires_grad_()
     total = torch.zeros((), dtype=torch.float64)
     count = scale_count(image.shape[0], image.shape[1], coarsest)
     factors = [1.0] * count if not scales else [*scales, *[0.0] * count][:count]
     for scale, factor in enumerate(factors):
-        loss = torch.zeros((), dtype=torch.float64)
         side = 1 << scale
-        features = features_reference(network_weights, box_average_reference(x, side))
-        for part in parts:
-            loss = loss + part.weight * _part_reference(network_weights, features, part, side, style_loss)
-        if content is not None and content_weight:
-            difference = features[CONTENT_LAYER] - _content_reference(network_weights, content, side)
-            position = _cells(coverage, side * layer_stride(CONTENT_LAYER))
-            a = torch.ones(difference.shape[:2], dtype=torch.float64) if position is None else position
-            loss = loss + content_weight * (a[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
-        total = total + factor * loss
+        inputs = ReferenceInputs(
+            network_weights,
+            Objective(network_weights.name, style_loss, content_weight),
+            features_reference(network_weights, box_average_reference(x, side)),
+            [
+                RegionReference(
+                    _scaled(network_weights, region.style, side), _cells(region.weights, side), region.factor
+                )
+                for region in regions
+            ],
+            None if content is None else _scaled(network_weights, content, side),
+            _cells(coverage, side),
+        )
+        values = [_statistics_terms(inputs), *(term.reference(inputs) for term in POSITION_TERMS)]
+        total = total + factor * sum(value for value in values if value is not None)
     loss = total / sum(factors)
     (gradient,) = torch.autograd.grad(loss, x)
     return loss.item(), gradient
 
 
-def _part_reference(
-    network_weights: BackboneWeights,
-    features: Mapping[str, Tensor],
-    part: RegionReference,
-    side: int,
-    style_loss: StyleLossName,
-) -> Tensor:
-    """Return the style terms of a region at one scale, given the view's features at that scale.
-
-    A pixel of the scale is the average of side x side full-size pixels.
-    """
-    wanted = features_reference(network_weights, box_average_reference(part.style.double(), side))
+def _statistics_terms(inputs: ReferenceInputs) -> Tensor:
+    """Return the style terms of all regions at one scale."""
     loss = torch.zeros((), dtype=torch.float64)
-    for layer in statistics_layers(style_loss, network_weights):
-        position = _cells(part.share, side * layer_stride(layer))
-        weights = term_weights(layer, network_weights.scales.get(PIXELS, 1.0) ** 2)
-        loss = loss + style_loss_reference(features[layer], _statistics(wanted[layer]), position, weights=weights)
-    if matched := nearest_layers(style_loss, network_weights.name):
-        position = _cells(part.share, side * layer_stride(matched[0]))
-        own, other = ([found[layer] for layer in matched] for found in (features, wanted))
-        weight = nearest_weight(style_loss, network_weights.scales.get(CONTENT_LAYER, 1.0))
-        loss = loss + weight * nearest_reference(own, other, position)
+    for region in inputs.regions:
+        for layer in statistics_layers(inputs.objective.style_loss, inputs.weights):
+            loss = loss + region.factor * style_loss_reference(
+                inputs.features[layer],
+                _statistics(region.style[layer]),
+                region.weights(layer),
+                weights=term_weights(layer, inputs.weights.scales.get(PIXELS, 1.0) ** 2),
+            )
     return loss
 
 
-def _content_reference(network_weights: BackboneWeights, content: Tensor, side: int) -> Tensor:
-    return features_reference(network_weights, box_average_reference(content.double(), side))[CONTENT_LAYER].detach()
+def _scaled(network_weights: BackboneWeights, image: Tensor, side: int) -> dict[str, Tensor]:
+    """Return the features of an image, each pixel averaged over side x side."""
+    features = features_reference(network_weights, box_average_reference(image.double(), side))
+    return {layer: values.detach() for layer, values in features.items()}
 
 
-def _cells(coverage: Tensor | None, side: int) -> Tensor | None:
-    return None if coverage is None else box_average_reference(coverage.double()[:, :, None], side)[:, :, 0]
+def _cells(coverage: Tensor | None, side: int) -> Callable[[str], Tensor | None]:
+    """Return a function that averages position weights [H, W] over the cells of a layer, with pixels of a side."""
+
+    def of(layer: str) -> Tensor | None:
+        if coverage is None:
+            return None
+        return box_average_reference(coverage.double()[:, :, None], side * layer_stride(layer))[:, :, 0]
+
+    return of

@@ -1,13 +1,24 @@
-"""Partitioning of scaled views into tiles under a memory budget, for the loss and for the planner's predictions."""
+"""Partitioning of scaled views into tiles under a memory budget, and division of the tiles among ranks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sgsst_core.features.partition import PartitionTile, Rectangle, choose_tile_size, kept_tiles, partition
+from torch import Tensor
+
+from sgsst_core.features.partition import (
+    PartitionTile,
+    Rectangle,
+    choose_tile_size,
+    covered_region,
+    kept_tiles,
+    partition,
+    scaled_region,
+)
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
-from sgsst_core.parallel.division import Size
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel.division import Piece, Size, divide
 from sgsst_core.scene.pyramid import scale_count
 
 
@@ -60,3 +71,87 @@ class Tiling:
         if not self.keep_activations:
             return [False] * len(areas)
         return kept_tiles(areas, self.held, self.working)
+
+
+@dataclass(frozen=True)
+class Division:
+    """Division of the work on some scales of a view among ranks.
+
+    Attributes:
+        pieces: For each scale, the pieces of every rank; identical on all ranks.
+        tiles: Partition tiles of this rank by scale.
+    """
+
+    pieces: dict[int, tuple[tuple[Piece, ...], ...]]
+    tiles: dict[int, list[PartitionTile]]
+
+    def cost(self, rank: int, halo: int) -> int:
+        """Return the number of pixels that a rank passes through the network."""
+        return sum(piece.cost(halo) for every in self.pieces.values() for piece in every[rank])
+
+
+class Divider:
+    """Divider of the work on views among ranks.
+
+    Args:
+        tiling: Partitioning rules.
+        collectives: Collectives of the ranks that evaluate each view together.
+        leave_out: Whether pixels of weight 0 are left out.
+
+    Attributes:
+        speeds: Relative speeds of the ranks; work is divided in proportion to them.
+    """
+
+    def __init__(self, tiling: Tiling, collectives: Collectives = ALONE, *, leave_out: bool = True) -> None:
+        self.tiling = tiling
+        self.leave_out = leave_out
+        self.speeds = (1.0,) * collectives.size
+        self._rank = collectives.rank
+
+    def divide(
+        self, sizes: Mapping[int, Size], coverage: Sequence[Tensor] | None = None, region: Rectangle | None = None
+    ) -> Division:
+        """Divide the work on some scales of a view.
+
+        Args:
+            sizes: (height, width) of each scale.
+            coverage: Position weights in the format of `ViewTarget.coverage`; None for equal weights.
+            region: Rectangle of the full-size view that contains every covered pixel. If it is given, `coverage` is not
+                read, which avoids synchronizing with the device. The pieces of coarser scales may then be a few cells
+                larger.
+        """
+        read = coverage if region is None else None
+        weights = {scale: read[scale] if read else None for scale in sizes}
+        if region is None or not self.leave_out:
+            pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
+        else:
+            pieces = tuple(Piece(scale, size, scaled_region(region, scale, size)) for scale, size in sizes.items())
+        by_rank = divide(pieces, self.tiling.halo, self.speeds)
+        own = by_rank[self._rank]
+        return Division(
+            {scale: tuple(tuple(p for p in each if p.scale == scale) for each in by_rank) for scale in sizes},
+            {
+                scale: [tile for p in own if p.scale == scale for tile in self._partition(p, weights[scale])]
+                for scale in sizes
+            },
+        )
+
+    def tiles(self, size: Size, coverage: Tensor | None = None) -> list[PartitionTile]:
+        """Return the partition tiles of a scaled view of size (height, width).
+
+        If `coverage` [h, w] is given, pixels with coverage 0 may not belong to any tile.
+        """
+        return self._partition(self._piece(0, size, coverage), coverage)
+
+    def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
+        """Return the piece of one scale that contains all pixels that the network has to process."""
+        if coverage is None or not self.leave_out:
+            return Piece(scale, size, Rectangle(0, 0, *size))
+        return Piece(scale, size, covered_region(coverage))
+
+    def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
+        """Return the covered partition tiles of a piece, as large as the memory budget allows."""
+        tiles = self.tiling.tiles(piece.size, piece.region)
+        if coverage is None or not self.leave_out:
+            return tiles
+        return [tile for tile in tiles if coverage[tile.inner.slices].any()]

@@ -17,9 +17,9 @@ from torch import Tensor
 from sgsst_core.budget import memory_for
 from sgsst_core.decision import Decision
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
-from sgsst_core.loss.nearest import MOST_VECTORS
+from sgsst_core.loss.nearest import MOST_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
-from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, has_statistics
+from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.planning.cost import OPTIMIZER_BYTES, CostModel, RanksChoice, ViewData
 from sgsst_core.planning.facts import LEAST_VISITS, LaunchCost, Link, Probe, RasterCost
 from sgsst_core.planning.survey import Survey

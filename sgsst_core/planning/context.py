@@ -10,7 +10,7 @@ import torch
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
-from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.choices import precision_of, rasterizer_options
 from sgsst_core.planning.facts import Machine

@@ -10,7 +10,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.scale_weights import check_scales
-from sgsst_core.loss.style_losses import has_statistics
+from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.orbit.choice import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import ANOTHER_LOSS

@@ -19,9 +19,8 @@ from sgsst_core.budget import memory_for
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.graphs import LossGraphs, has_graphs
-from sgsst_core.loss.nearest import search
-from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
-from sgsst_core.loss.sos import RegionTarget, ScaleTarget, SosLoss, SosResult
+from sgsst_core.loss.nearest import nearest_layers, search
+from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import rendered_gaussians
@@ -47,6 +46,7 @@ from sgsst_core.scene.pyramid import downscale
 from sgsst_core.scene.spherical_harmonics import rest_colors, scene_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
+from sgsst_core.style import Style
 from sgsst_core.timing import Timer, wait_for
 
 #: Maximum side of the image for timing the network: large enough for the rate of a partition tile. A GPU needs more
@@ -124,23 +124,15 @@ def _network_facts(context: PlanningContext, first: Camera, maps: int) -> Networ
         fixed,
         context.precision_ratio,
         gradient_error(context, first, side),
-        sum(network.channels(layer) for layer in loss.nearest_layers),
+        sum(network.channels(layer) for layer in nearest_layers(settings.style_loss, network.name)),
         max(network.layers),
     )
 
 
-def _loss(context: PlanningContext, scales: ScaleWeights = EVEN) -> SosLoss:
-    """Return the loss of a single rank."""
-    settings = context.settings
-    return SosLoss(
-        context.network,
-        content_weight=settings.content_weight,
-        style_loss=settings.style_loss,
-        memory=memory_for("activations", context.machine.memory),
-        coarsest=settings.coarsest_side,
-        scales=scales,
-        keep_activations="activations" not in settings.keep,
-    )
+def _loss(context: PlanningContext, scales: tuple[float, ...] = ()) -> SosLoss:
+    """Return the loss of a single rank on synthetic images, with weights of the scales; empty for equal weights."""
+    settings = context.settings.model_copy(update={"style_scale": 1.0, "scales": scales})
+    return make_loss(context.network, settings, memory_for("activations", context.machine.memory))
 
 
 def _side(context: PlanningContext, loss: SosLoss) -> int:
@@ -164,14 +156,15 @@ def measure_rate(loss: SosLoss, side: int, maps: int = 0) -> Rate:
         maps: Number of regions that have statistics of their own; 0 for none.
     """
     image = soft_image(side).to(loss.network.device)
-    style, view = loss.style_targets(image.flip(0), (side, side)), loss.view_target(image)
-    vectors = style[0].vectors
+    style, view = loss.targets.of_style(Style.of(image.flip(0)), (side, side)), loss.targets.of_view(image)
+    target = style[0][0]
+    vectors = target.vectors
     if vectors is not None:  # the search time depends on their number and is measured separately
-        style = {0: replace(style[0], vectors=replace(vectors, units=vectors.units[:1]))}
+        target = replace(target, vectors=replace(vectors, units=vectors.units[:1]))
     if maps:
         fraction = torch.full((side, side), 1 / maps, device=loss.network.device)
-        view.regions = [loss.position_weights(fraction)] * maps
-        style = {0: ScaleTarget({}, None, (RegionTarget(style[0]),) * maps)}
+        view.regions = [loss.targets.position_weights(fraction)] * maps
+    style = {0: (target,) * max(maps, 1)}
 
     def seconds(gradient: bool) -> float:
         timer = Timer(loss.network.device)
@@ -222,8 +215,8 @@ def gradient_error(context: PlanningContext, camera: Camera, side: int) -> Diffe
     memory, gradients = memory_for("activations", context.machine.memory), []
     for each in (network, reference):
         loss = SosLoss(each, content_weight=0, style_loss=context.settings.style_loss, memory=memory)
-        style = loss.style_targets(soft_image(max(image.shape[:2])), (image.shape[0], image.shape[1]))
-        result = loss.evaluate(image, style, loss.view_target(image), [0])
+        style = loss.targets.of_style(Style.of(soft_image(max(image.shape[:2]))), (image.shape[0], image.shape[1]))
+        result = loss.evaluate(image, style, loss.targets.of_view(image), [0])
         assert result.image_gradient is not None
         gradients.append(result.image_gradient)
     return Difference.of(*gradients)
@@ -235,7 +228,7 @@ def _launch_cost(context: PlanningContext, views: Sequence[Camera]) -> LaunchCos
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
     if context.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
         return None
-    return launch_cost(_loss(context, ScaleWeights(settings.scales)), (views[0].height, views[0].width))
+    return launch_cost(_loss(context, settings.scales), (views[0].height, views[0].width))
 
 
 def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
@@ -243,8 +236,8 @@ def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
     if not has_graphs(loss.network.device):
         return LaunchCost(problem="only NVIDIA GPUs are known to replay them")
     image = soft_image(max(size))[: size[0], : size[1]].contiguous().to(loss.network.device)
-    style, view = loss.style_targets(image.flip(0), size), loss.view_target(image)
-    scales = loss.scales(*size)
+    style, view = loss.targets.of_style(Style.of(image.flip(0)), size), loss.targets.of_view(image)
+    scales = loss.tiling.scales(size)
     graphs = LossGraphs(loss)
 
     def evaluate() -> SosResult:

@@ -16,13 +16,14 @@ from torch import Tensor
 
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.difference import Difference
-from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.loss.sos import make_loss
+from sgsst_core.loss.targets import StyleTargets
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName
-from sgsst_core.stylizing.evaluation import Evaluation, StyleTargets, evaluate
+from sgsst_core.stylizing.evaluation import Evaluation, evaluate
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
 
@@ -81,17 +82,10 @@ class ExactLoss:
     def __init__(self, stylizer: Stylizer, style_loss: StyleLossName | None = None) -> None:
         self._stylizer = stylizer
         settings = stylizer.settings
-        style_loss = style_loss or settings.style_loss
-        layers = layers_of(style_loss, stylizer.weights, content=settings.content_weight > 0)
-        self.loss = SosLoss(
-            FeatureNetwork(stylizer.weights, layers, torch.float32, stylizer.network.device),
-            content_weight=settings.content_weight,
-            style_loss=style_loss,
-            memory=stylizer.loss.memory,
-            coarsest=settings.coarsest_side,
-            style_scale=settings.style_scale,
-            scales=stylizer.loss.weights,
-        )
+        settings = settings.model_copy(update={"style_loss": style_loss or settings.style_loss})
+        layers = layers_of(settings.style_loss, stylizer.weights, content=settings.content_weight > 0)
+        network = FeatureNetwork(stylizer.weights, layers, torch.float32, stylizer.network.device)
+        self.loss = make_loss(network, settings, stylizer.loss.memory)
         self._style_targets: dict[tuple[int, int], StyleTargets] = {}
 
     def style_targets(self, camera: Camera) -> StyleTargets:

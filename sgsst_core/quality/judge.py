@@ -20,13 +20,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
-from sgsst_core.loss.sos import resize_area
 from sgsst_core.quality.consistency import shown
 from sgsst_core.quality.lpips import Lpips, unit_features
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Style, mixed_moments
 from sgsst_core.stylizing.job_styles import JobStyles

@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from sgsst_core.budget import measuring_memory
-from sgsst_core.loss.style_losses import has_statistics
+from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.planning.measuring import (
     LEVELS,
     NOTHING,

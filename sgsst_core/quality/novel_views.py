@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from sgsst_core.budget import Cache
-from sgsst_core.loss.sos import ScaleTarget, SosLoss
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.targets import StyleTargets
 from sgsst_core.planning.survey import sees_something
 from sgsst_core.quality.consistency import (
     LONG_RANGE,
@@ -178,7 +179,7 @@ class NovelViews:
         scene: Scene,
         rasterizer: Rasterizer,
         loss: SosLoss,
-        style_targets: Callable[[Camera], Mapping[int, ScaleTarget]],
+        style_targets: Callable[[Camera], StyleTargets],
         *,
         weighted: bool,
         lpips: Lpips | None = None,
@@ -200,10 +201,10 @@ class NovelViews:
             loss.network,
             content_weight=0.0,
             memory=loss.memory,
-            tile_size=loss.tile_size,
-            coarsest=loss.coarsest,
+            tile_size=loss.tiling.tile_size,
+            coarsest=loss.tiling.coarsest,
             scales=loss.weights,
-            leave_out=loss.leave_out,
+            leave_out=loss.divider.leave_out,
         )
         self._sh_rest = scene.sh_rest.to(rasterizer.device)
         self._means = scene.means.to(rasterizer.device)
@@ -293,10 +294,10 @@ class NovelViews:
             image, coverage = picture(index), None
             if self.weighted:
                 coverage = self._coverage.get(index, partial(self.rasterizer.coverage, self.cameras[index]))
-            target = self._loss.view_target(image, coverage)
+            target = self._loss.targets.of_view(image, coverage)
             if self._maps is not None:
                 shares = self._maps.render(self.cameras[index]).unbind(2)
-                target.regions = [self._loss.position_weights(share) for share in shares]
+                target.regions = [self._loss.targets.position_weights(share) for share in shares]
             style = self._style_targets(self.cameras[index])
             for scale, terms in self._loss.evaluate(image, style, target, gradient=False).terms.items():
                 values.setdefault(scale, []).append(terms["gram"])

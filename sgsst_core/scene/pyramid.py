@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
@@ -66,3 +67,12 @@ def style_size(style: tuple[int, int], view: tuple[int, int], scale: float = 1.0
 def coverage_pyramid(coverage: Tensor, levels: int) -> list[Tensor]:
     """Return coverage [H, W] box-averaged at the scales 0 to `levels` - 1."""
     return [downscale(coverage, level) for level in range(levels)]
+
+
+def resize_area(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Downscale an image [H, W, 3] to size (height, width) with an antialiasing filter."""
+    if (image.shape[0], image.shape[1]) == size:
+        return image
+    planes = image.permute(2, 0, 1).unsqueeze(0)
+    resized = torch.nn.functional.interpolate(planes, size=size, mode="bilinear", antialias=True, align_corners=False)
+    return resized[0].permute(1, 2, 0).contiguous()

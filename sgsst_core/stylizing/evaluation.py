@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
-from sgsst_core.loss.sos import ScaleTarget
+from sgsst_core.loss.targets import StyleTargets
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.views import Views
 
 Evaluation = dict[int, LossTerms]
-StyleTargets = dict[int, ScaleTarget]
 
 
 def evaluate(
@@ -26,7 +25,7 @@ def evaluate(
         camera = views.cameras[index]
         with torch.no_grad():
             image = views.render(index, views.colors(index, sh_dc))
-        target = views.target(index, views.loss.scales(camera.height, camera.width))
+        target = views.target(index, views.loss.tiling.scales((camera.height, camera.width)))
         evaluations.append(views.loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
     return mean_evaluation(evaluations)
 

@@ -12,7 +12,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.loss.sos import RegionTarget, ScaleTarget, SosLoss
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.targets import StyleTargets, combined
 from sgsst_core.parallel.division import Size
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions.definition import Regions
@@ -81,19 +82,14 @@ class JobStyles:
 
         return replace(self, own=move(self.own), each=tuple(map(move, self.each)))
 
-    def targets(self, loss: SosLoss, view_size: Size) -> dict[int, ScaleTarget]:
-        """Compute the targets for views of a size (height, width); see `SosLoss.style_targets`."""
+    def targets(self, loss: SosLoss, view_size: Size) -> StyleTargets:
+        """Compute the targets for views of a size (height, width); see `TargetBuilder.of_style`."""
         if not self.each:
-            return loss.style_targets(self.own, view_size)
+            return loss.targets.of_style(self.own, view_size)
         assert self.regions is not None
-        weights = [self.regions.every[place].weight for place in self.regions.active]
-        every = [loss.style_targets(style, view_size) for style in self.each]
-        return {
-            scale: ScaleTarget(
-                {}, None, tuple(RegionTarget(own[scale], weight) for own, weight in zip(every, weights, strict=True))
-            )
-            for scale in every[0]
-        }
+        weights = [self.regions.every[index].weight for index in self.regions.active]
+        targets = [loss.targets.of_style(style, view_size) for style in self.each]
+        return combined(targets, weights)
 
     def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, keep_chroma: bool = False) -> Tensor:
         """Transfer to each Gaussian the colors of its region's style; see `warm_start`.

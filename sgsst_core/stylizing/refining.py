@@ -22,8 +22,8 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.difference import psnr
 from sgsst_core.loss.feature_scale import weights_for
-from sgsst_core.loss.scale_weights import ScaleWeights
-from sgsst_core.loss.sos import ScaleTarget, SosLoss, ViewTarget
+from sgsst_core.loss.sos import make_loss
+from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.context import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
@@ -199,25 +199,21 @@ class _Refining:
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
         style = style.map(lambda image: image.to(device))
         scene = replace(self._scene, sh_dc=with_moments(self._scene.sh_dc, total, style))
-        loss = SosLoss(
+        loss = make_loss(
             self._planning_context.network,
-            content_weight=0.0,
-            style_loss=settings.style_loss,
-            memory=memory_for("activations", self._planning_context.machine.memory),
-            coarsest=settings.coarsest_side,
-            style_scale=settings.style_scale,
-            scales=ScaleWeights(settings.scales),
+            settings.model_copy(update={"content_weight": 0.0}),
+            memory_for("activations", self._planning_context.machine.memory),
         )
-        targets: dict[tuple[int, int], dict[int, ScaleTarget]] = {}
+        targets: dict[tuple[int, int], StyleTargets] = {}
         sums = torch.zeros((len(scene), 2), dtype=torch.float64)
         for index in self._shown(views):
             camera = cameras[index]
             size = (camera.height, camera.width)
             if size not in targets:
-                targets[size] = loss.style_targets(style, size)
+                targets[size] = loss.targets.of_style(style, size)
             image = render(scene, self._rasterizer, camera)
             weighted = settings.position_weights != "off"
-            weights = loss.position_weights(self._rasterizer.coverage(camera)) if weighted else None
+            weights = loss.targets.position_weights(self._rasterizer.coverage(camera)) if weighted else None
             gradient = loss.evaluate(image, targets[size], ViewTarget(coverage=weights)).image_gradient
             assert gradient is not None
             gradient = gradient.to(self._rasterizer.device, self._rasterizer.dtype)

@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Self
 
 import psutil
@@ -20,8 +21,8 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
-from sgsst_core.loss.scale_weights import ScaleWeights
-from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
+from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
+from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import ends_with_transfer, rasterizer_options
 from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
@@ -37,7 +38,6 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.evaluation import (
     Evaluation,
-    StyleTargets,
     evaluate,
     mean_evaluation,
     mean_loss,
@@ -257,20 +257,8 @@ class Stylizer:
         return self.settings.preserve_colors == "luminance"
 
     def _loss(self) -> SosLoss:
-        settings = self.settings
-        return SosLoss(
-            self.network,
-            content_weight=settings.content_weight,
-            style_loss=settings.style_loss,
-            memory=memory_for("activations", self.memory),
-            coarsest=settings.coarsest_side,
-            style_scale=settings.style_scale,
-            scales=ScaleWeights(settings.scales),
-            leave_out="uncovered" not in settings.keep,
-            keep_activations="activations" not in settings.keep,
-            timer=self.timer,
-            collectives=self.group,
-        )
+        memory = memory_for("activations", self.memory)
+        return make_loss(self.network, self.settings, memory, timer=self.timer, collectives=self.group)
 
     def _make_rasterizer(self, seen: Scene, planning_context: PlanningContext | None) -> Rasterizer:
         """Return the plan's rasterizer of the rendered Gaussians."""
@@ -347,12 +335,12 @@ class Stylizer:
     def scale_count(self, index: int) -> int:
         """Return n_s of a view."""
         camera = self.views.cameras[index]
-        return self.loss.scale_count(camera.height, camera.width)
+        return self.loss.tiling.scale_count((camera.height, camera.width))
 
     def scales(self, index: int) -> list[int]:
         """Return the scales of a view with a positive weight, finest first."""
         camera = self.views.cameras[index]
-        return self.loss.scales(camera.height, camera.width)
+        return self.loss.tiling.scales((camera.height, camera.width))
 
     @property
     def evaluation_views(self) -> list[int]:
@@ -444,8 +432,8 @@ class Stylizer:
                 target = self.views.target(index, scales, behind)
                 self._look_ahead(own_views[place + 1 :], phase)
                 style = self.style_targets(self.views.cameras[index])
-            assert target.share is not None
-            self._cost += target.share.cost(self.group.rank, self.network.halo)
+            assert target.division is not None
+            self._cost += target.division.cost(self.group.rank, self.network.halo)
             own, result = self._gradient(index, style, target, scales, behind)
             gradient = own if gradient is None else gradient.add_(own)
             results.append(result)
@@ -471,14 +459,14 @@ class Stylizer:
         """
         # The rasterizer, and with it the colors, may be on the CPU while the network is on a GPU.
         first = largest.double()[None].to(self.network.device)
-        numbers = torch.cat([first, *(result.values.flatten() for result in results)]).tolist()
-        if is_too_large(numbers[0]):
-            raise self._diverged(numbers[0])
-        evaluations, place = [], 1
-        for result in results:
-            count = result.values.numel()
-            evaluations.append(result.terms_from(numbers[place : place + count]))
-            place += count
+        tensors = [first, *(result.values.flatten() for result in results)]
+        magnitude, *values = torch.cat(tensors).cpu().split([len(tensor) for tensor in tensors])
+        if is_too_large(float(magnitude)):
+            raise self._diverged(float(magnitude))
+        evaluations = [
+            replace(result, values=own.view_as(result.values)).terms
+            for result, own in zip(results, values, strict=True)
+        ]
         if self._team.groups > 1:
             with self.timer("communication"):
                 every = self.collectives.all_gather(evaluations)[:: self.group.size]
@@ -497,7 +485,7 @@ class Stylizer:
         """Divide the work again, once in phase 2, in proportion to the measured speeds of the ranks."""
         speeds = self._team.compare_speeds(self._cost, self.timer.seconds)
         if speeds:
-            self.loss.speeds = speeds
+            self.loss.divider.speeds = speeds
             self.views.uncached_fraction()
 
     def _next_view(self) -> int:

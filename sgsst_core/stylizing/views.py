@@ -11,7 +11,9 @@ from torch import Tensor
 
 from sgsst_core.budget import Cache
 from sgsst_core.features.partition import PartitionTile, Rectangle
-from sgsst_core.loss.sos import ContentFeatures, Share, SosLoss, ViewTarget
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.targets import ContentFeatures, ViewTarget
+from sgsst_core.loss.tiling import Division
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide_rows
 from sgsst_core.parallel.shown import ShownGaussians
@@ -103,7 +105,7 @@ class Views:
         images = kept // 2 if drawn else 0
         self._images: Cache[_ImageKey, Tensor] = Cache(images, _tensor_bytes)
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(kept - images)
-        self._shares: dict[tuple[int, tuple[int, ...]], Share] = {}
+        self._shares: dict[tuple[int, tuple[int, ...]], Division] = {}
         self.covered = covered
         self.weighted = weighted
         self.clamp_aware_gradient = clamp_aware_gradient
@@ -270,17 +272,17 @@ class Views:
         """
         coverage = self.coverage(index) if self.weighted else None
         share = self._share(index, scales, coverage)
-        target = ViewTarget(coverage=coverage, share=share, regions=self.region_weights(index))
+        target = ViewTarget(coverage=coverage, division=share, regions=self.region_weights(index))
         if self.loss.content_weight and behind is not None:
             for scale, content in self._content_images(index, scales).items():
                 over = self._content_behind(index, content, behind, scale)
-                target.content[scale] = self.loss.content_features(over, 0, share.tiles[scale])
+                target.content[scale] = self.loss.targets.content_features(over, 0, share.tiles[scale])
         elif self.loss.content_weight:
             image = functools.cache(lambda: self.content(index))
             for scale in scales:
                 pieces = share.pieces[scale]
                 make = functools.partial(self._features, image, scale, share.tiles[scale])
-                size = self.loss.content_bytes(pieces)
+                size = self.loss.targets.content_bytes(pieces)
                 target.content[scale] = self._content.get((index, scale, pieces), make, size)
         return target
 
@@ -308,7 +310,7 @@ class Views:
         self._content.clear()
         self._shares.clear()
 
-    def _share(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> Share:
+    def _share(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> Division:
         """Return the division of work on some scales of a view.
 
         It is computed once, because it requires reading the coverage.
@@ -318,24 +320,24 @@ class Views:
             camera = self.cameras[index]
             sizes = {scale: (camera.height >> scale, camera.width >> scale) for scale in scales}
             known = self._regions[index] if self._regions and self.loss.network.device.type != "cpu" else None
-            self._shares[key] = self.loss.share(sizes, coverage, known)
+            self._shares[key] = self.loss.divider.divide(sizes, coverage, known)
         return self._shares[key]
 
     def _position_weights(self, index: int) -> list[Tensor]:
         band, camera = self._own_band(index), self.cameras[index]
         some = band[0] < band[1]
         rows = self._repeatable.coverage(camera, band) if some else self._nothing(0, camera.width)
-        return self.loss.position_weights(self.collectives.all_gather_rows(rows, self._bands[index]))
+        return self.loss.targets.position_weights(self.collectives.all_gather_rows(rows, self._bands[index]))
 
     def _rendered_regions(self, index: int, maps: RegionMaps) -> list[list[Tensor]]:
         band, camera = self._own_band(index), self.cameras[index]
         some = band[0] < band[1]
         rows = maps.render(camera, band) if some else self._nothing(0, camera.width, maps.count)
         whole = self.collectives.all_gather_rows(rows, self._bands[index])
-        return [self.loss.position_weights(weights) for weights in whole.unbind(2)]
+        return [self.loss.targets.position_weights(weights) for weights in whole.unbind(2)]
 
     def _features(self, image: Callable[[], Tensor], scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
-        return self.loss.content_features(image(), scale, tiles)
+        return self.loss.targets.content_features(image(), scale, tiles)
 
 
 #: Index of the view, and scale.

@@ -8,8 +8,8 @@ from sgsst_core.features.statistics import layer_statistics_reference, merge_all
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.nearest import MOST_VECTORS, positions_per_image
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.style_losses import layers_of
-from sgsst_core.loss.terms import LayerTarget
+from sgsst_core.loss.targets import LayerTarget
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.style import Style, mixed_moments, normalized
 from tests.sgsst_core.pictures import picture
 
@@ -49,31 +49,31 @@ def test_equal_pictures_are_one_picture():
 
 def test_one_picture_is_itself(tiny_weights):
     loss, style = SosLoss(FeatureNetwork(tiny_weights), coarsest=40), picture(90, 70)
-    alone = loss.style_targets(style, (100, 80))
-    weighted = loss.style_targets(Style.weighted([style], [0.3]), (100, 80))
-    for scale, target in alone.items():
+    alone = loss.targets.of_style(Style.of(style), (100, 80))
+    weighted = loss.targets.of_style(Style.weighted([style], [0.3]), (100, 80))
+    for scale, (target,) in alone.items():
         for layer, wanted in target.layers.items():
-            assert torch.equal(weighted[scale].layers[layer].gram, wanted.gram)
-            assert torch.equal(weighted[scale].layers[layer].std, wanted.std)
+            assert torch.equal(weighted[scale][0].layers[layer].gram, wanted.gram)
+            assert torch.equal(weighted[scale][0].layers[layer].std, wanted.std)
 
 
 def test_targets_are_those_of_each_picture_at_its_own_size(tiny_weights):
     pictures, weights = [picture(300, 90, seed=1), picture(40, 64, seed=2)], [3.0, 1.0]
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64), coarsest=40)
-    mixed = loss.style_targets(Style.weighted(pictures, weights), (64, 80))
-    single = [loss.style_targets(each, (64, 80)) for each in pictures]
-    for scale, target in mixed.items():
+    mixed = loss.targets.of_style(Style.weighted(pictures, weights), (64, 80))
+    single = [loss.targets.of_style(Style.of(each), (64, 80)) for each in pictures]
+    for scale, (target,) in mixed.items():
         assert set(target.layers) == set(STYLE_LAYERS)
         for layer, found in target.layers.items():
-            wanted = LayerTarget.mixed([each[scale].layers[layer] for each in single], [0.75, 0.25])
+            wanted = LayerTarget.mixed([each[scale][0].layers[layer] for each in single], [0.75, 0.25])
             assert_same(found, wanted, rtol=1e-13, atol=1e-15)
 
 
 def test_a_tiny_picture_leaves_layers_without_cells_to_the_others(tiny_weights):
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64))
     large, tiny = picture(64, 64), picture(7, 7, seed=2)
-    mixed = loss.style_targets(Style.weighted([large, tiny], [1, 9]), (64, 64))[0].layers
-    alone = loss.style_targets(large, (64, 64))[0].layers
+    mixed = loss.targets.of_style(Style.weighted([large, tiny], [1, 9]), (64, 64))[0][0].layers
+    alone = loss.targets.of_style(Style.of(large), (64, 64))[0][0].layers
     assert_same(mixed["relu4_1"], alone["relu4_1"], rtol=0, atol=0)
     assert not torch.equal(mixed["relu1_1"].mean, alone["relu1_1"].mean)
 
@@ -82,8 +82,8 @@ def test_features_are_matched_with_those_of_all_pictures(tiny_weights):
     network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights, content=False))
     loss = SosLoss(network, style_loss="nnfm", content_weight=0)
     pictures = [picture(40, 48, seed=1), picture(64, 32, seed=2)]
-    mixed = loss.style_targets(Style.weighted(pictures, [1, 5]), (64, 64))[0].vectors.units
-    single = [loss.style_targets(each, (64, 64))[0].vectors.units for each in pictures]
+    mixed = loss.targets.of_style(Style.weighted(pictures, [1, 5]), (64, 64))[0][0].vectors.units
+    single = [loss.targets.of_style(Style.of(each), (64, 64))[0][0].vectors.units for each in pictures]
     assert torch.equal(mixed, torch.cat(single))
 
 

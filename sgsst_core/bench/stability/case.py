@@ -19,13 +19,14 @@ from torch import Tensor
 from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.features.vgg import Activations, FeatureNetwork
-from sgsst_core.loss.sos import SosLoss, SosResult, resize_area
+from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.pyramid import resize_area, style_size
+from sgsst_core.style import Style
 
 Group = Literal[
     "Gaussians", "views", "style and content", "stiff optimization", "precision", "jobs", "files and orbits"
@@ -319,8 +320,8 @@ def _evaluate(
     coverage: Tensor | None,
 ) -> SosResult:
     loss = SosLoss(network, content_weight=content_weight)
-    targets = loss.style_targets(style.to(network.dtype), (image.shape[0], image.shape[1]))
-    view = loss.view_target(content.to(network.dtype), coverage)
+    targets = loss.targets.of_style(Style.of(style.to(network.dtype)), (image.shape[0], image.shape[1]))
+    view = loss.targets.of_view(content.to(network.dtype), coverage)
     return loss.evaluate(image.to(network.dtype), targets, view)
 
 

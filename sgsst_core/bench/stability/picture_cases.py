@@ -12,7 +12,9 @@ from torch import Tensor
 from sgsst_core.bench.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, texture
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.loss.sos_reference import style_loss_reference
-from sgsst_core.loss.terms import LayerTarget, style_loss
+from sgsst_core.loss.statistics_terms import style_loss
+from sgsst_core.loss.targets import LayerTarget
+from sgsst_core.style import Style
 
 _LOSS = "loss and pixel gradient, relative to float64"
 _HEIGHT, _WIDTH = 32, 40
@@ -105,7 +107,7 @@ def _long_style(full: bool) -> CaseResult:
     style = texture(10000, 50, 5)
     single, double = (
         SosLoss(FeatureNetwork(vgg16(), STYLE_LAYERS, dtype), content_weight=0, memory=memory)
-        .style_targets(style.to(dtype), size)[0]
+        .targets.of_style(Style.of(style.to(dtype)), size)[0][0]
         .layers
         for dtype, memory in ((torch.float32, 1 << 28), (torch.float64, 1 << 34))
     )

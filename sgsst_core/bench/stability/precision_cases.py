@@ -22,10 +22,12 @@ from sgsst_core.features.statistics import (
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.terms import LayerTarget, style_loss
+from sgsst_core.loss.statistics_terms import style_loss
+from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 
 #: Relative error bound of a loss that is computed in partition tiles, for any number of tiles.
 _TILES_BOUND = 1e-6
@@ -96,7 +98,9 @@ def _bfloat16(brightest: float, full: bool) -> CaseResult:
     gradients = []
     for dtype in (torch.float32, torch.bfloat16):
         loss = SosLoss(FeatureNetwork(vgg16(), dtype=dtype))
-        gradient = loss.evaluate(image, loss.style_targets(style, (48, 64)), loss.view_target(content)).image_gradient
+        gradient = loss.evaluate(
+            image, loss.targets.of_style(Style.of(style), (48, 64)), loss.targets.of_view(content)
+        ).image_gradient
         assert gradient is not None
         gradients.append(gradient)
     exact, found = gradients
@@ -203,4 +207,6 @@ def _loss_of(size: tuple[int, int], tile_size: int | None, dtype: torch.dtype) -
     """Return the whole loss of an image, and its number of partition tiles."""
     image, style, content = (texture(*size, seed).to(dtype) for seed in (1, 2, 3))
     loss = SosLoss(FeatureNetwork(vgg16(), dtype=dtype), tile_size=tile_size)
-    return loss.evaluate(image, loss.style_targets(style, size), loss.view_target(content)), len(loss.tiles(*size))
+    return loss.evaluate(image, loss.targets.of_style(Style.of(style), size), loss.targets.of_view(content)), len(
+        loss.divider.tiles(size)
+    )

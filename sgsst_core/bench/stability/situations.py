@@ -22,10 +22,12 @@ from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork
 from sgsst_core.loss.feature_scale import even_scales, with_scales
+from sgsst_core.loss.nearest import nearest_weight
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.optimizer import constrained
@@ -204,9 +206,9 @@ def reference_error(job: Stylizer) -> tuple[float, float, int]:
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
         return math.inf, REFERENCE_BOUND, double.flips
-    rounding = job.loss.nearest_weight * _ROUNDING_OF_COSINES
+    rounding = nearest_weight(job.loss.style_loss, job.loss.network.unit) * _ROUNDING_OF_COSINES
     error = max(abs(found.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
-    if not job.loss.nearest_layers:
+    if job.loss.style_loss == "sos":
         off = float((found.image_gradient.double() - exact.image_gradient).norm())
         error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
         uncertain = max(uncertain, _rounding_of_features(job, exact, given, weight))
@@ -304,5 +306,5 @@ def _evaluate(
         scales=job.loss.weights,
     )
     style = job.style.map(lambda own: own.to(network.dtype))
-    targets = loss.style_targets(style, (picture.shape[0], picture.shape[1]))
-    return loss.evaluate(picture.to(network.dtype), targets, loss.view_target(content.to(network.dtype), coverage))
+    targets = loss.targets.of_style(Style.of(style), (picture.shape[0], picture.shape[1]))
+    return loss.evaluate(picture.to(network.dtype), targets, loss.targets.of_view(content.to(network.dtype), coverage))

@@ -15,11 +15,12 @@ if torch.cuda.is_available():
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, has_graphs
-from sgsst_core.loss.sos import SosLoss, SosResult, ViewTarget
-from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.loss.targets import StyleTargets, ViewTarget
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.settings import StyleLossName
-from sgsst_core.stylizing.evaluation import StyleTargets
+from sgsst_core.style import Style
 from sgsst_core.timing import Timer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
@@ -54,12 +55,12 @@ def make_loss(weights: BackboneWeights, **options: Any) -> SosLoss:
 
 
 def style_of(loss: SosLoss) -> StyleTargets:
-    return loss.style_targets(picture(40, 50, seed=1, dtype=torch.float32), (HEIGHT, WIDTH))
+    return loss.targets.of_style(Style.of(picture(40, 50, seed=1, dtype=torch.float32)), (HEIGHT, WIDTH))
 
 
 def view_of(loss: SosLoss, seed: int, *, weighted: bool = False) -> ViewTarget:
     coverage = image(seed + 1000)[:, :, 0].contiguous() if weighted else None
-    return loss.view_target(image(seed + 100), coverage)
+    return loss.targets.of_view(image(seed + 100), coverage)
 
 
 def assert_same(found: SosResult, expected: SosResult) -> None:
@@ -124,14 +125,17 @@ def test_graphs_hold_the_search_for_nearest_vectors(
 def test_every_kind_of_evaluation_has_a_graph_of_its_own(tiny_weights: BackboneWeights) -> None:
     """Graphs differ by scales, image scale and style targets, and interleaved ones do not interfere."""
     loss = make_loss(tiny_weights)
-    whole, other = style_of(loss), loss.style_targets(picture(60, 60, seed=7, dtype=torch.float32), (HEIGHT, WIDTH))
+    whole, other = (
+        style_of(loss),
+        loss.targets.of_style(Style.of(picture(60, 60, seed=7, dtype=torch.float32)), (HEIGHT, WIDTH)),
+    )
     content = image(8)
     graphs = LossGraphs(loss)
 
     def view(scales: list[int]) -> ViewTarget:
-        share = loss.share({scale: (HEIGHT >> scale, WIDTH >> scale) for scale in scales})
-        own = {scale: loss.content_features(content, scale, tiles) for scale, tiles in share.tiles.items()}
-        return ViewTarget(content=own, share=share)
+        share = loss.divider.divide({scale: (HEIGHT >> scale, WIDTH >> scale) for scale in scales})
+        own = {scale: loss.targets.content_features(content, scale, tiles) for scale, tiles in share.tiles.items()}
+        return ViewTarget(content=own, division=share)
 
     for step in range(3):
         for pixels, style, scales, image_scale in (
@@ -149,7 +153,7 @@ def test_every_kind_of_evaluation_has_a_graph_of_its_own(tiny_weights: BackboneW
 @pytest.mark.usefixtures("without_triton")
 def test_there_are_no_more_graphs_than_asked_for(tiny_weights: BackboneWeights) -> None:
     loss = make_loss(tiny_weights, content_weight=0.0)
-    view, styles = loss.view_target(image(2)), [style_of(loss), style_of(loss)]
+    view, styles = loss.targets.of_view(image(2)), [style_of(loss), style_of(loss)]
     graphs = LossGraphs(loss, most=1)
     for step in range(3):
         for style in styles:
@@ -162,7 +166,7 @@ def test_what_cannot_be_captured_is_evaluated_as_ever(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loss = make_loss(tiny_weights, content_weight=0.0)
-    style, view = style_of(loss), loss.view_target(image(2))
+    style, view = style_of(loss), loss.targets.of_view(image(2))
     graphs = LossGraphs(loss)
     convolve = FeatureNetwork._convolve
 
@@ -193,7 +197,7 @@ def test_only_scales_of_one_tile_that_fit_twice_are_captured(
     network = FeatureNetwork(tiny_weights, device="cuda")
     once = HEIGHT * WIDTH * (network.held_bytes_per_pixel() + network.working_bytes_per_pixel())
     loss = make_loss(tiny_weights, content_weight=0.0, memory=int(fits * once), **options)
-    style, view = style_of(loss), loss.view_target(image(2))
+    style, view = style_of(loss), loss.targets.of_view(image(2))
     graphs = LossGraphs(loss)
     for step in range(FIRST_VISITS):
         assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
@@ -204,7 +208,7 @@ def test_only_scales_of_one_tile_that_fit_twice_are_captured(
 def test_a_view_without_its_content_is_not_captured(tiny_weights: BackboneWeights) -> None:
     """A graph would recompute the content features of the captured view in every replay."""
     loss = make_loss(tiny_weights)
-    style, view = style_of(loss), loss.view_target(image(2), keep_content=False)
+    style, view = style_of(loss), loss.targets.of_view(image(2), keep_content=False)
     graphs = LossGraphs(loss)
     for step in range(FIRST_VISITS):
         assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
@@ -222,5 +226,5 @@ def test_where_graphs_are_thought_of(tiny_weights: BackboneWeights) -> None:
         rank, size, local_size = 0, 2, 2
 
     loss = SosLoss(network, collectives=Two())  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="ranks tell each other"):
+    with pytest.raises(ValueError, match="communication between ranks"):
         LossGraphs(loss)

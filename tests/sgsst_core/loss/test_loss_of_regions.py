@@ -6,11 +6,13 @@ import torch
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.statistics import layer_statistics, merge
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.sos import RegionTarget, ScaleTarget, SosLoss, resize_area
-from sgsst_core.loss.sos_reference import RegionReference, sos_reference
-from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.sos_reference import StyledWeights, sos_reference
+from sgsst_core.loss.targets import combined
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.regions.definition import Region, Regions, check_regions
-from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.pyramid import resize_area, style_size
+from sgsst_core.style import Style
 from tests.networks import comparing_pixels
 from tests.sgsst_core.pictures import picture, relative_error
 
@@ -26,18 +28,14 @@ def shares(size, count):
 
 
 def targets_of(loss, styles, weights):
-    every = [loss.style_targets(style, SIZE) for style in styles]
-    return {
-        scale: ScaleTarget({}, None, tuple(RegionTarget(own[scale], w) for own, w in zip(every, weights, strict=True)))
-        for scale in every[0]
-    }
+    return combined([loss.targets.of_style(Style.of(style), SIZE) for style in styles], weights)
 
 
 def evaluate(network, image, content, styles, maps, weights, **options):
     dtype = network.dtype
     loss = SosLoss(network, coarsest=60, **options)
-    view = loss.view_target(content.to(dtype))
-    view.regions = [loss.position_weights(share) for share in maps]
+    view = loss.targets.of_view(content.to(dtype))
+    view.regions = [loss.targets.position_weights(share) for share in maps]
     return loss.evaluate(image.to(dtype), targets_of(loss, [s.to(dtype) for s in styles], weights), view)
 
 
@@ -52,7 +50,7 @@ def case():
 def test_float64_agrees_with_autograd(tiny_weights, case, tile_size, style_loss, pixels):
     tiny_weights = comparing_pixels(tiny_weights) if pixels else tiny_weights
     image, content, styles, maps, weights = case
-    parts = [RegionReference(*part) for part in zip(styles, maps, weights, strict=True)]
+    parts = [StyledWeights(*part) for part in zip(styles, maps, weights, strict=True)]
     expected, gradient = sos_reference(tiny_weights, image, parts, content, coarsest=60, style_loss=style_loss)
     layers = layers_of(style_loss, tiny_weights, content=True)
     network = FeatureNetwork(tiny_weights, layers, torch.float64)
@@ -85,9 +83,11 @@ def test_one_region_of_everything_is_a_view_without_regions(tiny_weights, case):
     network = FeatureNetwork(tiny_weights)
     loss = SosLoss(network, coarsest=60)
     content = content.float()
-    plain = loss.evaluate(image.float(), loss.style_targets(styles[0], SIZE), loss.view_target(content, maps[2]))
-    view = loss.view_target(content, maps[2])
-    view.regions = [loss.position_weights(maps[2])]
+    plain = loss.evaluate(
+        image.float(), loss.targets.of_style(Style.of(styles[0]), SIZE), loss.targets.of_view(content, maps[2])
+    )
+    view = loss.targets.of_view(content, maps[2])
+    view.regions = [loss.targets.position_weights(maps[2])]
     found = loss.evaluate(image.float(), targets_of(loss, styles[:1], [1.0]), view)
     assert torch.equal(found.values, plain.values)
     assert torch.equal(found.image_gradient, plain.image_gradient)

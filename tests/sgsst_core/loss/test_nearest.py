@@ -10,12 +10,22 @@ from sgsst_core.errors import ImageError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss import nearest
-from sgsst_core.loss.nearest import MOST_VECTORS, Matches, StyleVectors, chosen_places, nearest_reference, search
+from sgsst_core.loss.nearest import (
+    MOST_VECTORS,
+    NEAREST_WEIGHTS,
+    Matches,
+    chosen_places,
+    nearest_layers,
+    nearest_reference,
+    search,
+)
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.sos_reference import sos_reference
-from sgsst_core.loss.style_losses import NEAREST_WEIGHTS, layers_of, nearest_layers
+from sgsst_core.loss.targets import StyleVectors
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.settings import StyleLossName
+from sgsst_core.style import Style
 from tests.networks import comparing_pixels
 from tests.networks import tiny_weights as make_tiny_weights
 from tests.sgsst_core.pictures import picture, relative_error
@@ -45,8 +55,8 @@ def evaluate(loss: SosLoss, case: tuple[Tensor, Tensor, Tensor, Tensor | None]) 
     assert image is not None
     assert style is not None
     assert content is not None
-    targets = loss.style_targets(style, (image.shape[0], image.shape[1]))
-    return loss.evaluate(image, targets, loss.view_target(content, coverage))
+    targets = loss.targets.of_style(Style.of(style), (image.shape[0], image.shape[1]))
+    return loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
 
 
 def gradient_of(result: SosResult) -> Tensor:
@@ -224,7 +234,7 @@ def test_a_style_of_hardly_any_vector(
     tiny_weights: BackboneWeights, style_loss: StyleLossName, size: tuple[int, int]
 ) -> None:
     loss = loss_of(tiny_weights, style_loss)
-    vectors = loss.style_targets(picture(*size, seed=3), (100, 80))[0].vectors
+    vectors = loss.targets.of_style(Style.of(picture(*size, seed=3)), (100, 80))[0][0].vectors
     assert vectors is not None
     assert len(vectors.units) == size[0] // 4 * (size[1] // 4)
     image, _, content, _ = setting(100, 80)
@@ -235,10 +245,10 @@ def test_a_style_of_hardly_any_vector(
 
 def test_a_style_without_a_vector_is_refused(tiny_weights: BackboneWeights) -> None:
     with pytest.raises(ImageError, match="The style is used at 200 x 3 pixels, too few to match"):
-        loss_of(tiny_weights, "nnfm").style_targets(picture(3, 200), (100, 80))
+        loss_of(tiny_weights, "nnfm").targets.of_style(Style.of(picture(3, 200)), (100, 80))
     without_full_size = loss_of(tiny_weights, "nnfm", coarsest=40, scales=ScaleWeights((0.0, 1.0)))
     with pytest.raises(ImageError, match="The style is used at 100 x 2 pixels, too few to match"):
-        without_full_size.style_targets(picture(4, 200), (100, 80))
+        without_full_size.targets.of_style(Style.of(picture(4, 200)), (100, 80))
 
 
 def test_large_styles_are_thinned_evenly() -> None:
@@ -257,10 +267,10 @@ def test_large_styles_are_thinned_evenly() -> None:
 def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
     tiny_weights: BackboneWeights, tile_size: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sgsst_core.loss.sos.MOST_VECTORS", 200)
+    monkeypatch.setattr("sgsst_core.loss.target_builder.MOST_VECTORS", 200)
     style = picture(130, 201, seed=3)
     loss = loss_of(tiny_weights, "nnfm", tile_size=tile_size)
-    vectors = loss.style_targets(style, (130, 201))[0].vectors
+    vectors = loss.targets.of_style(Style.of(style), (130, 201))[0][0].vectors
     assert vectors is not None
     found = loss.network.forward(style, keep=False).features
     whole = torch.cat([found[layer] for layer in nearest_layers("nnfm", "vgg16")], dim=2).flatten(0, 1)
@@ -273,6 +283,6 @@ def test_layers_are_those_that_a_loss_reads() -> None:
     assert layers_of("sos", large, content=True) == (*STYLE_LAYERS, CONTENT_LAYER)
     assert layers_of("sos", comparing_pixels(small), content=False) == (PIXELS, *STYLE_LAYERS)
     assert layers_of("nnfm", comparing_pixels(small), content=False) == ("relu3_1", "relu3_2", "relu3_3")
-    assert layers_of("nnfm", large, content=True) == ("relu3_1", "relu3_2", "relu3_3", "relu3_4", CONTENT_LAYER)
+    assert layers_of("nnfm", large, content=True) == (CONTENT_LAYER, "relu3_1", "relu3_2", "relu3_3", "relu3_4")
     assert layers_of("mixed", small, content=False) == (*STYLE_LAYERS, "relu3_2", "relu3_3")
     assert NEAREST_WEIGHTS["sos"] == 0

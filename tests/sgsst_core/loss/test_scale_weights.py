@@ -11,10 +11,11 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights, check_scales
-from sgsst_core.loss.sos import SosLoss, SosResult, resize_area
+from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.sos_reference import sos_reference
-from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from tests.sgsst_core.pictures import picture, relative_error
 from tests.small_scenes import cameras
 
@@ -39,8 +40,8 @@ def evaluate(
 
     network.forward = looked  # type: ignore[method-assign, assignment]
     loss = SosLoss(network, tile_size=tile_size, coarsest=COARSEST, scales=ScaleWeights(values))
-    targets = loss.style_targets(painting, SIZE)
-    result = loss.evaluate(image, targets, loss.view_target(content, coverage))
+    targets = loss.targets.of_style(Style.of(painting), SIZE)
+    result = loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
     assert targets.keys() == set(result.scales)
     return result, seen
 

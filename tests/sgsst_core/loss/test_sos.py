@@ -6,11 +6,13 @@ import pytest
 import torch
 
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, Activations, FeatureNetwork
-from sgsst_core.loss.sos import ScaleTarget, SosLoss, resize_area
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.sos_reference import sos_reference
-from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.loss.targets import StyleTarget
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.scene import pyramid
-from sgsst_core.scene.pyramid import scale_count, style_size
+from sgsst_core.scene.pyramid import resize_area, scale_count, style_size
+from sgsst_core.style import Style
 from tests.networks import comparing_pixels
 from tests.sgsst_core.pictures import picture, relative_error
 
@@ -33,8 +35,8 @@ def setting(size, *, covered=False):
 def evaluate(network, case, tile_size, **options):
     image, style, content, coverage = (None if t is None else t.to(network.dtype) for t in case)
     loss = SosLoss(network, tile_size=tile_size, **options)
-    targets = loss.style_targets(style, image.shape[:2])
-    return loss.evaluate(image, targets, loss.view_target(content, coverage))
+    targets = loss.targets.of_style(Style.of(style), image.shape[:2])
+    return loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
 
 
 @pytest.mark.parametrize(
@@ -63,9 +65,10 @@ def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny
     loss = SosLoss(network, content_weight=0)
     image, style = picture(40, 56, seed=1).float(), picture(40, 56, seed=3).float()
     only = {
-        scale: ScaleTarget({PIXELS: own.layers[PIXELS]}) for scale, own in loss.style_targets(style, (40, 56)).items()
+        scale: (StyleTarget({PIXELS: own[0].layers[PIXELS]}),)
+        for scale, own in loss.targets.of_style(Style.of(style), (40, 56)).items()
     }
-    found = loss.evaluate(image, only, loss.view_target(image))
+    found = loss.evaluate(image, only, loss.targets.of_view(image))
     values = [(256 * part.double()).flatten(0, 1) for part in (image, style)]
     means, deviations = (
         [own(part) for part in values] for own in (lambda x: x.mean(0), lambda x: x.std(0, correction=0))
@@ -75,7 +78,7 @@ def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny
     assert found.terms[0]["std"] == pytest.approx(
         9e4 * float((deviations[0] - deviations[1]).square().mean()), rel=1e-5
     )
-    matched = loss.evaluate(style, only, loss.view_target(style))
+    matched = loss.evaluate(style, only, loss.targets.of_view(style))
     assert matched.loss < 1e-9 * found.loss
 
 
@@ -166,9 +169,9 @@ def test_content_features_kept_or_computed_again(tiny_weights):
     network = FeatureNetwork(tiny_weights)
     image, style, content, _ = (None if t is None else t.float() for t in setting((200, 300)))
     loss = SosLoss(network)
-    targets = loss.style_targets(style, (200, 300))
-    kept = loss.evaluate(image, targets, loss.view_target(content))
-    again = loss.evaluate(image, targets, loss.view_target(content, keep_content=False))
+    targets = loss.targets.of_style(Style.of(style), (200, 300))
+    kept = loss.evaluate(image, targets, loss.targets.of_view(content))
+    again = loss.evaluate(image, targets, loss.targets.of_view(content, keep_content=False))
     assert kept.loss == again.loss
     assert torch.equal(kept.image_gradient, again.image_gradient)
     assert kept.terms[0]["content"] > 0
@@ -180,7 +183,8 @@ def test_left_out_content_and_layers(tiny_weights):
     full = SosLoss(FeatureNetwork(tiny_weights, (*STYLE_LAYERS, CONTENT_LAYER)), content_weight=0)
     lean = SosLoss(FeatureNetwork(tiny_weights, STYLE_LAYERS), content_weight=0)
     results = [
-        loss.evaluate(image, loss.style_targets(style, (200, 300)), loss.view_target(content)) for loss in (full, lean)
+        loss.evaluate(image, loss.targets.of_style(Style.of(style), (200, 300)), loss.targets.of_view(content))
+        for loss in (full, lean)
     ]
     assert torch.equal(results[0].image_gradient, results[1].image_gradient)
     shallow = FeatureNetwork(tiny_weights, ("relu1_1", "relu2_1"))
@@ -191,7 +195,7 @@ def test_loss_only_is_the_same_loss(tiny_weights):
     network = FeatureNetwork(tiny_weights)
     image, style, content, coverage = (t.float() for t in setting((200, 300), covered=True))
     loss = SosLoss(network)
-    targets, view = loss.style_targets(style, (200, 300)), loss.view_target(content, coverage)
+    targets, view = loss.targets.of_style(Style.of(style), (200, 300)), loss.targets.of_view(content, coverage)
     only = loss.evaluate(image, targets, view, gradient=False)
     assert only.image_gradient is None
     assert only.terms == loss.evaluate(image, targets, view).terms
@@ -212,7 +216,7 @@ def test_uncovered_pixels_get_no_gradient_of_their_own(tiny_weights):
     coverage[:64] = 1
     image, style, content, _ = (None if t is None else t.float() for t in setting(size))
     loss = SosLoss(FeatureNetwork(tiny_weights))
-    result = loss.evaluate(image, loss.style_targets(style, size), loss.view_target(content, coverage))
+    result = loss.evaluate(image, loss.targets.of_style(Style.of(style), size), loss.targets.of_view(content, coverage))
     assert result.image_gradient[:64].abs().max() > 0
     assert result.image_gradient[64 + 16 + 64 :].abs().max() == 0
 
@@ -222,7 +226,7 @@ def test_scales_are_averaged(tiny_weights):
     assert scale_count(*size) == 2
     image, style, content, _ = (None if t is None else t.float() for t in setting(size))
     loss = SosLoss(FeatureNetwork(tiny_weights))
-    targets, view = loss.style_targets(style, size), loss.view_target(content)
+    targets, view = loss.targets.of_style(Style.of(style), size), loss.targets.of_view(content)
     both = loss.evaluate(image, targets, view)
     single = [loss.evaluate(image, targets, view, [scale]) for scale in (0, 1)]
     assert both.loss == pytest.approx((single[0].loss + single[1].loss) / 2, rel=1e-12)

@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
-from sgsst_core.loss.sos import resize_area
 from sgsst_core.quality.judge import JUDGED_SIDE, Judge, Judgment, frechet_distance, saturated
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -20,6 +19,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.pyramid import resize_area
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.style import Style

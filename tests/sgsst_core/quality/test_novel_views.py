@@ -19,9 +19,9 @@ from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.loss.sos import SosLoss, resize_area
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.sos_reference import box_average_reference, features_reference
-from sgsst_core.loss.terms import GRAM_WEIGHT
+from sgsst_core.loss.statistics_terms import GRAM_WEIGHT
 from sgsst_core.planning.measuring import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
 from sgsst_core.quality.lpips import Lpips
@@ -30,7 +30,9 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
 from sgsst_core.scene.gaussians import Scene, sampled
+from sgsst_core.scene.pyramid import resize_area
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.style import Style
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 AXIS = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
@@ -203,7 +205,7 @@ def novel_views(
     def style_targets(camera: Camera):
         size = (camera.height, camera.width)
         if size not in targets:
-            targets[size] = loss.style_targets(style(), size)
+            targets[size] = loss.targets.of_style(Style.of(style()), size)
         return targets[size]
 
     options = {"covered": range(len(views)), "weighted": False, **options}

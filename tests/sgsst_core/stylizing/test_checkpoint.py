@@ -147,12 +147,14 @@ def with_terms(kept: Checkpoint, **terms: float) -> Checkpoint:
 def test_a_term_that_the_loss_did_not_have_yet_is_0(
     kept: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    last = list(TERMS)[-1]
     with monkeypatch.context() as patch:
-        patch.delitem(TERMS, "nearest")  # the last term, so that undoing the patch restores the order
+        patch.delitem(TERMS, last)  # undoing the patch restores the order
         save_checkpoint(tmp_path / "c", with_terms(kept, gram=1.0, mean=2.0, std=3.0), "job")
     (record,) = load_checkpoint(tmp_path / "c", "job").state.history
-    assert record.terms == {0: LossTerms(gram=1.0, mean=2.0, std=3.0, nearest=0.0)}
-    assert list(TERMS)[-1] == "nearest"
+    assert record.terms == {0: LossTerms(gram=1.0, mean=2.0, std=3.0)}
+    assert record.terms[0][last] == 0
+    assert list(TERMS)[-1] == last
 
 
 def test_a_term_that_the_loss_does_not_have_is_refused_by_name(

@@ -9,8 +9,8 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.sos import SosLoss, resize_area
-from sgsst_core.scene.pyramid import style_size
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job_styles import _inside, check_style_size, prepared_style, rotated
@@ -111,8 +111,8 @@ def test_larger_strokes_are_statistics_of_a_larger_style(tiny_weights: BackboneW
     size = style_size((96, 120), view, scale)
     assert size == (round(64 * scale), round(80 * scale))
     network = FeatureNetwork(tiny_weights)
-    found = SosLoss(network, style_scale=scale).style_targets(style, view)[0]
-    wanted = SosLoss(network).style_targets(resize_area(style, size), size)[0]
+    found = SosLoss(network, style_scale=scale).targets.of_style(Style.of(style), view)[0][0]
+    wanted = SosLoss(network).targets.of_style(Style.of(resize_area(style, size)), size)[0][0]
     for layer in found.layers:
         torch.testing.assert_close(found.layers[layer].gram, wanted.layers[layer].gram)
 
@@ -139,7 +139,7 @@ def test_a_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
     (used,) = stylizer.style.images
     assert used.shape == (60, 40, 3)
-    assert stylizer.loss.style_scale == 2
+    assert stylizer.loss.targets.style_scale == 2
     weights = stylizer.plan.survey.total_blend_weights
     (wanted,) = prepared_style(Style.of(style), settings, scene.sh_dc, weights).images
     assert torch.equal(used, wanted)

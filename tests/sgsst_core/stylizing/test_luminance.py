@@ -12,12 +12,12 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.sos import SosLoss, resize_area
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.luminance import luminance
-from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
@@ -106,8 +106,8 @@ def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> Non
     expected, gradient = sos_reference(weights, image, painting, content, coverage=coverage, coarsest=70)
     for tile_size in (None, 64):
         loss = SosLoss(FeatureNetwork(weights, dtype=torch.float64), tile_size=tile_size, coarsest=70)
-        targets = loss.style_targets(painting, (129, 161))
-        found = loss.evaluate(image, targets, loss.view_target(content, coverage))
+        targets = loss.targets.of_style(Style.of(painting), (129, 161))
+        found = loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
         assert found.loss == pytest.approx(expected, rel=1e-9)
         assert found.image_gradient is not None
         assert relative_error(found.image_gradient, gradient) < 1e-9

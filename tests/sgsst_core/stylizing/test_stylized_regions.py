@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.sos import ViewTarget
+from sgsst_core.loss.targets import ViewTarget
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
@@ -248,6 +248,6 @@ def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: Back
     view = stylizer.views.target(0, [0])
     targets = stylizer.style_targets(stylizer.views.cameras[0])
     image = stylizer.views.render(0, stylizer.views.colors(0, stylizer.sh_dc.detach()))
-    bare = ViewTarget(view.content_image, view.content, view.coverage, view.share)
+    bare = ViewTarget(view.content_image, view.content, view.coverage, view.division)
     with pytest.raises(ValueError, match="not prepared for the regions"):
         stylizer.loss.evaluate(image, targets, bare, [0])

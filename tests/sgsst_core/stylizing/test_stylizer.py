@@ -215,14 +215,14 @@ def test_the_style_is_taken_for_no_views_price(
 ) -> None:
     """The style takes a thousand seconds of the first step, which must not recur in the predicted remaining time."""
     stylizer, seen = make(tiny_weights, scene), list[Progress]()
-    style_targets, clock, late = stylizer.loss.style_targets, time.perf_counter, [0.0]
+    style_targets, clock, late = stylizer.loss.targets.of_style, time.perf_counter, [0.0]
 
     def slowly(*arguments: Any) -> Any:
         late[0] += 1000.0
         return style_targets(*arguments)
 
     monkeypatch.setattr(time, "perf_counter", lambda: clock() + late[0])
-    monkeypatch.setattr(stylizer.loss, "style_targets", slowly)
+    monkeypatch.setattr(stylizer.loss.targets, "of_style", slowly)
     run(stylizer, Callbacks(progress=seen.append))
     assert seen[0].seconds > 1000
     assert all(now.seconds_left < 1000 for now in seen)

@@ -111,7 +111,7 @@ def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeight
     stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
     coverage = stylizer.views.coverage(0)[0][..., None]
     content = coverage * photo + (1 - coverage) * torch.tensor(COLOR)
-    expected = stylizer.loss.view_target(content, coverage[..., 0]).content[0]
+    expected = stylizer.loss.targets.of_view(content, coverage[..., 0]).content[0]
     found = stylizer.views.target(0, [0], COLOR).content[0]
     for tile, features in expected.items():
         torch.testing.assert_close(found[tile], features, rtol=1e-4, atol=1e-2)

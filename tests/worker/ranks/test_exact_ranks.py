@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.style_losses import layers_of
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
@@ -56,7 +56,7 @@ def gradient(
     loss = SosLoss(
         network, style_loss=style_loss, memory=memory, tile_size=tile_size, coarsest=40, collectives=collectives
     )
-    loss.speeds = speeds or loss.speeds
+    loss.divider.speeds = speeds or loss.divider.speeds
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     survey = survey_views(scene, [camera], rasterizer)
     weighted = survey.uncovered_share > 0.01
@@ -74,14 +74,14 @@ def gradient(
         maps=styles.maps(rasterizer),
         collectives=collectives,
     )
-    scales = range(loss.scale_count(camera.height, camera.width))
+    scales = range(loss.tiling.scale_count((camera.height, camera.width)))
     target = views.target(0, scales)
     targets = styles.targets(loss, (camera.height, camera.width))
     colors = views.colors(0, torch.roll(scene.sh_dc, 1, dims=0).to(dtype))
     result = loss.evaluate(views.render(0, colors), targets, target, scales)
     assert result.image_gradient is not None
-    assert target.share is not None
-    kept = loss.tiling.kept([tile.outer.pixels for tiles in target.share.tiles.values() for tile in tiles])
+    assert target.division is not None
+    kept = loss.tiling.kept([tile.outer.pixels for tiles in target.division.tiles.values() for tile in tiles])
     return views.gradient(0, result.image_gradient, colors), result.loss, kept
 
 
@@ -269,7 +269,7 @@ def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[st
     colors = stylizer.sh_dc.detach().clone()
     for _ in range(8):
         stylizer.run_step()
-    speeds = stylizer.loss.speeds
+    speeds = stylizer.loss.divider.speeds
     with torch.no_grad():
         stylizer.sh_dc.copy_(colors)
     return {"speeds": speeds, "before": before, "after": stylizer.gradient(0, [0])[0]}

@@ -1,0 +1,134 @@
+"""Content term: lambda_c mean((F_42 - F_42^content)^2), the mean weighted by coverage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from sgsst_core.features.partition import PartitionTile
+from sgsst_core.features.vgg import CONTENT_LAYER
+from sgsst_core.loss.position_term import (
+    Objective,
+    PositionTerm,
+    PositionWeights,
+    ReferenceInputs,
+    ScaledView,
+    TermInputs,
+)
+from sgsst_core.loss.targets import ContentFeatures
+
+
+def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
+    """Return lambda_c / (n c), the factor of the content term of a whole view, float64 scalar.
+
+    Args:
+        count: n, float64 scalar: number of positions or sum of their weights. If it is 0, the factor is 0.
+        channels: c.
+        weight: lambda_c.
+    """
+    return weight / (torch.where(count > 0, count, torch.inf) * channels)
+
+
+@dataclass(frozen=True)
+class ContentDifference:
+    """Difference between content features and their target on some cells.
+
+    Attributes:
+        difference: [h, w, c], float32 or float64.
+        weighted: Difference times the position weights.
+        factor: lambda_c / (n c), float64, where n is the number of positions of the view or the sum of their weights.
+    """
+
+    difference: Tensor
+    weighted: Tensor
+    factor: Tensor
+
+    @staticmethod
+    def of(
+        features: Tensor, content: Tensor, factor: Tensor, position_weights: Tensor | None = None
+    ) -> ContentDifference:
+        """Compare features of the image with those of the content image at the same positions.
+
+        Args:
+            features: [h, w, c].
+            content: [h, w, c].
+            factor: Result of `content_factor`.
+            position_weights: [h, w]; None for equal weights.
+        """
+        precision = torch.promote_types(features.dtype, torch.float32)
+        difference = features.to(precision) - content.to(precision)
+        weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
+        return ContentDifference(difference, weighted, factor)
+
+    def loss(self) -> Tensor:
+        """Return the contribution of these cells to the content loss, float64 scalar."""
+        # A float32 dot product over a whole view would lose digits, so rows are summed first and then added in float64.
+        return self.factor * (self.weighted * self.difference).sum(dim=(1, 2)).sum(dtype=torch.float64)
+
+    def gradient(self) -> Tensor:
+        """Return the gradient with respect to the features, [h, w, c]."""
+        return self.weighted * (2 * self.factor)
+
+
+@dataclass(frozen=True)
+class ContentTerm(PositionTerm):
+    """Content term of one scale of a view.
+
+    Attributes:
+        view: Scale of the view.
+        content: Content features.
+        coverage: Position weights.
+        factor: Result of `content_factor`.
+    """
+
+    name = "content"
+    label = "content"
+
+    view: ScaledView
+    content: ContentFeatures
+    coverage: PositionWeights
+    factor: Tensor
+
+    @staticmethod
+    def layers(objective: Objective) -> tuple[str, ...]:
+        """Return the content layer, if the objective has a content term."""
+        return (CONTENT_LAYER,) if objective.content_weight else ()
+
+    @classmethod
+    def of(cls, inputs: TermInputs) -> Self | None:
+        """Return the term of one scale of a view; None if the loss does not have it."""
+        if inputs.content is None:
+            return None
+        count = inputs.view.count(CONTENT_LAYER, inputs.coverage)
+        factor = content_factor(count, inputs.network.channels(CONTENT_LAYER), inputs.objective.content_weight)
+        return cls(inputs.view, inputs.content, inputs.coverage, factor)
+
+    def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
+        """Return the contribution of the cells that a tile owns, float64 scalar."""
+        return self._difference(tile, features[CONTENT_LAYER]).loss()
+
+    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> None:
+        """Add the derivative of `value` with respect to a layer's features to a gradient in place."""
+        if layer == CONTENT_LAYER:
+            cells = tile.owned_cells(CONTENT_LAYER, self.view.size)[1]
+            gradient[cells.slices] += self._difference(tile, features).gradient()
+
+    def _difference(self, tile: PartitionTile, features: Tensor) -> ContentDifference:
+        in_view, in_tile = tile.owned_cells(CONTENT_LAYER, self.view.size)
+        weights = self.view.weights(CONTENT_LAYER, in_view, self.coverage)
+        return ContentDifference.of(features[in_tile.slices], self.content[tile], self.factor, weights)
+
+    @staticmethod
+    def reference(inputs: ReferenceInputs) -> Tensor | None:
+        """Compute the term from its definition; None if the loss does not have it."""
+        if inputs.content is None or not inputs.objective.content_weight:
+            return None
+        difference = inputs.features[CONTENT_LAYER] - inputs.content[CONTENT_LAYER]
+        weights = inputs.coverage(CONTENT_LAYER)
+        a = torch.ones(difference.shape[:2], dtype=torch.float64) if weights is None else weights
+        mean = (a[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
+        return inputs.objective.content_weight * mean

@@ -1,0 +1,180 @@
+"""Interface of the loss terms that are sums over the positions of one scale of a view."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Self
+
+import torch
+from torch import Tensor
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.partition import PartitionTile, Rectangle
+from sgsst_core.features.vgg import FeatureNetwork, layer_stride
+from sgsst_core.loss.targets import ContentFeatures, StyleTarget
+from sgsst_core.parallel.division import Size
+from sgsst_core.settings import StyleLossName
+from sgsst_core.timing import Timer
+
+#: Position weights [H >> k, W >> k] for each power of two 2^k; None for equal weights.
+PositionWeights = Sequence[Tensor] | None
+
+
+@dataclass(frozen=True)
+class ScaledView:
+    """One scale of a view.
+
+    Attributes:
+        image: [h, w, 3], on the network's device.
+        scale: Scale; 0 is full size.
+    """
+
+    image: Tensor
+    scale: int
+
+    @property
+    def size(self) -> Size:
+        """(height, width) in pixels."""
+        return self.image.shape[0], self.image.shape[1]
+
+    def weights(self, layer: str, cells: Rectangle, pyramid: PositionWeights) -> Tensor | None:
+        """Return the weights [h, w] of some cells of a layer, as box averages; None for equal weights."""
+        if pyramid is None:
+            return None
+        return pyramid[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
+
+    def count(self, layer: str, pyramid: PositionWeights) -> Tensor:
+        """Return the number of cells of a layer in the whole scale, or the sum of their weights, float64 scalar."""
+        stride = layer_stride(layer)
+        cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
+        weights = self.weights(layer, cells, pyramid)
+        if weights is not None:
+            return weights.sum(dtype=torch.float64)
+        return torch.full((), cells.pixels, dtype=torch.float64, device=self.image.device)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Choice of terms.
+
+    Attributes:
+        network: Feature network, "vgg16" or "vgg19".
+        style_loss: Style loss; see `terms`.
+        content_weight: lambda_c; 0 for no content term.
+    """
+
+    network: str
+    style_loss: StyleLossName = "sos"
+    content_weight: float = 1.0
+
+
+class StyledRegion(NamedTuple):
+    """Positions of a view, and the style that they are compared with."""
+
+    style: StyleTarget
+    weights: PositionWeights
+
+
+@dataclass(frozen=True)
+class TermInputs:
+    """Inputs of the terms of one scale of a view.
+
+    Attributes:
+        view: Scale of the view.
+        network: Feature network.
+        objective: Choice of terms.
+        regions: Regions with their styles; a single one for the whole view if the scene has no regions.
+        content: Content features; None without a content term.
+        coverage: Position weights of terms that do not depend on the style.
+        timer: Timer of this evaluation.
+    """
+
+    view: ScaledView
+    network: FeatureNetwork
+    objective: Objective
+    regions: Sequence[StyledRegion]
+    content: ContentFeatures | None
+    coverage: PositionWeights
+    timer: Timer
+
+
+class RegionReference(NamedTuple):
+    """Float64 features [h, w, c] of a region's style by layer, weights [h, w] by layer, and the loss's factor."""
+
+    style: Mapping[str, Tensor]
+    weights: Callable[[str], Tensor | None]
+    factor: float
+
+
+@dataclass(frozen=True)
+class ReferenceInputs:
+    """Inputs of the float64 reference of a term, for one scale of a view; features are [h, w, c] by layer.
+
+    Attributes:
+        weights: Weights of the feature network.
+        objective: Choice of terms.
+        features: Features of the view, differentiable.
+        regions: Regions with their styles.
+        content: Features of the content image; None without a content term.
+        coverage: Function that returns the position weights [h, w] of a layer; None for equal weights.
+    """
+
+    weights: BackboneWeights
+    objective: Objective
+    features: Mapping[str, Tensor]
+    regions: Sequence[RegionReference]
+    content: Mapping[str, Tensor] | None
+    coverage: Callable[[str], Tensor | None]
+
+
+class PositionTerm(ABC):
+    """Term that is a sum over the positions of one scale of a view.
+
+    Every tile adds the positions that it owns. `POSITION_TERMS` in `terms` lists all such terms.
+
+    Attributes:
+        name: Name in files and reports.
+        label: Display name.
+    """
+
+    name: ClassVar[str]
+    label: ClassVar[str]
+
+    @staticmethod
+    @abstractmethod
+    def layers(objective: Objective) -> tuple[str, ...]:
+        """Return the layers that the term reads; empty if the objective does not have it."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls, inputs: TermInputs) -> Self | None:
+        """Return the term of one scale of a view; None if the loss does not have it."""
+
+    @abstractmethod
+    def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
+        """Return the contribution of the cells that a tile owns, float64 scalar.
+
+        Args:
+            tile: Partition tile.
+            features: Features [h, w, c] of the whole tile by layer.
+        """
+
+    @abstractmethod
+    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> None:
+        """Add the derivative of `value` with respect to a layer's features to a gradient in place.
+
+        It is called for every layer that the network reports.
+
+        Args:
+            tile: Partition tile; `value` has been called for it.
+            layer: Layer.
+            features: [h, w, c], features of the whole tile.
+            gradient: [h, w, c], gradient of the whole tile.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def reference(inputs: ReferenceInputs) -> Tensor | None:
+        """Compute the term from its definition, float64 and differentiable; None if the loss does not have it."""

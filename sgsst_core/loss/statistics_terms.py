@@ -1,0 +1,258 @@
+"""Style terms of one scale: Gram matrix, mean and standard deviation of features, and their gradient in closed form.
+
+E_style = sum over layers of w_G mean((G - G_v)^2) + w_m mean((mu - mu_v)^2) + w_s mean((sigma - sigma_v)^2)
+
+with w_G = 1e3 / c^2 and w_m = w_s = 1e4 (SGSST, CVPR 2025). Means are over the entries of each matrix or vector. If
+there are position weights a_p, the statistics G, mu and sigma are weighted by them, and n is their sum instead of the
+number of positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from sgsst_core.features.fused_statistics import can_be_fused, fused_statistics, has_kernels
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.partition import PartitionTile
+from sgsst_core.features.statistics import LayerStatistics, blocks_of, center, layer_statistics
+from sgsst_core.features.vgg import PIXELS, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
+from sgsst_core.loss.position_term import StyledRegion, TermInputs
+from sgsst_core.loss.targets import LayerTarget
+from sgsst_core.settings import StyleLossName
+
+#: Terms of the statistics: name in files and reports, and display name.
+STATISTICS_TERMS = {"gram": "Gram matrix", "mean": "mean", "std": "standard deviation"}
+
+#: Numerator of w_G = GRAM_WEIGHT / c^2.
+GRAM_WEIGHT = 1e3
+#: w_m.
+MEAN_WEIGHT = 1e4
+#: w_s.
+STD_WEIGHT = 1e4
+
+
+class TermWeights(NamedTuple):
+    """Weights c^2 w_G, w_m and w_s of the terms of a layer."""
+
+    gram: float = GRAM_WEIGHT
+    mean: float = MEAN_WEIGHT
+    std: float = STD_WEIGHT
+
+
+#: Weights of the SGSST paper.
+PAPERS_WEIGHTS = TermWeights()
+
+
+def has_statistics(style_loss: StyleLossName) -> bool:
+    """Return whether a loss compares Gram matrices, means and standard deviations."""
+    return style_loss != "nnfm"
+
+
+def statistics_layers(style_loss: StyleLossName, weights: BackboneWeights) -> tuple[str, ...]:
+    """Return the layers whose statistics a loss compares; empty if it compares none."""
+    if not has_statistics(style_loss):
+        return ()
+    return (PIXELS, *STYLE_LAYERS) if PIXELS in weights.scales else STYLE_LAYERS
+
+
+def term_weights(layer: str, pixel_weight: float) -> TermWeights:
+    """Return the weights of a layer's terms.
+
+    They are the paper's weights, except that `PIXELS` has no Gram term, and its other terms are multiplied by
+    `pixel_weight`.
+    """
+    if layer != PIXELS:
+        return PAPERS_WEIGHTS
+    return TermWeights(0.0, MEAN_WEIGHT * pixel_weight, STD_WEIGHT * pixel_weight)
+
+
+@dataclass(frozen=True)
+class StyleGradient:
+    """dE/dF of one layer as an affine map of centered features: dE/dF_p = a_p (matrix (F_p - mean) + offset).
+
+    The map acts on centered features because at mean-to-sigma ratios of 1e4, matrix @ F and a separate offset would
+    cancel down to their last digits in float32. Tensors are float64, or float32 if GPU kernels computed them; float32
+    features are multiplied in float32 in either case.
+    """
+
+    matrix: Tensor  # [c, c]
+    mean: Tensor  # [c]
+    offset: Tensor  # [c]
+
+    def times(self, factor: float) -> StyleGradient:
+        """Return the gradient of the loss times a factor."""
+        return StyleGradient(self.matrix * factor, self.mean, self.offset * factor)
+
+    def about_rounded_mean(self) -> StyleGradient:
+        """Return the same map about the mean rounded to float32, with the rounding error moved into the offset.
+
+        `add_to` subtracts the mean in the precision of the features. If the features differ by less than the rounding
+        error of their mean, as in an image of a single color, that error would dominate the result.
+        """
+        mean = self.mean.float().double()
+        return StyleGradient(self.matrix, mean, self.offset + self.matrix @ (mean - self.mean))
+
+    def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
+        """Return dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
+        result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
+        self.add_to(result, features, position_weights)
+        return result
+
+    def add_to(self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None) -> None:
+        """Add the result of `apply` to a gradient [h, w, c] in place.
+
+        The computation runs in blocks, so no tensor as large as the features is allocated.
+        """
+        if can_be_fused(features) and can_be_fused(gradient) and self.matrix.dtype == torch.float32:
+            fused_add_style_gradient(gradient, features, self.matrix, self.mean, self.offset, position_weights)
+            return
+        precision = torch.promote_types(features.dtype, torch.float32)
+        matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
+        for rows, block in blocks_of(features):
+            centered, target = center(features[rows], mean, block).view(-1, len(mean)), gradient[rows]
+            weights = centered.new_ones(1) if position_weights is None else position_weights[rows].reshape(-1)
+            weights = weights.to(precision).expand(len(centered))
+            if position_weights is not None:
+                centered *= weights[:, None]
+            if target.dtype == precision and target.is_contiguous():
+                target.view(centered.shape).addmm_(centered, matrix).addr_(weights, offset)
+            else:
+                target += torch.addr(centered @ matrix, weights, offset).view(target.shape)
+
+
+def style_loss(
+    statistics: LayerStatistics,
+    target: LayerTarget,
+    *,
+    feature_eps: float = 2.0**-23,
+    weights: TermWeights = PAPERS_WEIGHTS,
+) -> tuple[Tensor, StyleGradient]:
+    """Compute the style loss of one layer and its gradient with respect to the features.
+
+    A channel counts as constant if its sigma is 0 or within the rounding error of its mean. In the gradient, its factor
+    (F - mu)/sigma is then set to 0, so the gradient is finite; the loss still contains the sigma term. If there are no
+    positions, loss and gradient are 0.
+
+    Args:
+        statistics: Statistics of the view's features.
+        target: Target from the style.
+        feature_eps: Relative rounding error of the features (2^-23 for float32, 2^-52 for float64).
+        weights: Weights of the terms.
+
+    Returns:
+        Contribution of the layer to each of `STATISTICS_TERMS`, [3] float64, and the gradient.
+    """
+    channels = statistics.mean.shape[0]
+    if has_kernels(statistics.mean.device, channels) and feature_eps > torch.finfo(torch.float64).eps:
+        fused = fused_style_loss(statistics, (target.gram, target.mean, target.std), weights, feature_eps)
+        return fused[0], StyleGradient(*fused[1:])
+    some = statistics.count > 0
+    gram_error = statistics.gram() - target.gram
+    mean_error = statistics.mean - target.mean
+    std = statistics.std()
+    std_error = std - target.std
+    gram_weight = weights.gram / channels**2
+    terms = torch.stack(
+        [
+            gram_weight * gram_error.square().mean(),
+            weights.mean * mean_error.square().mean(),
+            weights.std * std_error.square().mean(),
+        ]
+    )
+    matrix = (4 * gram_weight / channels**2) * gram_error
+    offset = matrix @ statistics.mean + (2 * weights.mean / channels) * mean_error
+    alive = std > feature_eps * statistics.mean.abs()
+    slope = torch.where(alive, std_error / torch.where(alive, std, 1.0), 0.0)
+    matrix = matrix + torch.diag((2 * weights.std / channels) * slope)
+    count = torch.where(some, statistics.count, torch.inf)
+    return torch.where(some, terms, 0.0), StyleGradient(matrix / count, statistics.mean, offset / count)
+
+
+def statistics_of(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
+    """Compute the statistics of features [h, w, c] with weights [h, w], on a GPU by its kernels if they can."""
+    return (fused_statistics if can_be_fused(features) else layer_statistics)(features, position_weights)
+
+
+def compared_layers(style_loss: StyleLossName, network: FeatureNetwork) -> list[str]:
+    """Return the reported layers of a network whose statistics a loss compares."""
+    return [layer for layer in (PIXELS, *STYLE_LAYERS) if layer in network.layers] if has_statistics(style_loss) else []
+
+
+class StatisticsTerms:
+    """Style terms of one scale of a view, which need statistics of the whole scale before they have a gradient.
+
+    Args:
+        inputs: Inputs of the terms.
+        layers: Compared layers.
+    """
+
+    def __init__(self, inputs: TermInputs, layers: Sequence[str]) -> None:
+        self._view = inputs.view
+        self._network = inputs.network
+        self._regions = inputs.regions
+        self._layers = layers
+        #: Gradients by layer, with the regions that they apply to.
+        self._gradients: dict[str, list[tuple[StyleGradient, StyledRegion]]] = {}
+
+    def zero(self) -> list[LayerStatistics]:
+        """Return the statistics of no tile."""
+        network, device = self._network, self._view.image.device
+        return [LayerStatistics.zero(network.channels(layer), device) for _ in self._regions for layer in self._layers]
+
+    def statistics(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> list[LayerStatistics]:
+        """Return the statistics of the cells that a tile owns, ordered by region and then by layer."""
+        statistics = []
+        for region in self._regions:
+            for layer in self._layers:
+                in_view, in_tile = tile.owned_cells(layer, self._view.size)
+                owned, weights = features[layer][in_tile.slices], self._view.weights(layer, in_view, region.weights)
+                nowhere = self._is_nowhere(weights)
+                zero = LayerStatistics.zero(owned.shape[-1], owned.device) if nowhere else None
+                statistics.append(zero or statistics_of(owned, weights))
+        return statistics
+
+    def compare(self, statistics: Sequence[LayerStatistics]) -> dict[str, Tensor]:
+        """Compare the statistics of the whole scale, in the order of `statistics`, with those of the styles.
+
+        Returns:
+            Float64 scalar of each of `STATISTICS_TERMS`.
+        """
+        total = torch.zeros(len(STATISTICS_TERMS), dtype=torch.float64, device=self._view.image.device)
+        pairs = [(region, layer) for region in self._regions for layer in self._layers]
+        for (region, layer), own in zip(pairs, statistics, strict=True):
+            if layer not in region.style.layers:
+                continue
+            terms, gradient = style_loss(
+                own,
+                region.style.layers[layer],
+                feature_eps=self._network.rounding_of(layer),
+                weights=term_weights(layer, self._network.pixel_weight),
+            )
+            if layer == PIXELS and gradient.matrix.dtype == torch.float64:  # the GPU kernels already do this
+                gradient = gradient.about_rounded_mean()
+            if region.style.weight != 1:
+                terms, gradient = region.style.weight * terms, gradient.times(region.style.weight)
+            total = total + terms
+            self._gradients.setdefault(layer, []).append((gradient, region))
+        return dict(zip(STATISTICS_TERMS, total.unbind(), strict=True))
+
+    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> None:
+        """Add the gradient with respect to a layer's features of a tile, on the cells that the tile owns, in place."""
+        in_view, in_tile = tile.owned_cells(layer, self._view.size)
+        for own, region in self._gradients.get(layer, ()):
+            weights = self._view.weights(layer, in_view, region.weights)
+            if not self._is_nowhere(weights):
+                own.add_to(gradient[in_tile.slices], features[in_tile.slices], weights)
+
+    def _is_nowhere(self, weights: Tensor | None) -> bool:
+        """Return whether the weights of a region in some cells are known to be all 0.
+
+        Weights on a GPU count as unknown, because reading them would synchronize with the device.
+        """
+        return len(self._regions) > 1 and weights is not None and not weights.is_cuda and not bool(weights.any())

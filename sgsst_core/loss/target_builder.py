@@ -1,0 +1,232 @@
+"""Computation of the targets of styles and views."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from sgsst_core.errors import ImageError
+from sgsst_core.features.partition import PartitionTile
+from sgsst_core.features.statistics import LayerStatistics, merge
+from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork, layer_stride
+from sgsst_core.loss.nearest import MOST_VECTORS, chosen_places, nearest_layers, places_in, positions_per_image
+from sgsst_core.loss.statistics_terms import compared_layers, statistics_of
+from sgsst_core.loss.targets import ContentFeatures, LayerTarget, StyleTarget, StyleTargets, StyleVectors, ViewTarget
+from sgsst_core.loss.tiling import Divider
+from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
+from sgsst_core.parallel.division import Piece, Size, rounds
+from sgsst_core.scene.pyramid import coverage_pyramid, downscale, resize_area, style_size
+from sgsst_core.settings import StyleLossName
+from sgsst_core.style import Style
+from sgsst_core.timing import Timer
+
+
+class TargetBuilder:
+    """Builder of the targets of styles and views for one loss.
+
+    Args:
+        network: Feature network.
+        divider: Divider of the work among the ranks.
+        timer: Timer for `vgg_forward`, `statistics` and `communication`.
+        collectives: Collectives of the ranks that build each style target together.
+        style_loss: Style loss.
+        has_content: Whether the loss has a content term.
+        style_scale: Magnification of style images relative to their default size.
+    """
+
+    def __init__(
+        self,
+        network: FeatureNetwork,
+        divider: Divider,
+        timer: Timer,
+        collectives: Collectives = ALONE,
+        *,
+        style_loss: StyleLossName = "sos",
+        has_content: bool = True,
+        style_scale: float = 1.0,
+    ) -> None:
+        self.style_scale = style_scale
+        self._network = network
+        self._divider = divider
+        self._timer = timer
+        self._collectives = collectives
+        self._has_content = has_content
+        self._compared = compared_layers(style_loss, network)
+        self._matched = nearest_layers(style_loss, network.name)
+
+    def of_style(self, style: Style, view_size: Size) -> StyleTargets:
+        """Compute the targets of a style at all scales with a positive weight.
+
+        If a style image is so small that a layer's feature map is empty at some scale, the layer is not compared at
+        that scale. With several images, the layer's target is computed from those with a feature map.
+
+        Args:
+            style: Style.
+            view_size: (height, width) of the views.
+
+        Raises:
+            ImageError: If the loss matches features, and the style image is too small to have any.
+        """
+        pyramids = [self._style_pyramid(image, view_size) for image in style.images]
+        layers = self._mixed_layers(pyramids, style.weights) if self._compared else {}
+        vectors = {
+            scale: self._style_vectors([pyramid[scale] for pyramid in pyramids], style.weights) for scale in pyramids[0]
+        }
+        if self._matched and all(found is None for found in vectors.values()):
+            height, width = _size(pyramids[0][min(pyramids[0])])  # from the scales with a positive weight
+            raise ImageError(
+                f"The style is used at {width} x {height} pixels, too few to match features with. "
+                "Use a larger style image, larger views, or --style-loss sos."
+            )
+        return {scale: (StyleTarget(layers.get(scale, {}), found),) for scale, found in vectors.items()}
+
+    def _style_pyramid(self, image: Tensor, view_size: Size) -> dict[int, Tensor]:
+        """Return a style image at the scales that are evaluated for views of a given size, on the network's device."""
+        size = style_size(_size(image), view_size, self.style_scale)
+        resized = resize_area(image, size).to(self._network.device)
+        return {scale: downscale(resized, scale) for scale in self._divider.tiling.scales(view_size)}
+
+    def _mixed_layers(
+        self, pyramids: Sequence[Mapping[int, Tensor]], weights: Sequence[float]
+    ) -> dict[int, dict[str, LayerTarget]]:
+        """Compute the layer targets of a style at each scale, from the pyramids and weights of its images."""
+        every = [self._style_statistics(pyramid) for pyramid in pyramids]
+        mixed: dict[int, dict[str, LayerTarget]] = {}
+        for scale in pyramids[0]:
+            mixed[scale] = {}
+            for layer in self._compared:
+                pairs = zip(every, weights, strict=True)
+                some = [(own[scale][layer], weight) for own, weight in pairs if layer in own[scale]]
+                if some:
+                    mixed[scale][layer] = LayerTarget.mixed(*zip(*some, strict=True))
+        return mixed
+
+    def _style_statistics(self, scaled: Mapping[int, Tensor]) -> dict[int, dict[str, LayerTarget]]:
+        """Compute the layer targets of a style image, given as images [h, w, 3] by scale.
+
+        The work is divided among the ranks.
+        """
+        division = self._divider.divide({scale: _size(image) for scale, image in scaled.items()})
+        targets: dict[int, dict[str, LayerTarget]] = {}
+        for scales in rounds(list(scaled), self._collectives.size):
+            pending = {scale: self._merged_statistics(scaled[scale], division.tiles[scale]) for scale in scales}
+            for scale, merged in pending.items():
+                with self._timer("communication"):
+                    statistics = merged()[0]
+                targets[scale] = {
+                    layer: LayerTarget.of(own)
+                    for layer, own in zip(self._compared, statistics, strict=True)
+                    if min(_size(scaled[scale])) >= layer_stride(layer)
+                }
+        return targets
+
+    def _merged_statistics(self, image: Tensor, tiles: Sequence[PartitionTile]) -> Merged:
+        """Compute the statistics of this rank's tiles of an image [h, w, 3], and start merging those of all ranks."""
+        size, device = _size(image), image.device
+        total: list[LayerStatistics] = []
+        for tile in tiles:
+            features = self._forward(image, tile).features
+            with self._timer("statistics"):
+                own = [statistics_of(features[c][tile.owned_cells(c, size)[1].slices]) for c in self._compared]
+                total = [merge(*pair) for pair in zip(total, own, strict=True)] if total else own
+        zero = [LayerStatistics.zero(self._network.channels(layer), device) for layer in self._compared]
+        return self._collectives.all_reduce_statistics(
+            total or zero, torch.zeros(0, dtype=torch.float64, device=device)
+        )
+
+    def _style_vectors(self, images: Sequence[Tensor], weights: Sequence[float]) -> StyleVectors | None:
+        """Compute the style vectors of weighted images [h, w, 3] at one scale.
+
+        The vectors of all images are pooled; if there are too many, each image contributes in proportion to its weight.
+        The vectors are too large to send, so every rank computes all of them.
+
+        Returns:
+            Style vectors; None if the loss matches no features, or the images are too small to have any.
+        """
+        if not self._matched:
+            return None
+        stride = layer_stride(self._matched[0])
+        counts = [(size[0] // stride) * (size[1] // stride) for size in map(_size, images)]
+        chosen = positions_per_image(counts, weights, MOST_VECTORS)
+        vectors = [
+            self._vectors_of(image, chosen_places(count, some))
+            for image, count, some in zip(images, counts, chosen, strict=True)
+            if count
+        ]
+        if not vectors:
+            return None
+        return StyleVectors.of(
+            {layer: torch.cat([each[layer] for each in vectors]).to(images[0].device) for layer in self._matched}
+        )
+
+    def _vectors_of(self, image: Tensor, positions: Tensor) -> dict[str, Tensor]:
+        """Return the features [k, c] of an image [h, w, 3] at some positions of the matched layers, on the CPU."""
+        size = _size(image)
+        width = size[1] // layer_stride(self._matched[0])
+        vectors = {
+            layer: torch.empty((len(positions), self._network.channels(layer)), dtype=self._network.dtype)
+            for layer in self._matched
+        }
+        for tile in self._divider.tiles(size):
+            features = self._forward(image, tile).features
+            in_image, in_tile = tile.owned_cells(self._matched[0], size)
+            inside, row, column = places_in(positions, width, in_image)
+            for layer, values in vectors.items():
+                values[inside] = features[layer][in_tile.slices].cpu()[row, column]
+        return vectors
+
+    def of_view(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
+        """Compute the targets of a view.
+
+        Args:
+            content: Content image [H, W, 3] in 0..1.
+            coverage: [H, W] in 0..1; None for equal weights.
+            keep_content: Whether to compute and cache the content features now, instead of in every evaluation.
+        """
+        height, width = _size(content)
+        weights = None if coverage is None else self.position_weights(coverage)
+        scales = self._divider.tiling.scales((height, width))
+        division = self._divider.divide({scale: (height >> scale, width >> scale) for scale in scales}, weights)
+        target = ViewTarget(content_image=content, coverage=weights, division=division)
+        if self._has_content and keep_content:
+            target.content = {
+                scale: self.content_features(content, scale, tiles) for scale, tiles in division.tiles.items()
+            }
+            target.content_image = None
+        return target
+
+    def position_weights(self, coverage: Tensor) -> list[Tensor]:
+        """Downscale coverage [H, W] in 0..1 by every power of two that a layer needs at some scale."""
+        coarsest = self._divider.tiling.scales(_size(coverage))[-1]
+        levels = coarsest + 1 + layer_stride("relu5_1").bit_length()
+        dtype = torch.promote_types(self._network.dtype, torch.float32)
+        return coverage_pyramid(coverage.to(self._network.device, dtype), levels)
+
+    def content_features(self, content: Tensor, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
+        """Compute the content features of a content image [H, W, 3] at a scale, on the cells owned by some tiles."""
+        image = downscale(content.to(self._network.device), scale)
+        result = {}
+        for tile in tiles:
+            cells = tile.owned_cells(CONTENT_LAYER, _size(image))[1]
+            # Copy: a slice would keep the features of the halo alive too.
+            result[tile] = self._forward(image, tile).features[CONTENT_LAYER][cells.slices].clone()
+        return result
+
+    def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
+        """Return the maximum size over all ranks of the `content_features` of a scale, in bytes.
+
+        Args:
+            pieces: Pieces of the scale for every rank.
+        """
+        value = torch.finfo(self._network.dtype).bits // 8 * self._network.channels(CONTENT_LAYER)
+        return max(sum(piece.cells(CONTENT_LAYER) for piece in own) for own in pieces) * value
+
+    def _forward(self, image: Tensor, tile: PartitionTile) -> Activations:
+        with self._timer("vgg_forward"):
+            return self._network.forward(image[tile.outer.slices], keep=False)
+
+
+def _size(image: Tensor) -> Size:
+    return image.shape[0], image.shape[1]
