@@ -120,7 +120,7 @@ def test_a_refined_scene_is_known_again(kept: Checkpoint, tmp_path: Path) -> Non
 
 def test_checkpoint_of_an_earlier_version_is_refused(kept: Checkpoint, tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "c", kept, "job")
-    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"6"', b'"version":"5"'))
+    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"7"', b'"version":"6"'))
     with pytest.raises(CheckpointError, match="another version of this program"):
         load_checkpoint(tmp_path / "c", "job")
 
