@@ -17,7 +17,7 @@ import torch
 #: Lock that is held while a kernel runs. Numba's `workqueue` threading layer, the only one that is always available,
 #: aborts the process if two Python threads run parallel kernels at once. Little is lost by running kernels one at a
 #: time, because each uses every core.
-_TURN = threading.RLock()
+_LOCK = threading.RLock()
 
 
 #: Source files whose functions and constants are compiled into kernels of other modules.
@@ -33,7 +33,7 @@ def kernel_folders() -> set[Path]:
     return set(_folders)
 
 
-def keep_in_memory(report: Callable[[], None]) -> None:
+def cache_in_memory(report: Callable[[], None]) -> None:
     """Cache newly compiled kernels only in memory, for a process that may read but not write the cache folders.
 
     Args:
@@ -80,7 +80,7 @@ def kernel_threads() -> Iterator[None]:
     If Numba and PyTorch use the same OpenMP library, Numba's first kernel resets PyTorch's thread count to all cores,
     so the count is restored.
     """
-    with _TURN:
+    with _LOCK:
         threads = torch.get_num_threads()
         available: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
         numba.set_num_threads(max(1, min(threads, available)))

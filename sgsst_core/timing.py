@@ -77,29 +77,29 @@ class Timer:
         self.seconds.clear()
         self._marked.clear()
         if self._open:
-            self._begin()
+            self._start()
 
     def read(self) -> dict[str, float]:
         """Update and return `seconds`. On a GPU, waits for the end of the last block."""
         if self._marked and not self._marked[-1][2].query():
             self._marked[-1][2].synchronize()
-        for name, begin, end in self._marked:
-            self._add(name, begin.elapsed_time(end) / 1000)
+        for name, start, end in self._marked:
+            self._add(name, start.elapsed_time(end) / 1000)
         self._marked.clear()
         return self.seconds
 
     def _switch(self) -> None:
         """Attribute the time since the last switch to the innermost open block."""
-        begin, begin_clock = self._since, self._since_clock
-        self._begin()
+        start, start_clock = self._since, self._since_clock
+        self._start()
         if not self._open:
             return
         if self._since is None:
-            self._add(self._open[-1], self._since_clock - begin_clock)
-        elif begin is not None:
-            self._marked.append((self._open[-1], begin, self._since))
+            self._add(self._open[-1], self._since_clock - start_clock)
+        elif start is not None:
+            self._marked.append((self._open[-1], start, self._since))
 
-    def _begin(self) -> None:
+    def _start(self) -> None:
         if self._event is None:
             self._since_clock = time.perf_counter()
         else:

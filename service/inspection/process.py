@@ -31,7 +31,7 @@ from service.inspection.sandbox import confine, installation
 from service.parameters import JobParameters
 from service.request import scene_request, stylize_request
 from sgsst_core.budget import default_memory_limit
-from sgsst_core.compiled import keep_in_memory, kernel_folders
+from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.cache_folder import cache_folder
@@ -379,7 +379,7 @@ def _confine(request: dict[str, Any]) -> list[None]:
         result.touch()
         most_bytes = (folder / request["staged"]["scene"]).stat().st_size + (1 << 20)  # a compressed scene is smaller
     uncompiled: list[None] = []
-    keep_in_memory(lambda: uncompiled.append(None))
+    cache_in_memory(lambda: uncompiled.append(None))
     confine([folder, *linked, cache_folder(), *kernel_folders(), *installation()], result, most_bytes)
     return uncompiled
 

@@ -102,8 +102,8 @@ def spread(views: Sequence[V], count: int) -> list[V]:
     """
     if count < 1:
         raise SettingsError(f"The number of views is {count}; give at least 1.")
-    total, parts = len(views), min(count, len(views))
-    return [views[(2 * part + 1) * total // (2 * parts)] for part in range(parts)]
+    total, sections = len(views), min(count, len(views))
+    return [views[(2 * section + 1) * total // (2 * sections)] for section in range(sections)]
 
 
 def between(first: Camera, second: Camera) -> Camera:

@@ -95,8 +95,8 @@ def sampled(scene: Scene, count: int) -> Scene:
     The area of a Gaussian grows with the square of its size, so sizes are multiplied by the square root of the number
     of Gaussians that each one represents.
     """
-    part = scene.subset(sampled_rows(len(scene), count))
-    return replace(part, scales=part.scales + math.log(-(-len(scene) // count)) / 2)
+    sample = scene.subset(sampled_rows(len(scene), count))
+    return replace(sample, scales=sample.scales + math.log(-(-len(scene) // count)) / 2)
 
 
 def sampled_rows(total: int, count: int) -> Tensor:
@@ -120,8 +120,8 @@ def _used_coefficients(sh_rest: Tensor, rows: Tensor | None = None) -> int:
         values = sh_rest[start : start + _CHUNK, used:]
         if rows is not None:
             values = values[rows[start : start + _CHUNK]]
-        found = (values != 0).any(dim=2).any(dim=0).nonzero()
-        used += int(found[-1]) + 1 if len(found) else 0
+        nonzero = (values != 0).any(dim=2).any(dim=0).nonzero()
+        used += int(nonzero[-1]) + 1 if len(nonzero) else 0
         if used == sh_rest.shape[1]:
             break
     return used

@@ -9,10 +9,10 @@ from torch import Tensor
 
 def rotations(quats: Tensor) -> Tensor:
     """Return the rotation matrices [P, 3, 3] of wxyz quaternions [P, 4]; the identity for a zero quaternion."""
-    nothing = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    given = torch.where((quats != 0).any(1, keepdim=True), quats, nothing)
-    turned: Tensor = torch.from_numpy(Rotation.from_quat(given.roll(-1, 1).numpy()).as_matrix())
-    return turned
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    nonzero = torch.where((quats != 0).any(1, keepdim=True), quats, identity)
+    matrices: Tensor = torch.from_numpy(Rotation.from_quat(nonzero.roll(-1, 1).numpy()).as_matrix())
+    return matrices
 
 
 def unit_rotations(quats: Tensor) -> Tensor:

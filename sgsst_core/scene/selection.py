@@ -26,8 +26,8 @@ COMPARISONS: dict[str, Callable[[Tensor, float], Tensor]] = {
 def in_box(means: Tensor, corners: Sequence[float]) -> Tensor:
     """Select positions between two opposite corners x0, y0, z0, x1, y1, z1, in any order."""
     first, second = torch.tensor([corners[:3], corners[3:]], dtype=torch.float64)
-    places = means.double()
-    return ((places >= torch.minimum(first, second)) & (places <= torch.maximum(first, second))).all(dim=1)
+    positions = means.double()
+    return ((positions >= torch.minimum(first, second)) & (positions <= torch.maximum(first, second))).all(dim=1)
 
 
 def in_sphere(means: Tensor, sphere: Sequence[float]) -> Tensor:

@@ -121,9 +121,9 @@ def reference_rest_colors(
     colors = torch.empty(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     count = (degree + 1) ** 2 - 1
     for start in range(0, sh_rest.shape[0], _CHUNK):
-        part = slice(start, start + _CHUNK)
-        values = basis(view_directions(means[part], camera.center), degree)
-        colors[part] = torch.einsum("nk,nkc->nc", values, sh_rest[part, :count].double()).to(sh_rest.dtype)
+        chunk = slice(start, start + _CHUNK)
+        values = basis(view_directions(means[chunk], camera.center), degree)
+        colors[chunk] = torch.einsum("nk,nkc->nc", values, sh_rest[chunk, :count].double()).to(sh_rest.dtype)
     return colors
 
 
@@ -150,8 +150,8 @@ def _stored_rest_colors(sh_rest: StoredHarmonics, means: Tensor, camera: Camera,
     points, center, out = means.detach().cpu().contiguous().numpy(), camera.center.numpy(), colors.numpy()
 
     def add_up(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
-        part = slice(start, start + len(rows))
-        kernels.block_rest_colors(block, rows, points[part], center, degree, out[part])
+        chunk = slice(start, start + len(rows))
+        kernels.block_rest_colors(block, rows, points[chunk], center, degree, out[chunk])
 
     sh_rest.for_blocks(add_up)
     return colors
@@ -190,10 +190,10 @@ def triton_runs_on(device: torch.device) -> bool:
     one, center = torch.ones((1, 3, 3), device=device), torch.eye(4, dtype=torch.float64)
     camera = Camera("trial", 1, 1, 1.0, 1.0, 0.5, 0.5, center)
     try:
-        found = kernel_rest_colors(one, torch.tensor([[0.0, 0.0, 1.0]], device=device), camera, 1)
+        colors = kernel_rest_colors(one, torch.tensor([[0.0, 0.0, 1.0]], device=device), camera, 1)
     except Exception:  # the tensor functions are used instead
         return False
-    return abs(float(found[0, 0]) - SH_C1) < 1e-6
+    return abs(float(colors[0, 0]) - SH_C1) < 1e-6
 
 
 def view_colors(

@@ -23,9 +23,9 @@ _C30, _C31, _C32, _C33, _C34, _C35, _C36 = (tl.constexpr(factor) for factor in S
 
 
 @triton.jit
-def _term(k: tl.constexpr, factor: tl.constexpr, polynomial, row, own):
+def _term(k: tl.constexpr, factor: tl.constexpr, polynomial, row, valid):
     """Return coefficient k times its basis function, factor * polynomial: [BLOCK, 4], with 0 in the fourth channel."""
-    return (polynomial * factor)[:, None] * tl.load(row + 3 * k, mask=own, other=0.0)
+    return (polynomial * factor)[:, None] * tl.load(row + 3 * k, mask=valid, other=0.0)
 
 
 @triton.jit
@@ -56,22 +56,22 @@ def rest_colors(
     # Triton's block sizes are powers of two, so a masked fourth channel is added to a coefficient's three contiguous
     # values.
     channel = tl.arange(0, 4)[None, :]
-    own = there[:, None] & (channel < 3)
+    valid = there[:, None] & (channel < 3)
     row = sh_rest + (3 * COEFFICIENTS) * p[:, None] + channel
-    colors = _term(0, -_C1, y, row, own) + _term(1, _C1, z, row, own) + _term(2, -_C1, x, row, own)
+    colors = _term(0, -_C1, y, row, valid) + _term(1, _C1, z, row, valid) + _term(2, -_C1, x, row, valid)
     if DEGREE >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        colors += _term(3, _C20, x * y, row, own)
-        colors += _term(4, _C21, y * z, row, own)
-        colors += _term(5, _C22, 2 * zz - xx - yy, row, own)
-        colors += _term(6, _C23, x * z, row, own)
-        colors += _term(7, _C24, xx - yy, row, own)
+        colors += _term(3, _C20, x * y, row, valid)
+        colors += _term(4, _C21, y * z, row, valid)
+        colors += _term(5, _C22, 2 * zz - xx - yy, row, valid)
+        colors += _term(6, _C23, x * z, row, valid)
+        colors += _term(7, _C24, xx - yy, row, valid)
         if DEGREE >= 3:
-            colors += _term(8, _C30, y * (3 * xx - yy), row, own)
-            colors += _term(9, _C31, x * y * z, row, own)
-            colors += _term(10, _C32, y * (4 * zz - xx - yy), row, own)
-            colors += _term(11, _C33, z * (2 * zz - 3 * xx - 3 * yy), row, own)
-            colors += _term(12, _C34, x * (4 * zz - xx - yy), row, own)
-            colors += _term(13, _C35, z * (xx - yy), row, own)
-            colors += _term(14, _C36, x * (xx - 3 * yy), row, own)
-    tl.store(out + 3 * p[:, None] + channel, colors, mask=own)
+            colors += _term(8, _C30, y * (3 * xx - yy), row, valid)
+            colors += _term(9, _C31, x * y * z, row, valid)
+            colors += _term(10, _C32, y * (4 * zz - xx - yy), row, valid)
+            colors += _term(11, _C33, z * (2 * zz - 3 * xx - 3 * yy), row, valid)
+            colors += _term(12, _C34, x * (4 * zz - xx - yy), row, valid)
+            colors += _term(13, _C35, z * (xx - yy), row, valid)
+            colors += _term(14, _C36, x * (xx - 3 * yy), row, valid)
+    tl.store(out + 3 * p[:, None] + channel, colors, mask=valid)

@@ -165,11 +165,11 @@ class StoredHarmonics:
         if rows.dtype == torch.bool:
             rows = rows.nonzero()[:, 0]
         if len(rows) > 1 and not bool((rows[1:] >= rows[:-1]).all()):
-            ascending, places = rows.unique(return_inverse=True)
-            return self._of(ascending).tensor()[places]
-        return self._of(rows)
+            ascending, inverse = rows.unique(return_inverse=True)
+            return self._select(ascending).tensor()[inverse]
+        return self._select(rows)
 
-    def _of(self, rows: Tensor) -> StoredHarmonics:
+    def _select(self, rows: Tensor) -> StoredHarmonics:
         """Select Gaussians by ascending indices."""
         indices = rows.to("cpu", torch.int32).numpy()
         chosen = indices if self._chosen is None else self._chosen[indices]
@@ -199,13 +199,13 @@ class StoredHarmonics:
 
     def largest(self) -> Tensor:
         """Return the largest magnitude among the coefficients of each Gaussian, [N] float32."""
-        found = torch.empty(len(self))
+        largest = torch.empty(len(self))
 
-        def look(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
-            found[start : start + len(rows)] = torch.from_numpy(np.abs(block[rows]).max(axis=(1, 2)))
+        def take(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
+            largest[start : start + len(rows)] = torch.from_numpy(np.abs(block[rows]).max(axis=(1, 2)))
 
-        self.for_blocks(look)
-        return found
+        self.for_blocks(take)
+        return largest
 
     def used_coefficients(self) -> int:
         """Return the number of coefficients per channel up to the last one that is non-zero for any Gaussian.
@@ -214,9 +214,9 @@ class StoredHarmonics:
         """
         step, used = self._rows_at_a_time() * 16, 0
         for start in range(0, len(self), step):
-            values = self._of(torch.arange(start, min(start + step, len(self)))).tensor()[:, used:]
-            found = (values != 0).any(dim=2).any(dim=0).nonzero()
-            used += int(found[-1]) + 1 if len(found) else 0
+            values = self._select(torch.arange(start, min(start + step, len(self)))).tensor()[:, used:]
+            nonzero = (values != 0).any(dim=2).any(dim=0).nonzero()
+            used += int(nonzero[-1]) + 1 if len(nonzero) else 0
             if used == self.shape[1]:
                 break
         return used
@@ -239,8 +239,8 @@ class StoredHarmonics:
         else:
             with ThreadPoolExecutor(threads, thread_name_prefix="harmonics") as pool:
                 # Blocks are interleaved, so that threads read neighboring parts of a file that may be on a disk.
-                for done in [pool.submit(self._work_through, work, bounds[i::threads]) for i in range(threads)]:
-                    done.result()
+                for future in [pool.submit(self._work_through, work, bounds[i::threads]) for i in range(threads)]:
+                    future.result()
         self._file.check_unchanged(self.layout.stamp)
 
     def _rows_at_a_time(self) -> int:
@@ -250,13 +250,13 @@ class StoredHarmonics:
         """Call `work` for the blocks that start at the file rows `bounds`."""
         layout, step = self.layout, self._rows_at_a_time()
         buffer = np.empty(step * layout.row_bytes, np.uint8)
-        every = np.arange(step, dtype=np.int32)
+        consecutive = np.arange(step, dtype=np.int32)
         first, last = layout.column // 4, layout.column // 4 + 3 * layout.coefficients
         table = buffer.view("<f4").reshape(step, -1)[:, first:last].reshape(step, 3, -1)
         values = table.transpose(0, 2, 1)[:, : self.shape[1]]
         for row in bounds:
             count = min(step, layout.rows - row)
-            start, rows = row, every[:count]
+            start, rows = row, consecutive[:count]
             if self._chosen is not None:
                 start, stop = np.searchsorted(self._chosen, np.array((row, row + count), np.int32)).tolist()
                 rows = self._chosen[start:stop] - np.int32(row)

@@ -77,7 +77,7 @@ def step(timer: Timer, work: Any) -> None:
 SECONDS = {"loss": 33.0, "forward": 26.0, "statistics": 4.0, "optimizer": 128.0}
 
 
-def test_nested_blocks_count_for_the_inner_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nested_block_counts_for_the_inner_name(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [10.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     timer = Timer()
@@ -86,7 +86,7 @@ def test_nested_blocks_count_for_the_inner_name(monkeypatch: pytest.MonkeyPatch)
     assert timer.read() == SECONDS
 
 
-def test_blocks_within_a_whole_one_count_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_nested_in_a_whole_block_count_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(float(2**step) for step in range(12))
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
     timer = Timer()
@@ -97,7 +97,7 @@ def test_blocks_within_a_whole_one_count_for_it(monkeypatch: pytest.MonkeyPatch)
     assert timer.seconds == {"outer": 2**1 - 2**0 + 2**7 - 2**6, "whole": 2**6 - 2**1, "inner": 2**9 - 2**8}
 
 
-def test_a_devices_seconds_are_its_own() -> None:
+def test_gpu_block_is_timed_by_device_events() -> None:
     """The program submits the work at once, so its own clock hardly advances."""
     stream = Stream()
     timer = Timer(event=stream.event)
@@ -107,7 +107,7 @@ def test_a_devices_seconds_are_its_own() -> None:
     assert stream.waits == 1
 
 
-def test_reading_behind_a_wait_costs_none() -> None:
+def test_reading_after_a_wait_does_not_wait_again() -> None:
     stream = Stream()
     timer = Timer(event=stream.event)
     for rounds in (1, 2):
@@ -118,7 +118,7 @@ def test_reading_behind_a_wait_costs_none() -> None:
         assert timer.seconds == pytest.approx({name: rounds * value for name, value in SECONDS.items()})
 
 
-def test_what_was_not_read_is_forgotten() -> None:
+def test_clearing_discards_unread_measurements() -> None:
     stream = Stream()
     timer = Timer(event=stream.event)
     step(timer, stream.launch)
@@ -131,7 +131,7 @@ def test_what_was_not_read_is_forgotten() -> None:
     assert timer.read() == pytest.approx({"loss": 2.0})
 
 
-def test_a_block_that_fails_is_timed_and_closed() -> None:
+def test_failing_block_is_timed_and_closed() -> None:
     stream = Stream()
     timer = Timer(event=stream.event)
     with pytest.raises(KeyError):

@@ -8,7 +8,7 @@ import torch
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 
 
-def test_forgives_a_step_in_the_band_and_counts_it() -> None:
+def test_step_within_the_band_is_tolerated_and_counted() -> None:
     expected, band = torch.zeros(40, 50, 3), torch.zeros(40, 50, dtype=torch.bool)
     actual = expected.clone()
     actual[3, 4, 1] = 5e-3
@@ -17,7 +17,7 @@ def test_forgives_a_step_in_the_band_and_counts_it() -> None:
     assert assert_close_outside_band(actual, expected, band, tolerance=1e-4) == 1
 
 
-def test_finds_an_error_outside_the_band() -> None:
+def test_error_outside_the_band_fails() -> None:
     expected, band = torch.zeros(40, 50, 3), torch.zeros(40, 50, dtype=torch.bool)
     band[3, 5] = True
     actual = expected.clone()
@@ -26,7 +26,7 @@ def test_finds_an_error_outside_the_band() -> None:
         assert_close_outside_band(actual, expected, band, tolerance=1e-4)
 
 
-def test_finds_a_step_too_large_for_a_cutoff() -> None:
+def test_step_too_large_for_a_cutoff_fails() -> None:
     expected, band = torch.zeros(40, 50, 3), torch.ones(40, 50, dtype=torch.bool)
     actual = expected.clone()
     actual[3, 4, 1] = 0.1
@@ -34,7 +34,7 @@ def test_finds_a_step_too_large_for_a_cutoff() -> None:
         assert_close_outside_band(actual, expected, band, tolerance=1e-4)
 
 
-def test_finds_too_many_steps_and_values_that_are_not_finite() -> None:
+def test_too_many_steps_and_non_finite_values_fail() -> None:
     expected, band = torch.zeros(40, 50), torch.ones(40, 50, dtype=torch.bool)
     with pytest.raises(AssertionError, match="of the pixels flip"):
         assert_close_outside_band(expected + 1e-3, expected, band, tolerance=1e-4)

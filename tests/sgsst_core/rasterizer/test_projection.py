@@ -18,7 +18,7 @@ from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, single, to
 _HALF_LOG2_E = 0.5 * math.log2(math.e)
 
 
-def test_agrees_with_plain_pytorch() -> None:
+def test_projection_agrees_with_plain_pytorch() -> None:
     scene, view = cloud(3000, log_scale=-2.0), camera(pose=turned_pose())
     fast, plain = project(scene, view), splat(scene, view)
     place = {int(g): i for i, g in enumerate(plain.gaussians)}
@@ -46,7 +46,7 @@ def test_agrees_with_plain_pytorch() -> None:
 
 
 @pytest.mark.parametrize("length", [1.0, 1e3, 1e6])
-def test_needles_keep_their_width(length: float) -> None:
+def test_needles_have_their_exact_width(length: float) -> None:
     """The determinant of a slanted needle, a million times longer than wide, matches exact arithmetic."""
     half = math.sqrt(0.5)
     view = camera(focal=64.0)
@@ -68,7 +68,7 @@ def test_needles_keep_their_width(length: float) -> None:
     assert row[Column.W_SCALE] ** 2 == pytest.approx(_HALF_LOG2_E / float(r), rel=1e-12)
 
 
-def test_the_near_plane_keeps_what_lies_on_it() -> None:
+def test_gaussian_on_the_near_plane_is_visible() -> None:
     at, before, behind = 0.5, math.nextafter(0.5, 0), -1.0
     scene = together([((0, 0, z), 0.9, (0.01,) * 3, (1, 0, 0, 0)) for z in (at, float(np.float32(before)), behind)])
     scene.means[1, 2] = float(np.nextafter(np.float32(0.5), np.float32(0)))
@@ -80,7 +80,7 @@ def test_the_near_plane_keeps_what_lies_on_it() -> None:
         project(scene, camera(), near=0.0)
 
 
-def test_opacities_around_the_cut() -> None:
+def test_opacities_around_the_cutoff() -> None:
     logit = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
     scene = together([((0, 0, 4), 0.5, (2.0,) * 3, (1, 0, 0, 0))] * 5)
     scene.opacities[:] = torch.tensor([logit - 1e-3, logit + 1e-3, -200.0, 200.0, -1e4])
@@ -91,13 +91,13 @@ def test_opacities_around_the_cut() -> None:
     assert found.values[1, Column.LOG2_OPACITY] == pytest.approx(0, abs=1e-80)
 
 
-def test_equal_depths_keep_the_order_of_the_file() -> None:
+def test_equal_depths_stay_in_file_order() -> None:
     scene = together([((0.01 * i, 0, 4.0 - (i == 3)), 0.5, (0.1,) * 3, (1, 0, 0, 0)) for i in range(6)])
     assert project(scene, camera()).gaussians.tolist() == [3, 0, 1, 2, 4, 5]
     assert splat(scene, camera()).gaussians.tolist() == [3, 0, 1, 2, 4, 5]
 
 
-def test_values_without_a_projection_are_left_out_and_counted() -> None:
+def test_gaussians_without_a_projection_are_dropped_and_counted() -> None:
     scene = together([((0, 0, 4), 0.5, (0.1,) * 3, (1, 0, 0, 0))] * 4)
     scene.quats[1] = 0
     scene.quats[2] = 1e-30  # short, but still a direction
@@ -115,7 +115,7 @@ def test_huge_gaussians_and_an_empty_scene() -> None:
     assert len(project(empty_scene(), camera()).gaussians) == 0
 
 
-def test_a_world_moved_far_away_projects_alike() -> None:
+def test_scene_far_from_origin_projects_alike() -> None:
     scene, view = cloud(300), camera(pose=turned_pose())
     scene = replace(scene, means=(scene.means * 16).round() / 16)
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)

@@ -26,7 +26,7 @@ CLOSE = 2e-3
 @pytest.mark.gpu
 @needs_gpu
 @needs_gsplat
-def test_gsplat_has_no_problem() -> None:
+def test_gsplat_renders() -> None:
     assert drawing_problem("cuda") is None
 
 
@@ -53,7 +53,7 @@ def test_cuda_agrees_with_the_reference(seed: int) -> None:
 @pytest.mark.gpu
 @needs_gpu
 @needs_gsplat
-def test_bands_put_together_are_the_whole() -> None:
+def test_concatenated_bands_equal_whole_view() -> None:
     scene, view = cloud(800, seed=3, log_scale=-1.0), camera(130, 75)
     colors, pixels = colors_of(scene), pixels_like(view)
     cuda = CudaRasterizer(scene)
@@ -65,14 +65,14 @@ def test_bands_put_together_are_the_whole() -> None:
 
 
 @pytest.mark.skipif(HAS_GSPLAT, reason="gsplat is installed")
-def test_without_gsplat_the_error_names_the_extra() -> None:
+def test_error_without_gsplat_names_the_extra() -> None:
     with pytest.raises(SettingsError, match=r"sgsst-service\[cuda\]"):
         make_rasterizer("cuda", cloud(10))
 
 
 @needs_gsplat
 @pytest.mark.skipif(HAS_GPU, reason="there is a GPU")
-def test_without_a_gpu_the_error_says_what_to_choose() -> None:
+def test_error_without_a_gpu_names_alternatives() -> None:
     with pytest.raises(SettingsError, match="choose 'cpu' or 'cached'"):
         make_rasterizer("cuda", cloud(10))
 
@@ -80,12 +80,12 @@ def test_without_a_gpu_the_error_says_what_to_choose() -> None:
 @pytest.mark.parametrize(
     ("version", "clamp"), [("1.5.3", 0.999), ("1.6.0", 0.99), ("1.6.0rc1+cu124", 0.99), ("2.0", 0.99)]
 )
-def test_the_clamp_follows_the_version(version: str, clamp: float) -> None:
+def test_limit_of_alpha_depends_on_gsplat_version(version: str, clamp: float) -> None:
     assert gsplat_alpha_max(version) == clamp
 
 
 @pytest.mark.skipif(HAS_GPU and HAS_GSPLAT, reason="there is no problem")
-def test_gsplat_that_cannot_be_used_has_a_reason_in_one_line() -> None:
+def test_reason_why_gsplat_is_unusable_is_one_line() -> None:
     problem = drawing_problem("cuda")
     assert problem
     assert "\n" not in problem

@@ -44,7 +44,7 @@ def threads(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", DEPTHS)
-def test_depth_order_is_that_of_a_stable_sort(name: str, threads: None) -> None:
+def test_depth_order_equals_a_stable_sort(name: str, threads: None) -> None:
     depths = DEPTHS[name]
     visible = np.flatnonzero(_RANDOM.random(len(depths)) < 0.8)
     found = depth_order(depths, visible)
@@ -52,7 +52,7 @@ def test_depth_order_is_that_of_a_stable_sort(name: str, threads: None) -> None:
     assert np.array_equal(found, visible[np.argsort(depths[visible], kind="stable")])
 
 
-def test_values_are_in_order_of_depth(threads: None) -> None:
+def test_projected_values_are_in_depth_order(threads: None) -> None:
     scene, view = cloud(700, seed=31), camera()
     found = project(scene, view)
     pose = view.world_to_camera.double()
@@ -84,7 +84,7 @@ def check_slots(isects: TileIntersections) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 150])
-def test_tile_intersections_are_those_of_one_gaussian_after_the_other(count: int, threads: None) -> None:
+def test_tile_intersections_equal_a_loop_over_gaussians(count: int, threads: None) -> None:
     scene, view = cloud(count, seed=32), camera(97, 61)
     scene.scales[:10] += 4  # as large as the view
     isects = build_tile_intersections(scene, view)
@@ -105,7 +105,7 @@ def check_same(found: TileIntersections, expected: TileIntersections) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.6, 1.0])
-def test_tile_intersections_of_some_gaussians_are_those_that_would_be_built(share: float, threads: None) -> None:
+def test_tile_intersections_of_a_subset_equal_rebuilt_ones(share: float, threads: None) -> None:
     scene, view = cloud(900, seed=33), camera(97, 61)
     scene.scales[:10] += 4
     chosen = torch.rand(900, generator=torch.Generator().manual_seed(1)) < share
@@ -114,7 +114,7 @@ def test_tile_intersections_of_some_gaussians_are_those_that_would_be_built(shar
     check_same(found, build_tile_intersections(scene.subset(chosen), view))
 
 
-def test_tile_intersections_are_handed_on_once_and_stay_within_the_budget() -> None:
+def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
     scene = cloud(600, seed=34)
     views = [camera(97, 61, pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
     chosen = torch.arange(600) % 4 > 0
@@ -135,7 +135,7 @@ def test_tile_intersections_are_handed_on_once_and_stay_within_the_budget() -> N
         whole.for_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool))
 
 
-def test_tile_intersections_beyond_a_new_limit_are_let_go_the_last_ones_first() -> None:
+def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
     scene = cloud(300, seed=35)
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
     cpu = CpuRasterizer(scene)
@@ -144,7 +144,7 @@ def test_tile_intersections_beyond_a_new_limit_are_let_go_the_last_ones_first() 
     assert [cpu.has_intersections(view) for view in views] == [False, True, False]
 
 
-def test_tile_intersections_beside_others_keep_what_these_leave_of_their_bytes() -> None:
+def test_guests_use_the_rest_of_the_budget_for_tile_intersections() -> None:
     scene = cloud(300, seed=36)
     views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
     sizes = [build_tile_intersections(scene, view).nbytes for view in views]

@@ -32,7 +32,7 @@ def build_often(folder: Path, others: list[Path], own: Path) -> None:
             build(folder)
 
 
-def test_processes_that_start_together_build_one_after_the_other(tmp_path: Path) -> None:
+def test_concurrent_processes_compile_one_after_the_other(tmp_path: Path) -> None:
     ready = [tmp_path / f"ready{number}" for number in range(2)]
     processes = [SPAWN.Process(target=build_often, args=(tmp_path / "builds", ready, own)) for own in ready]
     for process in processes:
@@ -48,7 +48,7 @@ def hold(folder: Path, held: Path) -> None:
         time.sleep(300)
 
 
-def test_a_process_that_dies_keeps_nobody_out(tmp_path: Path) -> None:
+def test_lock_of_a_dead_process_is_released(tmp_path: Path) -> None:
     process = SPAWN.Process(target=hold, args=(tmp_path, tmp_path / "held"))
     process.start()
     while not (tmp_path / "held").exists():
@@ -61,7 +61,7 @@ def test_a_process_that_dies_keeps_nobody_out(tmp_path: Path) -> None:
     process.join()
 
 
-def test_nobody_waits_where_nothing_can_be_built(tmp_path: Path) -> None:
+def test_unwritable_folder_is_not_locked(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with one_at_a_time(tmp_path / "file" / "builds"), one_at_a_time(tmp_path / "file" / "builds"):
         pass
@@ -73,7 +73,7 @@ def try_to_draw(trying: Path, tried: Path) -> None:
     tried.touch()
 
 
-def test_a_rasterizer_is_tried_when_no_other_process_tries_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_one_process_tries_a_rasterizer_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
     process = SPAWN.Process(target=try_to_draw, args=(tmp_path / "trying", tmp_path / "tried"))
     with one_at_a_time(build_folder()):

@@ -88,7 +88,7 @@ def on_device(scene: Scene, **options: float) -> TritonRasterizer:
     return TritonRasterizer(scene, background=BACKGROUND, device=DEVICE, **options)  # type: ignore[arg-type]
 
 
-def test_agrees_with_the_reference(case: tuple[Scene, Camera], one_thread: None) -> None:
+def test_images_and_gradients_agree_with_reference(case: tuple[Scene, Camera], one_thread: None) -> None:
     scene, view = case
     reference, fast = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
     band = reference.near_cutoff(view, CLOSE)
@@ -101,7 +101,7 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera], one_thread: None)
     assert relative_error(gradient, reference.color_gradient(pixels, view)) < 5e-6
 
 
-def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera], one_thread: None) -> None:
+def test_survey_equals_coverage_and_gradient_of_ones(case: tuple[Scene, Camera], one_thread: None) -> None:
     scene, view = case
     coverage, weights = on_device(scene).survey(view)
     plain, gradient = Rasterizer.survey(on_device(scene), view)
@@ -117,7 +117,7 @@ def test_a_survey_is_coverage_and_the_gradient_of_ones(case: tuple[Scene, Camera
     assert relative_error(weights, gradient) < 1e-6
 
 
-def test_tile_intersections_are_those_of_the_cpu(case: tuple[Scene, Camera]) -> None:
+def test_tile_intersections_equal_those_of_the_cpu(case: tuple[Scene, Camera]) -> None:
     scene, view = case
     isects, expected = on_device(scene).intersections(view), build_tile_intersections(scene, view)
     assert np.array_equal(isects.gaussians.cpu().numpy(), expected.projection.gaussians)
@@ -128,7 +128,7 @@ def test_tile_intersections_are_those_of_the_cpu(case: tuple[Scene, Camera]) -> 
     assert np.allclose(isects.values.cpu().numpy(), expected.projection.values, rtol=1e-9, atol=1e-9)
 
 
-def test_bands_put_together_are_the_same_bits() -> None:
+def test_concatenated_bands_are_bit_identical_to_whole_view() -> None:
     scene, view = cloud(120, seed=14), camera(40, 45)
     rasterizer, colors, pixels = on_device(scene), colors_of(scene), pixels_like(view)
     whole, bands = rasterizer.render(colors, view), [(0, 16), (16, 21), (21, 45)]
@@ -137,7 +137,7 @@ def test_bands_put_together_are_the_same_bits() -> None:
     assert relative_error(sum(parts), rasterizer.color_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
 
 
-def test_gradient_is_the_transpose_and_repeats_to_the_bit() -> None:
+def test_gradient_is_transpose_and_reproducible() -> None:
     scene, view = cloud(120, seed=15), camera(40, 33)
     rasterizer, colors, pixels = on_device(scene), colors_of(scene), pixels_like(view)
     gradient = rasterizer.color_gradient(pixels, view)
@@ -149,7 +149,7 @@ def test_gradient_is_the_transpose_and_repeats_to_the_bit() -> None:
 
 
 @pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
-def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
+def test_view_without_gaussians_is_background(scene: Scene) -> None:
     rasterizer, view = on_device(scene), camera(20, 18)
     assert torch.equal(rasterizer.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
     assert not rasterizer.coverage(view).any()
@@ -159,7 +159,7 @@ def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
     assert not gradient.any()
 
 
-def test_invalid_gaussians_are_left_out_as_by_the_reference() -> None:
+def test_invalid_gaussians_are_dropped_as_by_reference() -> None:
     scene = cloud(80, seed=16)
     quats, scales = scene.quats.clone(), scene.scales.clone()
     quats[3] = 0
@@ -169,7 +169,7 @@ def test_invalid_gaussians_are_left_out_as_by_the_reference() -> None:
     assert float((on_device(broken).render(colors_of(scene), view).cpu() - expected).abs().max()) < 1e-5
 
 
-def test_tile_intersections_beyond_the_budget_are_held_for_the_last_view_only() -> None:
+def test_tile_intersections_beyond_the_budget_are_cached_for_the_last_view_only() -> None:
     scene, views = cloud(50), [camera(33, 20), camera(20, 33)]
     rasterizer = on_device(scene, max_intersection_bytes=0)
     first = rasterizer.intersections(views[0])
@@ -178,26 +178,26 @@ def test_tile_intersections_beyond_the_budget_are_held_for_the_last_view_only() 
     assert rasterizer.intersections(views[0]) is not first
 
 
-def test_too_many_intersections_are_refused_before_they_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_intersections_are_refused_before_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sgsst_core.rasterizer.tile_intersections.MAX_INTERSECTIONS", 10)
     with pytest.raises(TooManyIntersectionsError, match="raster tiles"):
         on_device(cloud(200)).intersections(camera())
 
 
-def test_a_trial_drawing_tells_whether_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trial_render_returns_the_reason_of_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert drawing_problem("triton", DEVICE) is None
     monkeypatch.setattr(TritonRasterizer, "render", lambda *arguments: torch.zeros(16, 16, 3))
     assert drawing_problem("triton", DEVICE) == "it draws nothing"
     assert "no rasterizer is called 'none'" in str(drawing_problem("none"))  # type: ignore[arg-type]
 
 
-def test_made_by_its_name() -> None:
+def test_rasterizer_is_created_by_name() -> None:
     assert make_rasterizer("triton", cloud(10), device=DEVICE).name == "triton"
     assert make_rasterizer("triton", cloud(10)).device.type == DEVICE
 
 
 @pytest.mark.slow
-def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
+def test_steps_of_a_job_agree_with_the_cpu(tiny_weights: BackboneWeights, one_thread: None) -> None:
     """The whole job uses the rasterizer's protocol: survey, plan, both phases."""
     # The other tests do not even need pydantic, so they run on a bare machine with a GPU.
     from sgsst_core.settings import make_settings
@@ -215,7 +215,7 @@ def test_a_job_steps_as_on_the_cpu(tiny_weights: BackboneWeights, one_thread: No
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_the_error_says_what_to_do() -> None:
+def test_error_without_a_gpu_says_what_to_do() -> None:
     with pytest.raises(SettingsError, match="PyTorch sees no GPU"):
         make_rasterizer("triton", cloud(10), device="cuda")
     code = (
@@ -228,7 +228,7 @@ def test_without_a_gpu_the_error_says_what_to_do() -> None:
 
 
 @pytest.mark.slow
-def test_kernels_compile_for_real_targets_within_their_registers() -> None:
+def test_kernels_compile_for_gpus_within_their_registers() -> None:
     """Spilled registers cost memory traffic in the innermost loop: none are allowed on NVIDIA, few on AMD."""
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     command = [sys.executable, "-m", "benchmarks.triton_targets"]

@@ -66,7 +66,7 @@ def cached_on_device(scene: Scene, **options: Any) -> CachedRasterizer:
     return CachedRasterizer(scene, uncached=on_device(scene), **options)
 
 
-def test_agrees_with_the_reference(case: tuple[Scene, Camera]) -> None:
+def test_images_and_gradients_agree_with_reference(case: tuple[Scene, Camera]) -> None:
     scene, view = case
     reference, uncached = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
     band = reference.near_cutoff(view, CLOSE)
@@ -82,7 +82,7 @@ def test_agrees_with_the_reference(case: tuple[Scene, Camera]) -> None:
         assert cached.is_cached(view)
 
 
-def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
+def test_half_precision_weights_are_within_rounding_error() -> None:
     """The bound holds down to the smallest weights, of a faint Gaussian behind opaque ones."""
     scene, view = cloud(150, seed=7, log_scale=-1.0), camera(18, 17)
     uncached = on_device(scene)
@@ -96,7 +96,7 @@ def test_each_half_precision_weight_is_off_by_at_most_its_share() -> None:
 
 
 @pytest.mark.parametrize("precision", ERRORS)
-def test_gradient_is_the_transpose_and_repeats_to_the_bit(precision: Precision) -> None:
+def test_gradient_is_transpose_and_reproducible(precision: Precision) -> None:
     scene, view = cloud(120, seed=15), camera(33, 20)
     cached, colors, pixels = cached_on_device(scene, precision=precision), colors_of(scene), pixels_like(view)
     gradient = cached.color_gradient(pixels, view)
@@ -107,7 +107,7 @@ def test_gradient_is_the_transpose_and_repeats_to_the_bit(precision: Precision) 
     assert torch.equal(cached_on_device(scene, precision=precision).color_gradient(pixels, view), gradient)
 
 
-def test_bands_put_together_are_the_whole() -> None:
+def test_concatenated_bands_equal_whole_view() -> None:
     scene, view = cloud(100, seed=14), camera(20, 35)
     colors, pixels, uncached = colors_of(scene), pixels_like(view), on_device(scene)
     whole, parts = (CachedRasterizer(scene, uncached=uncached) for _ in range(2))
@@ -126,7 +126,7 @@ def test_bands_put_together_are_the_whole() -> None:
 
 
 @pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
-def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
+def test_view_without_gaussians_is_background(scene: Scene) -> None:
     cached, view = cached_on_device(scene), camera(20, 18)
     assert torch.equal(cached.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
     assert not cached.coverage(view).any()
@@ -136,7 +136,7 @@ def test_a_view_that_shows_nothing_is_the_background(scene: Scene) -> None:
     assert cached.cached_bytes == cached.count_weights(view).nbytes(cached.precision)
 
 
-def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() -> None:
+def test_weights_beyond_the_budget_are_recomputed_on_the_device() -> None:
     scene = cloud(100, seed=20)
     views = [camera(20, 17), camera(20, 17, pose=turned_pose(0.1)), camera(17, 20, pose=turned_pose(0.2))]
     colors, pixels, uncached = colors_of(scene), pixels_like(views[0]), on_device(scene)
@@ -158,7 +158,7 @@ def test_bytes_are_as_planned_and_what_does_not_fit_is_computed_on_the_device() 
     assert alone.cached_bytes == alone.count_weights(views[0], band).nbytes(alone.precision)
 
 
-def test_a_piece_holds_a_weight_and_every_slot_is_filled_once() -> None:
+def test_pieces_have_weights_and_slots_are_filled_once() -> None:
     scene, view = cloud(120, seed=21), camera(33, 20)
     weights: Any = cached_on_device(scene).count_weights(view).store("float32")
     assert bool((weights.weights.view(-1, 16).amax(1) > 0).all())
@@ -189,7 +189,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         yield found
 
 
-def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_caching_synchronizes_once_and_cached_views_never(monkeypatch: pytest.MonkeyPatch) -> None:
     """Intersections wait for their length, and weights for the number of pieces."""
     scene, view = cloud(60, seed=22), camera(20, 17)
     cached, colors, pixels = cached_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
@@ -203,7 +203,7 @@ def test_a_kept_view_waits_for_nothing_and_keeping_it_once_beside_its_lists(monk
     assert not found
 
 
-def test_made_by_its_name() -> None:
+def test_rasterizer_is_created_by_name() -> None:
     scene = cloud(10)
     uncached = make_rasterizer("triton", scene, device=DEVICE)
     rasterizer: Any = make_rasterizer("cached", scene, uncached=uncached)
@@ -220,7 +220,7 @@ def test_made_by_its_name() -> None:
 VIEWS = cameras(2, 32, 24)
 
 
-def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) -> None:
+def test_plan_predicts_the_bytes_of_cached_weights(tiny_weights: BackboneWeights) -> None:
     scene = ball(60)
     planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
     found = measure(
@@ -238,7 +238,7 @@ def test_a_plan_counts_the_bytes_that_are_kept(tiny_weights: BackboneWeights) ->
 
 
 @pytest.mark.slow
-def test_a_job_goes_on_with_the_lists_of_its_plan(tiny_weights: BackboneWeights) -> None:
+def test_job_reuses_tile_intersections_of_its_plan(tiny_weights: BackboneWeights) -> None:
     scene, losses = ball(60), {}
     settings = make_settings("preview", steps_coarse=0, steps_sos=1, cached_weights="half")
     for name in ("cpu", "triton"):

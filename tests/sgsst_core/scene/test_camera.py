@@ -28,7 +28,7 @@ def project(view: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("longer_side", [1, 7, 480, 990, 1600, 5187])
 @pytest.mark.parametrize(("width", "height"), [(990, 742), (742, 990), (640, 640), (5000, 3)])
-def test_resizing_leaves_every_direction_at_its_place_in_the_picture(width: int, height: int, longer_side: int) -> None:
+def test_resizing_keeps_directions_at_their_relative_image_position(width: int, height: int, longer_side: int) -> None:
     before = camera(width, height)
     after = resized(before, longer_side)
     assert max(after.width, after.height) == longer_side
@@ -40,7 +40,7 @@ def test_resizing_leaves_every_direction_at_its_place_in_the_picture(width: int,
 
 
 @pytest.mark.parametrize(("width", "height"), [(242, 813), (813, 242), (444, 444)])
-def test_a_shape_that_was_chosen_keeps_its_number_of_pixels_at_a_resolution(width: int, height: int) -> None:
+def test_fitted_aspect_ratio_has_the_pixels_of_its_resolution(width: int, height: int) -> None:
     chosen = replace(camera(width, height), resolution=512)
     for side in (100, 512, 1024):
         after = resized(chosen, side)
@@ -52,13 +52,13 @@ def test_a_shape_that_was_chosen_keeps_its_number_of_pixels_at_a_resolution(widt
     assert fitted.side == 400
 
 
-def test_resizing_to_nothing_is_refused() -> None:
+def test_resizing_below_one_pixel_is_refused() -> None:
     with pytest.raises(SettingsError, match="resolution is 0"):
         resized(camera(), 0)
 
 
 @pytest.mark.parametrize(("total", "count"), [(97, 8), (97, 96), (10, 3), (5, 5), (5, 9), (1, 1), (1000, 1)])
-def test_a_spread_subset_is_even_and_in_order(total: int, count: int) -> None:
+def test_spread_views_are_even_and_in_order(total: int, count: int) -> None:
     cameras = [camera(name=str(i)) for i in range(total)]
     chosen = [int(c.name) for c in spread(cameras, count)]
     assert len(chosen) == min(count, total)
@@ -70,12 +70,12 @@ def test_a_spread_subset_is_even_and_in_order(total: int, count: int) -> None:
         assert min(gaps) - 1 <= seam <= max(gaps) + 1
 
 
-def test_a_subset_of_nothing_is_refused() -> None:
+def test_spread_of_less_than_one_view_is_refused() -> None:
     with pytest.raises(SettingsError, match="views is 0"):
         spread([camera()], 0)
 
 
-def test_look_at_sees_its_target_in_the_middle_and_up_above() -> None:
+def test_look_at_centers_target_with_up_at_the_top() -> None:
     position, target, up = torch.tensor([1.0, 2, 3]), torch.tensor([4.0, -1, 7]), torch.tensor([0.0, 0, 5])
     view = look_at("a", position, target, up, width=300, height=200, focal=250.0)
     pixels, depths = project(view, torch.stack([target, target + 0.1 * up]))

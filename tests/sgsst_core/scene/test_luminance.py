@@ -10,7 +10,7 @@ def colors(count: int = 200, dtype: torch.dtype = torch.float64) -> torch.Tensor
     return torch.randn(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
 
 
-def test_gray_has_the_luminance_and_no_color() -> None:
+def test_gray_keeps_luminance_and_has_no_chroma() -> None:
     found = gray(colors())
     assert sum(WEIGHTS) == pytest.approx(1, abs=1e-15)
     torch.testing.assert_close(found[:, 0], colors() @ torch.tensor(WEIGHTS, dtype=torch.float64))
@@ -20,13 +20,13 @@ def test_gray_has_the_luminance_and_no_color() -> None:
     assert found.is_contiguous()
 
 
-def test_the_gradient_of_gray_is_its_derivative() -> None:
+def test_gray_gradient_agrees_with_autograd() -> None:
     values, sent = colors().requires_grad_(), colors(200).flip(0)
     (wanted,) = torch.autograd.grad((gray(values) * sent).sum(), values)
     torch.testing.assert_close(gray_gradient(sent), wanted)
 
 
-def test_chroma_is_taken_from_the_original() -> None:
+def test_chroma_comes_from_the_original() -> None:
     original = 3 * colors(dtype=torch.float32)
     shift = torch.linspace(-5, 5, 200)[:, None]
     noise = 1e-3 * colors(dtype=torch.float32).flip(0)
@@ -37,7 +37,7 @@ def test_chroma_is_taken_from_the_original() -> None:
     torch.testing.assert_close(change.mean(1), (shift[:, 0] + noise.mean(1)).double(), rtol=0, atol=1e-5)
 
 
-def test_errors_of_many_steps_do_not_add_up() -> None:
+def test_chroma_errors_do_not_accumulate() -> None:
     original = colors(dtype=torch.float32)
     present = original
     for _ in range(2000):

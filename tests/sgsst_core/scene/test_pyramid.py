@@ -16,7 +16,7 @@ def test_scale_count(size, count):
 
 
 @pytest.mark.parametrize("scale", [0, 1, 2, 3])
-def test_downscale_is_the_box_average_and_upscaling_its_adjoint(scale):
+def test_downscale_is_box_average_and_upscale_its_adjoint(scale):
     image = torch.rand((37, 50, 3), dtype=torch.float64)
     small = downscale(image, scale)
     side = 2**scale
@@ -29,12 +29,12 @@ def test_downscale_is_the_box_average_and_upscaling_its_adjoint(scale):
     assert float((adjoint * image).sum()) == pytest.approx(0.5 * float((gradient * small).sum()), rel=1e-13)
 
 
-def test_scales_compose():
+def test_downscaling_twice_equals_downscaling_once():
     image = torch.rand((64, 48, 3), dtype=torch.float64)
     torch.testing.assert_close(downscale(downscale(image, 1), 2), downscale(image, 3), rtol=1e-14, atol=0)
 
 
-def test_style_is_brought_down_but_never_up():
+def test_style_is_downscaled_but_never_upscaled():
     assert style_size((1520, 1920), (500, 700)) == (500, 632)
     assert style_size((540, 900), (500, 700)) == (540, 900)
     assert style_size((300, 200), (500, 700)) == (300, 200)

@@ -22,7 +22,7 @@ def colors(sh_dc: torch.Tensor) -> torch.Tensor:
     return 0.5 + SH_C0 * sh_dc.double()
 
 
-def test_the_bound_is_the_last_float32_inside() -> None:
+def test_bound_is_the_largest_float32_within_range() -> None:
     bound = torch.tensor([LARGEST])
     beyond = torch.nextafter(bound, torch.tensor([torch.inf]))
     assert float(colors(bound)) <= 1
@@ -32,7 +32,7 @@ def test_the_bound_is_the_last_float32_inside() -> None:
 
 
 @given(st.lists(COLOR, min_size=1, max_size=8))
-def test_each_channel_is_cut_off_by_itself(rows: list[tuple[float, float, float]]) -> None:
+def test_channels_are_clamped_separately(rows: list[tuple[float, float, float]]) -> None:
     sh_dc = torch.tensor(rows, dtype=torch.float32)
     found = on_screen(sh_dc)
     shown = colors(found)
@@ -44,7 +44,7 @@ def test_each_channel_is_cut_off_by_itself(rows: list[tuple[float, float, float]
 
 
 @given(st.lists(COLOR, min_size=1, max_size=8))
-def test_along_gray_no_further_than_needed(rows: list[tuple[float, float, float]]) -> None:
+def test_gray_shift_is_as_small_as_possible(rows: list[tuple[float, float, float]]) -> None:
     sh_dc = torch.tensor(rows, dtype=torch.float32).double()
     found = on_screen_by_luminance(sh_dc)
     shift = found - sh_dc
@@ -60,7 +60,7 @@ def test_along_gray_no_further_than_needed(rows: list[tuple[float, float, float]
             assert float(after.min() + after.max()) == pytest.approx(0, abs=1e-9 * float(before.abs().max()))
 
 
-def test_chroma_survives_float32() -> None:
+def test_gray_shift_preserves_chroma_in_float32() -> None:
     generator = torch.Generator().manual_seed(1)
     original = torch.rand((1000, 3), generator=generator) * 2 - 1
     moved = original + 6 * torch.randn((1000, 1), generator=generator)

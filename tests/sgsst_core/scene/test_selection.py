@@ -9,18 +9,18 @@ NAN = float("nan")
 MEANS = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1, 2, 1], [-3, 0, 0], [NAN, 0, 0]])
 
 
-def test_a_box_has_its_borders_and_corners_in_any_order():
+def test_box_includes_its_border_for_any_order_of_corners():
     wanted = [True, True, False, False, False]
     assert in_box(MEANS, (0, 0, 0, 1, 1, 1)).tolist() == wanted
     assert in_box(MEANS, (1, 0, 1, 0, 1, 0)).tolist() == wanted
 
 
-def test_a_sphere_has_its_border():
+def test_sphere_includes_its_border():
     assert in_sphere(MEANS, (0, 0, 0, 3**0.5)).tolist() == [True, True, False, False, False]
     assert in_sphere(MEANS, (0, 0, 0, 3)).tolist() == [True, True, True, True, False]
 
 
-def test_a_half_space_is_where_its_normal_points():
+def test_half_space_lies_on_the_side_of_its_normal():
     assert in_half_space(MEANS, (1, 0, 0, 1)).tolist() == [False, True, True, False, False]
     assert in_half_space(MEANS, (-2, 0, 0, 6)).tolist() == [False, False, False, True, False]
 

@@ -56,7 +56,7 @@ def test_basis_is_orthonormal() -> None:
     assert torch.allclose(products, torch.eye(16, dtype=torch.float64), atol=1e-12)
 
 
-def test_basis_has_the_signs_and_the_order_of_3dgs_files() -> None:
+def test_basis_has_signs_and_order_of_3dgs_files() -> None:
     # Computed by hand at (x, y, z) = (2, 3, 6) / 7 with the tabulated constants of the real harmonics.
     x, y, z = 2 / 7, 3 / 7, 6 / 7
     expected = [
@@ -93,7 +93,7 @@ def test_rest_colors_of_a_degree_use_only_its_coefficients(degree: int) -> None:
     assert degree > 0 or not alone.any()
 
 
-def test_a_world_moved_far_away_keeps_its_colors() -> None:
+def test_scene_far_from_origin_keeps_its_colors() -> None:
     scene, view = cloud(50, degree=3), camera(pose=turned_pose())
     scene = replace(scene, means=(scene.means * 16).round() / 16)  # so that a translation by 1e6 is exact
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
@@ -143,7 +143,7 @@ KERNEL_CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("name", KERNEL_CASES)
-def test_the_kernel_agrees_with_float64(name: str, degree: int) -> None:
+def test_kernel_agrees_with_float64_reference(name: str, degree: int) -> None:
     """Files have this degree, or higher bands that are not used."""
     pytest.importorskip("triton")
     scene, view = KERNEL_CASES[name]()
@@ -160,7 +160,7 @@ def test_the_kernel_agrees_with_float64(name: str, degree: int) -> None:
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("name", KERNEL_CASES)
-def test_on_the_cpu_sums_are_those_of_float64_rounded_once(name: str, degree: int) -> None:
+def test_cpu_sums_are_float64_rounded_once(name: str, degree: int) -> None:
     scene, view = KERNEL_CASES[name]()
     whole = held(scene.sh_rest)
     count = (degree + 1) ** 2 - 1
@@ -174,7 +174,7 @@ def test_on_the_cpu_sums_are_those_of_float64_rounded_once(name: str, degree: in
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")
-def test_colors_on_a_gpu_are_those_of_the_kernel() -> None:
+def test_gpu_colors_come_from_the_kernel() -> None:
     scene, view = cloud(300, degree=3), camera(pose=turned_pose())
     sh_rest, means = held(scene.sh_rest).cuda(), scene.means.cuda()
     found = rest_colors(sh_rest, means, view)
@@ -183,7 +183,7 @@ def test_colors_on_a_gpu_are_those_of_the_kernel() -> None:
     assert not rest_colors(sh_rest, means, view, degree=0).any()
 
 
-def test_colors_are_clamped_and_the_gradient_follows() -> None:
+def test_colors_are_clamped_and_gradient_is_zero_below_the_clamp() -> None:
     generator = torch.Generator().manual_seed(0)
     sh_dc = 3 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
     rest = torch.randn(40, 3, generator=generator, dtype=torch.float64)
@@ -197,7 +197,7 @@ def test_colors_are_clamped_and_the_gradient_follows() -> None:
     assert torch.allclose(view_colors_gradient(gradient, colors.detach()), expected, atol=1e-15)
 
 
-def test_revived_colors_only_come_back() -> None:
+def test_clamp_aware_gradient_only_raises_clamped_colors() -> None:
     """At a color clamped to 0, a gradient passes if it would raise the color, not if it would lower it."""
     colors = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
     gradient = torch.tensor([[-1.0, 1.0, 2.0], [0.0, -3.0, -4.0]])
@@ -205,7 +205,7 @@ def test_revived_colors_only_come_back() -> None:
     torch.testing.assert_close(found, SH_C0 * torch.tensor([[-1.0, 0.0, 2.0], [0.0, -3.0, -4.0]]))
 
 
-def test_dark_colors_come_back_when_revived() -> None:
+def test_clamp_aware_gradient_recovers_clamped_colors() -> None:
     """Descent on |c - 0.6|^2 from far below 0 is stuck without the clamp-aware gradient, and converges with it."""
     ends = []
     for clamp_aware_gradient in (False, True):
@@ -218,7 +218,7 @@ def test_dark_colors_come_back_when_revived() -> None:
     torch.testing.assert_close(ends[1], torch.full((1, 3), 0.6), rtol=1e-4, atol=0)
 
 
-def test_impossible_coefficients_are_refused() -> None:
+def test_wrong_number_of_coefficients_is_refused() -> None:
     scene, view = cloud(5, degree=1), camera()
     with pytest.raises(ValueError, match="4 coefficients"):
         rest_colors(torch.zeros(5, 4, 3), scene.means, view)

@@ -83,7 +83,7 @@ def rewritten(path: Path, comment: bytes, extra: tuple[str, ...], position: int,
     elements=st.sampled_from([b"", b"\x01\x02\x03"]),
     mask=st.integers(0, 2**60 - 1),
 )
-def test_any_layout_gives_the_bits_of_the_scene_in_memory(
+def test_stored_harmonics_of_any_layout_equal_those_in_memory(
     tmp_path_factory: pytest.TempPathFactory,
     count: int,
     degree: int,
@@ -115,7 +115,7 @@ def test_any_layout_gives_the_bits_of_the_scene_in_memory(
 
 
 @pytest.mark.parametrize("change", ["big_endian", "doubles", "order", "text", "odd rows"])
-def test_other_layouts_are_held_in_memory(tmp_path: Path, change: str) -> None:
+def test_unsupported_layouts_are_read_into_memory(tmp_path: Path, change: str) -> None:
     path = written(tmp_path, 5, 1)
     data = path.read_bytes()
     expected = held(read_scene(path).scene.sh_rest)
@@ -144,12 +144,12 @@ def test_other_layouts_are_held_in_memory(tmp_path: Path, change: str) -> None:
     assert torch.equal(scene.sh_rest, expected)
 
 
-def test_small_scenes_are_held_in_memory(tmp_path: Path) -> None:
+def test_small_scenes_are_read_into_memory(tmp_path: Path) -> None:
     assert isinstance(read_scene(written(tmp_path)).scene.sh_rest, Tensor)
     assert isinstance(read_scene(written(tmp_path, degree=0), held_bytes=0).scene.sh_rest, Tensor)
 
 
-def test_what_follows_from_coefficients_is_the_same(tmp_path: Path) -> None:
+def test_values_derived_from_stored_coefficients_are_the_same(tmp_path: Path) -> None:
     """These are fingerprints of jobs, so that a job can be resumed either way, and the largest coefficients."""
     stored, plain = both(written(tmp_path))
     found = [fingerprint(scene, [camera()], torch.zeros(2, 2, 3), make_settings(), "w") for scene in (stored, plain)]
@@ -159,7 +159,7 @@ def test_what_follows_from_coefficients_is_the_same(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("last", "degree"), [(None, 0), (0, 1), (2, 1), (3, 2), (7, 2), (8, 3)])
-def test_zero_bands_are_left_out_without_a_copy(tmp_path: Path, last: int | None, degree: int) -> None:
+def test_zero_bands_are_removed_without_a_copy(tmp_path: Path, last: int | None, degree: int) -> None:
     scene = cloud(100, degree=3)
     values = torch.zeros(100, 15, 3)
     if last is not None:
@@ -175,7 +175,7 @@ def test_zero_bands_are_left_out_without_a_copy(tmp_path: Path, last: int | None
         assert found.used_degree(without) == 0
 
 
-def test_dropped_gaussians_are_absent_and_counted(tmp_path: Path) -> None:
+def test_invalid_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
     scene = cloud(100, degree=2)
     values = held(scene.sh_rest).clone()
     values[3, 1, 2], values[70, 0, 0] = torch.nan, torch.inf  # f_rest_17 and f_rest_0
@@ -200,7 +200,7 @@ def test_dropped_gaussians_are_absent_and_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ["shortened", "emptied", "overwritten", "longer"])
-def test_a_file_that_changes_meanwhile_is_an_error_and_no_signal(tmp_path: Path, change: str) -> None:
+def test_changed_file_raises_an_error_instead_of_a_signal(tmp_path: Path, change: str) -> None:
     path = written(tmp_path)
     scene = both(path)[0]
     size, data = path.stat().st_size, path.read_bytes()
@@ -217,7 +217,7 @@ def test_a_file_that_changes_meanwhile_is_an_error_and_no_signal(tmp_path: Path,
         rest_colors(scene.sh_rest, scene.means, camera())
 
 
-def test_a_file_that_is_replaced_or_deleted_stays_readable(tmp_path: Path) -> None:
+def test_replaced_or_deleted_file_stays_readable(tmp_path: Path) -> None:
     path = written(tmp_path)
     stored, plain = both(path)
     (tmp_path / "other.ply").write_bytes(b"ply")
@@ -226,7 +226,7 @@ def test_a_file_that_is_replaced_or_deleted_stays_readable(tmp_path: Path) -> No
     assert torch.equal(held(stored.sh_rest), held(plain.sh_rest))
 
 
-def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_that_shrinks_during_a_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path)
 
     def shrink(scene: Path) -> SceneHeader:
@@ -245,7 +245,7 @@ def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path: Path, monkeyp
         read_scene(path, held_bytes=0)
 
 
-def test_another_process_opens_the_same_file_or_none(tmp_path: Path) -> None:
+def test_other_process_opens_the_same_file_or_raises(tmp_path: Path) -> None:
     path = written(tmp_path)
     stored, plain = both(path)
     assert isinstance(stored.sh_rest, StoredHarmonics)
@@ -285,7 +285,7 @@ _PEAK = textwrap.dedent("""
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is looked for in Linux's /proc")
-def test_memory_holds_neither_the_harmonics_nor_the_result(tmp_path: Path) -> None:
+def test_neither_harmonics_nor_result_are_in_memory(tmp_path: Path) -> None:
     """A Gaussian takes 56 bytes, in the subset again, plus 12 for its color and 4 for its row; SH would take 180."""
     write_scene(tmp_path / "scene.ply", cloud(10, degree=3))
     count, one = 300_000, cloud(3000, degree=3)
