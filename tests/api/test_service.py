@@ -435,7 +435,7 @@ def test_the_client_and_its_commands(service: Service, files: dict[str, Path], e
     assert sgsst("download", newest["id"], "plan.json").stdout == "plan.json\n"
     assert json.loads((tmp_path / "plan.json").read_text())["decisions"]
     wrong = sgsst("submit", str(files["style"]), "--style", str(files["style"]), "--orbit", "3")
-    assert (wrong.returncode, "PLY header" in wrong.stderr) == (2, True)
+    assert (wrong.returncode, "is not a scene file" in wrong.stderr) == (2, True)
     assert sgsst("status", "job_00000000000000000000").returncode == 2
 
     with Client(service.url) as client:

@@ -221,7 +221,7 @@ def test_a_plan_queues_nothing_and_bad_files_are_refused(
 ) -> None:
     with connect(service.url) as client:
         before = [job.id for job in client.jobs()]
-        with pytest.raises(RequestError, match="PLY header") as caught:
+        with pytest.raises(RequestError, match="is not a scene file") as caught:
             client.plan(files["style"], files["style"], orbit=2)
         assert (caught.value.status, caught.value.problem["input"]) == (422, "scene")
         with pytest.raises(RequestError, match="is not a file"):
