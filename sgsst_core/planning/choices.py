@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -391,18 +390,6 @@ def _launch_times(cost: LaunchCost) -> str:
 
 
 # --- rasterizer ----------------------------------------------------------------------------------------------------
-
-
-def rasterizer_options(name: str, settings: Settings, memory: int) -> dict[str, Any]:
-    """Return the constructor options, apart from the scene, of the rasterizer that computes blend weights.
-
-    Args:
-        name: Name of the rasterizer.
-        settings: Settings of the job.
-        memory: Memory budget of the rank in bytes.
-    """
-    options = RASTERIZERS[name].options(memory_for("rasterizer", memory)) if name in RASTERIZERS else {}
-    return {"background": settings.background, "near": settings.near, **options}
 
 
 def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[CachedWeights, Decision]:

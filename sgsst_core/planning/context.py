@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import torch
 
-from sgsst_core.budget import default_memory_limit
+from sgsst_core.budget import default_memory_limit, memory_for
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.planning.choices import precision_of, rasterizer_options
+from sgsst_core.planning.choices import precision_of
 from sgsst_core.planning.facts import Machine
 from sgsst_core.planning.plan import Device
 from sgsst_core.rasterizer import Rasterizer, gpu_rasterizers, make_rasterizer, rasterizer_for
@@ -90,7 +90,8 @@ def equip(
         problems=problems,
     )
     name = rasterizer or rasterizer_for(device, problems)
-    of_scene = make_rasterizer(name, scene, **rasterizer_options(name, settings, machine.memory))
+    memory = memory_for("rasterizer", machine.memory)
+    of_scene = make_rasterizer(name, scene, background=settings.background, near=settings.near, memory=memory)
     return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, ratio, of_scene, sh_degree)
 
 

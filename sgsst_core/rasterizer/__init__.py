@@ -35,6 +35,7 @@ def make_rasterizer(
     background: Color = (0.0, 0.0, 0.0),
     near: float = NEAR,
     device: torch.device | str | None = None,
+    memory: int | None = None,
     **options: Any,
 ) -> Rasterizer:
     """Create the rasterizer of a given name for a scene.
@@ -47,6 +48,7 @@ def make_rasterizer(
         near: Near plane in world units.
         device: Device for `cached`, `triton` and `cuda`. None selects the CPU for `cached` (or the device of its option
             `uncached`), and the current GPU for `triton` and `cuda`.
+        memory: Memory budget in bytes for tile intersections and cached blend weights; None for the default.
         options: Further arguments of the implementation's constructor.
 
     Raises:
@@ -55,7 +57,10 @@ def make_rasterizer(
     if name not in RASTERIZERS:
         *names, last = RASTERIZERS
         raise SettingsError(f"no rasterizer is called {name!r}: choose {', '.join(names)} or {last}")
-    return RASTERIZERS[name](scene, background=background, near=near, device=device, **options)
+    kind = RASTERIZERS[name]
+    if memory is not None:
+        options = kind.options(memory) | options
+    return kind(scene, background=background, near=near, device=device, **options)
 
 
 def gpu_rasterizers() -> list[str]:

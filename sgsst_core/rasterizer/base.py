@@ -220,15 +220,15 @@ class Rasterizer(ABC):
         """Return a rasterizer of another scene with the same options, apart from those given."""
         return type(self)(scene, **(self._options | options))
 
-    def for_subset(self, scene: Scene, rows: Tensor, **options: Any) -> Self:
+    def for_subset(self, scene: Scene, rows: Tensor, memory: int) -> Self:
         """Return a rasterizer of a subset of the Gaussians, which may take over data prepared for views.
 
         Args:
             scene: Scene of the subset, with unchanged geometry.
             rows: [N] bool, mask of the subset.
-            options: Constructor options that differ.
+            memory: Memory budget of the new rasterizer in bytes, as in `make_rasterizer`.
         """
-        return self.for_scene(scene, **options)
+        return self.for_scene(scene, **self.options(memory))
 
     def beside(self, scene: Scene) -> Self:
         """Return a rasterizer of another scene that shares this one's memory budget, with lower priority."""

@@ -100,6 +100,11 @@ class CachedRasterizer(Rasterizer):
         self._temporary: dict[tuple[CameraKey, Rows], _CachedBand] = {}
         self._lock = threading.Lock()
 
+    @classmethod
+    def options(cls, memory: int) -> dict[str, Any]:
+        """Return constructor options for a memory budget in bytes."""
+        return {"max_bytes": memory}
+
     @property
     def cached_bytes(self) -> int:
         """Size of all cached weights in bytes."""

@@ -68,7 +68,7 @@ class CpuRasterizer(Rasterizer):
         """Return constructor options for a memory budget in bytes, which cached weights share."""
         return {"max_intersection_bytes": memory}
 
-    def for_subset(self, scene: Scene, rows: Tensor, **options: Any) -> CpuRasterizer:
+    def for_subset(self, scene: Scene, rows: Tensor, memory: int) -> CpuRasterizer:
         """Return a rasterizer of a subset of the Gaussians, see `Rasterizer.for_subset`.
 
         The new rasterizer takes over the cached tile intersections. Those of a view are restricted to the subset when
@@ -76,11 +76,11 @@ class CpuRasterizer(Rasterizer):
         """
         if len(scene) != int(rows.sum()) or len(rows) != len(self.scene):
             raise ValueError(f"{len(scene)} Gaussians are not the {int(rows.sum())} chosen ones of {len(self.scene)}")
-        subset = self.for_scene(scene, **options)
+        subset = self.for_scene(scene, **self.options(memory))
         indices = torch.where(rows, rows.cumsum(0, dtype=torch.int32) - 1, -1).to(torch.int32).numpy()
         subset._intersections = ViewCache(
             subset._build,
-            subset._options["max_intersection_bytes"],
+            memory,
             self._intersections,
             lambda isects: intersections_of_subset(isects, indices),
         )

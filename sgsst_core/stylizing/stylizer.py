@@ -24,7 +24,7 @@ from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.choices import ends_with_transfer, rasterizer_options
+from sgsst_core.planning.choices import ends_with_transfer
 from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
@@ -263,19 +263,21 @@ class Stylizer:
     def _make_rasterizer(self, seen: Scene, planning_context: PlanningContext | None) -> Rasterizer:
         """Return the plan's rasterizer of the rendered Gaussians."""
         plan, settings = self.plan, self.settings
-        options = rasterizer_options(plan.uncached, settings, self.memory)
+        memory = memory_for("rasterizer", self.memory)
         whole = planning_context.rasterizer if planning_context else None
         if whole is None:
-            uncached = make_rasterizer(plan.uncached, seen, **options)
+            uncached = make_rasterizer(
+                plan.uncached, seen, background=settings.background, near=settings.near, memory=memory
+            )
         elif plan.seen.all():
             uncached = whole
         else:
-            uncached = whole.for_subset(seen, plan.seen, **options)
+            uncached = whole.for_subset(seen, plan.seen, memory)
         if plan.cached_weights == "none":
             return uncached
         return CachedRasterizer(
             seen,
-            max_bytes=memory_for("rasterizer", self.memory),
+            max_bytes=memory,
             least_intersection_bytes=self._least_intersection_bytes,
             precision="half" if plan.cached_weights == "half" else "float32",
             at_first_use=False,

@@ -123,7 +123,7 @@ def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
     for view in views:
         whole.intersections(view)
     budget = sum(sizes[:3])
-    part = whole.for_subset(scene.subset(chosen), chosen, max_intersection_bytes=budget)
+    part = whole.for_subset(scene.subset(chosen), chosen, budget)
     assert [part.has_intersections(view) for view in views] == [True, True, True, False]
     for done, view in enumerate(views):
         check_same(part.intersections(view), build_tile_intersections(scene.subset(chosen), view))
@@ -132,7 +132,7 @@ def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
         assert [whole.has_intersections(other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
     assert part.intersections(views[1]) is part.intersections(views[1])
     with pytest.raises(ValueError, match="450 Gaussians are not the 600 chosen ones of 600"):
-        whole.for_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool))
+        whole.for_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool), budget)
 
 
 def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
