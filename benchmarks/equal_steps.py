@@ -22,7 +22,7 @@ from typing import Any
 import torch
 
 from benchmarks.cameras import read_views
-from benchmarks.machine import RESULTS, write_result
+from benchmarks.machine import add_pair, print_row
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.bench.quality import make_novel_views
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
@@ -62,21 +62,24 @@ def main() -> None:
     cameras = read_views(arguments.cameras, scene, arguments.views, arguments.resolution)
     base = {"steps_coarse": arguments.steps_coarse, "steps_sos": arguments.steps_sos, "early_stop": False}
     base |= json.loads(arguments.settings)
+    description = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
+    description |= {"resolution": arguments.resolution, "steps": [arguments.steps_coarse, arguments.steps_sos]}
+    description |= {"settings": json.loads(arguments.settings)}
     judge, palette = _judge(scene, cameras, style, base), quantiles(style, torch.ones(style.shape[:2]))
     rows = {"unstylized": _judged(judge, scene.sh_dc, palette)}
     colors = {"unstylized": scene.sh_dc}
     print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
-    _print("unstylized", rows["unstylized"])
+    print_row("unstylized", rows["unstylized"], COLUMNS)
     for row in arguments.rows:
         name, _, text = row.partition("=")
-        found = []
+        results = []
         for seed in arguments.seeds.split(","):
             values = base | json.loads(text or "{}") | {"seed": int(seed)}
             colors[name], seconds = _run(scene, cameras, style, values)
-            found.append({**_judged(judge, colors[name], palette), "seconds": seconds})
-        rows[name] = _mean(found)
-        _print(name, rows[name])
-        _store(arguments, rows)
+            results.append({**_judged(judge, colors[name], palette), "seconds": seconds})
+        rows[name] = _mean(results)
+        print_row(name, rows[name], COLUMNS)
+        add_pair("equal_steps", arguments.name, description, rows)
     if arguments.out:
         _write_sheet(arguments.out, arguments.name, judge, style, colors)
 
@@ -96,27 +99,27 @@ def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[st
     return {**asdict(judgment), "sliced": sum(sliced) / len(sliced)}
 
 
-def sliced_distance(pictures: list[torch.Tensor], palette: torch.Tensor) -> float:
+def sliced_distance(renders: list[torch.Tensor], palette: torch.Tensor) -> float:
     """Return the order-2 sliced Wasserstein distance of a view's covered pixels from a palette, in 8-bit levels.
 
     Args:
-        pictures: Renders of the view [h, w, 3], on black and on white.
+        renders: Renders of the view [h, w, 3], on black and on white.
         palette: Quantiles of the style's colors.
     """
-    on_black, on_white = pictures
+    on_black, on_white = renders
     coverage = (1 - (on_white - on_black).mean(-1)).clamp(0, 1)
     return 255 * float((quantiles(on_black, coverage) - palette).square().mean().sqrt())
 
 
-def quantiles(picture: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+def quantiles(image: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     """Return the quantiles [QUANTILES, DIRECTIONS] of an image [h, w, 3] with pixel weights [h, w]."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn((3, DIRECTIONS), generator=generator).double(), dim=0)
-    ordered, order = (picture.reshape(-1, 3).double() @ directions).sort(dim=0)
-    shares = weights.reshape(-1).double()[order].cumsum(0) / weights.double().sum()
-    wanted = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
-    places = torch.searchsorted(shares.T.contiguous(), wanted.expand(DIRECTIONS, -1).contiguous()).T
-    return ordered.gather(0, places.clamp_max(len(ordered) - 1))
+    ordered, order = (image.reshape(-1, 3).double() @ directions).sort(dim=0)
+    cumulative = weights.reshape(-1).double()[order].cumsum(0) / weights.double().sum()
+    fractions = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    indices = torch.searchsorted(cumulative.T.contiguous(), fractions.expand(DIRECTIONS, -1).contiguous()).T
+    return ordered.gather(0, indices.clamp_max(len(ordered) - 1))
 
 
 def _run(
@@ -141,30 +144,14 @@ def _weights(factor: float | dict[str, float] | None) -> BackboneWeights:
     return with_scales(weights, dict.fromkeys(layers, float(factor)))
 
 
-def _mean(found: list[dict[str, float]]) -> dict[str, Any]:
+def _mean(results: list[dict[str, float]]) -> dict[str, Any]:
     """Return means over seeds, and spreads between them."""
-    mean: dict[str, Any] = {name: sum(row[name] for row in found) / len(found) for name in found[0]}
-    mean["seeds"] = len(found)
-    if len(found) > 1:
-        values = {name: [row[name] for row in found] for name in COLUMNS}
+    mean: dict[str, Any] = {name: sum(row[name] for row in results) / len(results) for name in results[0]}
+    mean["seeds"] = len(results)
+    if len(results) > 1:
+        values = {name: [row[name] for row in results] for name in COLUMNS}
         mean["spread"] = {name: max(each) - min(each) for name, each in values.items()}
     return mean
-
-
-def _print(name: str, row: dict[str, Any]) -> None:
-    print(f"{name:28}", *(f"{row[each]:9.3f}" if each in row else " " * 9 for each in COLUMNS), flush=True)
-
-
-def _store(arguments: argparse.Namespace, rows: dict[str, Any]) -> None:
-    """Add rows to the stored results of the same scene and style."""
-    path = RESULTS / "equal_steps.json"
-    pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
-    told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
-    told |= {"resolution": arguments.resolution, "steps": [arguments.steps_coarse, arguments.steps_sos]}
-    told |= {"settings": json.loads(arguments.settings)}
-    earlier = pairs.get(arguments.name, {}).get("rows", {})
-    pairs[arguments.name] = {**told, "rows": {**earlier, **rows}}
-    write_result("equal_steps", {"pairs": pairs})
 
 
 def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -43,6 +44,20 @@ def write_result(name: str, figures: dict[str, Any], folder: Path = RESULTS) -> 
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return path
+
+
+def add_pair(name: str, pair: str, description: dict[str, Any], rows: dict[str, Any]) -> None:
+    """Add rows to the results of one pair of scene and style in `NAME.json`; other rows and pairs stay."""
+    path = RESULTS / f"{name}.json"
+    pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
+    earlier = pairs.get(pair, {}).get("rows", {})
+    pairs[pair] = {**description, "rows": {**earlier, **rows}}
+    write_result(name, {"pairs": pairs})
+
+
+def print_row(name: str, row: dict[str, Any], columns: Sequence[str]) -> None:
+    """Print the figures of one row in columns; missing figures stay blank."""
+    print(f"{name:28}", *(f"{row[column]:9.3f}" if column in row else " " * 9 for column in columns), flush=True)
 
 
 def _processor() -> str:

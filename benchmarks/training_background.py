@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.machine import RESULTS, write_result
+from benchmarks.machine import add_pair, print_row
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
@@ -61,19 +61,21 @@ def main() -> None:
     ways = {"unstylized": _row(judge, scene.sh_dc)}
     colors = {"unstylized": scene.sh_dc}
     print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
-    _print("unstylized", ways["unstylized"])
+    print_row("unstylized", ways["unstylized"], COLUMNS)
+    description = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
+    description |= {"size": [arguments.width, arguments.height], "steps": arguments.steps}
     base = {"precision": "bfloat16", "steps_coarse": 0, "steps_sos": arguments.steps, "early_stop": False}
     for way in arguments.ways.split(","):
-        found = []
+        rows = []
         for seed in arguments.seeds.split(","):
             settings = base | _settings(way) | {"seed": int(seed)} | json.loads(arguments.settings)
             colors[way], row = _run(judge, scene, ring[::2], style, settings)
-            found.append(row)
-        ways[way] = {name: sum(row[name] for row in found) / len(found) for name in found[0]} | {"seeds": len(found)}
-        _print(way, ways[way])
-        _store(arguments, ways)
+            rows.append(row)
+        ways[way] = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]} | {"seeds": len(rows)}
+        print_row(way, ways[way], COLUMNS)
+        add_pair("training_background", arguments.name, description, ways)
     if arguments.out:
-        _keep(arguments.out, arguments.name, judge, style, colors)
+        _write_sheet(arguments.out, arguments.name, judge, style, colors)
 
 
 def _settings(way: str) -> dict[str, Any]:
@@ -111,29 +113,14 @@ def _run(
     return sh_dc, {**_row(judge, sh_dc), "loss": loss, "seconds": seconds}
 
 
-def _print(way: str, row: dict[str, float]) -> None:
-    print(f"{way:28}", *(f"{row[name]:9.3f}" if name in row else " " * 9 for name in COLUMNS), flush=True)
-
-
-def _store(arguments: argparse.Namespace, ways: dict[str, dict[str, float]]) -> None:
-    """Add rows to the stored results of the same scene and style."""
-    path = RESULTS / "training_background.json"
-    pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
-    told = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
-    told |= {"size": [arguments.width, arguments.height], "steps": arguments.steps}
-    earlier = pairs.get(arguments.name, {}).get("ways", {})
-    pairs[arguments.name] = {**told, "ways": {**earlier, **ways}}
-    write_result("training_background", {"pairs": pairs})
-
-
-def _keep(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
+def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
     """Write the colors, and a contact sheet with one row per way: views on black, then the first view on white."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras = judge.cameras[:SHOWN]
     rows = []
     for way, sh_dc in colors.items():
-        pictures = [judge.pictures(sh_dc, camera) for camera in cameras]
-        rows.append((way, [*(pair[0] for pair in pictures), pictures[0][1]]))
+        renders = [judge.pictures(sh_dc, camera) for camera in cameras]
+        rows.append((way, [*(pair[0] for pair in renders), renders[0][1]]))
     write_rows(folder / f"{name}.jpg", style, rows)
     torch.save(colors, folder / f"{name}.pt")
 

@@ -15,29 +15,29 @@ def _noise(height: int = 40, width: int = 30) -> Tensor:
     return torch.rand((height, width, 3), generator=torch.Generator().manual_seed(3))
 
 
-def _palette(picture: Tensor) -> Tensor:
-    return quantiles(picture, torch.ones(picture.shape[:2]))
+def _palette(image: Tensor) -> Tensor:
+    return quantiles(image, torch.ones(image.shape[:2]))
 
 
-def test_pixels_in_another_order_have_the_same_palette() -> None:
-    picture = _noise()
+def test_palette_ignores_the_order_of_pixels() -> None:
+    image = _noise()
     order = torch.randperm(1200, generator=torch.Generator().manual_seed(5))
-    shuffled = picture.reshape(-1, 3)[order].reshape(30, 40, 3)
-    assert sliced_distance([shuffled, shuffled], _palette(picture)) == pytest.approx(0, abs=1e-6)
+    shuffled = image.reshape(-1, 3)[order].reshape(30, 40, 3)
+    assert sliced_distance([shuffled, shuffled], _palette(image)) == pytest.approx(0, abs=1e-6)
 
 
-def test_two_colors_are_as_far_apart_as_on_the_mean_direction() -> None:
+def test_distance_of_two_colors_is_the_mean_over_directions() -> None:
     """Along uniformly distributed directions, a difference d has the mean square d^2 / 3. Here 64 are sampled."""
     first, second = torch.full((4, 4, 3), 0.2), torch.tensor([0.9, 0.5, 0.2]).expand(7, 3, 3)
-    found = sliced_distance([first, first], _palette(second))
-    assert found == pytest.approx(255 * math.hypot(0.7, 0.3) / math.sqrt(3), rel=0.1)
+    distance = sliced_distance([first, first], _palette(second))
+    assert distance == pytest.approx(255 * math.hypot(0.7, 0.3) / math.sqrt(3), rel=0.1)
 
 
-def test_what_no_gaussian_covers_does_not_count() -> None:
-    picture = _noise()
-    covered = torch.rand(picture.shape[:2], generator=torch.Generator().manual_seed(4)) < 0.5
-    on_black, on_white = picture.clone(), picture.clone()
+def test_uncovered_pixels_do_not_count() -> None:
+    image = _noise()
+    covered = torch.rand(image.shape[:2], generator=torch.Generator().manual_seed(4)) < 0.5
+    on_black, on_white = image.clone(), image.clone()
     on_black[~covered], on_white[~covered] = 0.0, 1.0
-    seen = picture[covered][:, None]
+    seen = image[covered][:, None]
     assert sliced_distance([on_black, on_white], _palette(seen)) == pytest.approx(0, abs=1e-4)
     assert sliced_distance([on_black, on_black], _palette(seen)) > 10  # uncovered black pixels would count
