@@ -22,10 +22,10 @@ from sqlalchemy import event, select
 
 from benchmarks.fleet_parts.demand import SimulatedJob
 from service.files.names import CHECKPOINT
-from service.scheduling.backfill import Holding
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Grant
+from service.scheduling.scheduler import Holding
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -231,7 +231,7 @@ class Fleet:
         """Lease all jobs that fit a host, as a real dispatcher does in each poll."""
         while host.free and self._waiting:
             self._do("lease")
-            found = host.dispatcher.next_job(host.held)
+            found = host.dispatcher.lease_next_job(host.held)
             if found is None:
                 self._do("look")
                 host.keeps_room_for = self._reserved(host)

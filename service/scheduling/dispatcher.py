@@ -22,13 +22,13 @@ from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.logs import set_up
 from service.private import keep_private
-from service.scheduling.backfill import Backfill, Holding
 from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.identity import is_dead, own_name
 from service.scheduling.machine import Machine
-from service.scheduling.packing import Grant, Room
+from service.scheduling.packing import Capacity, Grant, QueuedJob
 from service.scheduling.publishing import sweep
 from service.scheduling.running import RunningAttempt
+from service.scheduling.scheduler import Forecast, Holding, Reason, Snapshot, backfill, measured_pace, next_job
 from service.scheduling.strays import remove_strays
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
@@ -65,8 +65,9 @@ class Dispatcher:
         self._artifacts = Artifacts(settings.artifacts_url)
         self._blobs = open_blobs(settings, store.inputs, self._artifacts)
         self._machine = machine or Machine.find(settings)
-        self._room = Room(self._machine, settings.parallel_jobs)
-        self._backfill = Backfill(self._room)
+        self._capacity = Capacity(self._machine, settings.parallel_jobs)
+        self._pace: float | None = None
+        self._forecast: Forecast | None = None
         self._running: dict[str, RunningAttempt] = {}
         self._stop = threading.Event()
         self.name = own_name()
@@ -90,7 +91,7 @@ class Dispatcher:
         for thread in self._beside:
             thread.start()
         what = "GPUs" if self._machine.gpus else "places"
-        _log.info("dispatcher %s is ready: %d %s", self.name, self._room.size, what)
+        _log.info("dispatcher %s is ready: %d %s", self.name, self._capacity.size, what)
         while not self._stop.is_set():
             try:
                 self._work_once()
@@ -123,52 +124,63 @@ class Dispatcher:
             check_weights()
         except DamagedWeightsError:
             return
-        while not self._stop.is_set() and (found := self.next_job(self._held())) is not None:
+        while not self._stop.is_set() and (found := self.lease_next_job(self._holdings())) is not None:
             self._start_attempt(*found)
 
     # --- capacity --------------------------------------------------------------------------------------------------
 
-    def _held(self) -> list[Holding]:
+    def _holdings(self) -> list[Holding]:
         return [attempt.holding for attempt in self._running.values()]
 
-    def next_job(self, held: Sequence[Holding]) -> tuple[Lease, Grant] | None:
-        """Lease the next job of the queue that fits; None if there is none.
+    def lease_next_job(self, holdings: Sequence[Holding]) -> tuple[Lease, Grant] | None:
+        """Lease the job that the scheduler chooses (`service.scheduling.scheduler`); None if it chooses none.
+
+        The store locks one job of the queue at a time. The scheduler therefore gets one job at a time too.
 
         Args:
-            held: Capacity of running jobs.
+            holdings: Capacity of running jobs.
         """
-        self._backfill.learn(held)
-        grants = [each.grant for each in held]
-        if self._room.free(grants) < 1:  # skips the query, which would lock rows that other dispatchers want
+        snapshot = self._snapshot(holdings)
+        if snapshot is None:
             return None
-        dispatchers = max(1, self._store.operations.alive())
-        if not (waiting := self._store.leases.waiting(self._room.size * dispatchers)):
-            return None
-        share = -(-waiting // dispatchers)  # other dispatchers take their portion of the queue
-        grant: Grant | None = None
+        decision = next_job([], snapshot)
 
         def fits(job: JobRow) -> bool:
-            nonlocal grant
-            grant = self._room.grant(job, grants, share)
-            return grant is not None
+            nonlocal decision
+            decision = next_job([_queued_job(job)], snapshot)
+            return decision.grant is not None
 
-        def keeps(job: JobRow) -> bool:
-            return dispatchers == 1 or self._backfill.is_near(job, held, share, self._store.database.clock())
+        def should_reserve(job: JobRow) -> bool:
+            return decision.reserved_for == job.id
 
-        def before(kept: JobRow) -> Callable[[JobRow], bool] | None:
-            granted = self._backfill.before(kept, held, share, self._store.database.clock())
-            if granted is None:
+        def backfills(_reserved: JobRow) -> Callable[[JobRow], bool] | None:
+            forecast, pace = decision.forecast, snapshot.pace
+            self._forecast = forecast
+            if decision.reason != Reason.NONE_ENDS_IN_TIME or forecast is None or pace is None:
                 return None
 
-            def is_harmless(job: JobRow) -> bool:
-                nonlocal grant
-                grant = granted(job)
-                return grant is not None
+            def ends_in_time(job: JobRow) -> bool:
+                nonlocal decision
+                decision = backfill([_queued_job(job)], forecast, pace, snapshot)
+                return decision.grant is not None
 
-            return is_harmless
+            return ends_in_time
 
-        lease = self._store.leases.take(self.name, fits, keeps, before, self._clocks.is_lost)
-        return (lease, grant) if lease is not None and grant is not None else None
+        lease = self._store.leases.take(self.name, fits, should_reserve, backfills, self._clocks.is_lost)
+        _log.debug("scheduling decision: %s", decision.reason, extra={"job": decision.job_id})
+        return (lease, decision.grant) if lease is not None and decision.grant is not None else None
+
+    def _snapshot(self, holdings: Sequence[Holding]) -> Snapshot | None:
+        """Return the state of the machine and the fleet; None if no capacity is free or no job waits."""
+        self._pace = measured_pace(holdings, self._pace)
+        if self._capacity.free([each.grant for each in holdings]) < 1:
+            return None  # without a query, which would lock rows that other dispatchers want
+        dispatchers = max(1, self._store.operations.alive())
+        if not (waiting := self._store.leases.waiting(self._capacity.size * dispatchers)):
+            return None
+        waiting = -(-waiting // dispatchers)  # other dispatchers take their portion of the queue
+        now = self._store.database.clock()
+        return Snapshot(self._capacity, holdings, waiting, now, dispatchers, self._pace, self._forecast)
 
     def _start_attempt(self, lease: Lease, grant: Grant) -> None:
         folder = self._work / f"{lease.job_id}-{lease.epoch}"
@@ -184,7 +196,7 @@ class Dispatcher:
         """Send a heartbeat if it is due."""
         if time.monotonic() - self._announced_at >= _RENEW_SHARE * self._settings.lease_seconds:
             self._store.operations.beat(
-                self.name, self._room.size, self._room.free([each.grant for each in self._held()])
+                self.name, self._capacity.size, self._capacity.free([each.grant for each in self._holdings()])
             )
             self._announced_at = time.monotonic()
 
@@ -259,6 +271,10 @@ class Dispatcher:
                 remove_strays(self._store, self._artifacts)
         except Exception:  # file stores raise arbitrary errors; running jobs must not suffer
             _log.exception("expired files could not all be removed; retrying later")
+
+
+def _queued_job(row: JobRow) -> QueuedJob:
+    return QueuedJob(row.id, row.queued_at, row.parameters, row.inputs)
 
 
 def main() -> None:

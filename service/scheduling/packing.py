@@ -14,12 +14,12 @@ slots.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from service.scheduling.job_size import estimated_size
 from service.scheduling.machine import Machine
-from service.store.tables import JobRow
 from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 
 #: Maximum fractions of the machine's memory that all concurrent jobs together, and each of them, may plan with. The
@@ -30,6 +30,22 @@ _MEMORY_SHARE, _JOB_SHARE = 0.8, 0.4
 #: for 50,000.
 _LEAST_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4
+
+
+@dataclass(frozen=True)
+class QueuedJob:
+    """Record of a waiting job, as far as scheduling needs it.
+
+    Attributes:
+        queued_at: Time since which the job waits, by the store's clock.
+        parameters: Stored parameters.
+        inputs: `role`, `name` and `size` of each file.
+    """
+
+    id: str
+    queued_at: float
+    parameters: Mapping[str, Any]
+    inputs: Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -58,7 +74,7 @@ class Grant:
         return memory_beside_gpus(self.ranks, self.scene) if self.gpus else 0
 
 
-class Room:
+class Capacity:
     """Capacity of a machine.
 
     Args:
@@ -80,7 +96,7 @@ class Room:
         held = list(held)
         return len(self._free_gpus(held)) if self._machine.gpus else self._free_places(held)
 
-    def grant(self, job: JobRow, held: Iterable[Grant], waiting: int) -> Grant | None:
+    def grant(self, job: QueuedJob, held: Iterable[Grant], waiting: int) -> Grant | None:
         """Return the capacity that a job gets beside the running jobs; None if it has to wait.
 
         Args:
@@ -103,7 +119,7 @@ class Room:
     def _free_places(self, held: list[Grant]) -> int:
         return self._places - sum(grant.places for grant in held)
 
-    def _on_gpus(self, job: JobRow, asked: int, held: list[Grant], sharers: int) -> Grant | None:
+    def _on_gpus(self, job: QueuedJob, asked: int, held: list[Grant], sharers: int) -> Grant | None:
         free = self._free_gpus(held)
         if asked:
             ranks = min(asked, len(self._machine.gpus))
@@ -118,7 +134,7 @@ class Room:
         together = sum(each.beside_gpus for each in (grant, *held))
         return grant if together <= _MEMORY_SHARE * self._machine.memory else None
 
-    def _on_cores(self, job: JobRow, ranks: int, free: int) -> Grant | None:
+    def _on_cores(self, job: QueuedJob, ranks: int, free: int) -> Grant | None:
         if self._places == 1 or self._machine.cluster:
             return Grant(ranks)
         share = _MEMORY_SHARE * self._machine.memory / self._places
@@ -132,7 +148,7 @@ class Room:
         return Grant(ranks, (), places, threads, min(asked or limit, limit))
 
 
-def _scene_bytes(job: JobRow) -> int:
+def _scene_bytes(job: QueuedJob) -> int:
     """Return the size of a job's scene in bytes, once it is read and refined."""
     files = [entry for entry in job.inputs if entry["role"] == "scene"]
     growth = job.parameters.get("refine")
@@ -140,7 +156,7 @@ def _scene_bytes(job: JobRow) -> int:
     return int(size * growth) if isinstance(growth, int | float) and growth > 1 else size
 
 
-def _asked(job: JobRow, name: str) -> int:
+def _asked(job: QueuedJob, name: str) -> int:
     """Return an integer parameter of a job; 0 if it is missing or has another type.
 
     Other types were stored by an earlier version of the service. The attempt will reject them, so they need no

@@ -14,13 +14,13 @@ import pytest
 
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
-from service.scheduling.backfill import Holding
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.identity import is_dead, own_name
 from service.scheduling.job_size import estimated_seconds
 from service.scheduling.machine import Machine
-from service.scheduling.packing import Grant, Room
+from service.scheduling.packing import Capacity, Grant, QueuedJob
 from service.scheduling.running import RunningAttempt
+from service.scheduling.scheduler import Holding
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -98,12 +98,13 @@ def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: S
     held = leased(store, "one")
     grant = Grant(3, ("5", "6", "7"))
     attempt = attempt_of(held, grant, settings, store, tmp_path)
-    room = Room(Machine(grant.gpus, 2, 10**11), None)
-    assert room.free([attempt.grant]) == 0
+    capacity = Capacity(Machine(grant.gpus, 2, 10**11), None)
+    assert capacity.free([attempt.grant]) == 0
     for gpu in ("7", "5"):
         attempt._take_in({"kind": "left-out", "gpus": [gpu]})
     assert attempt.grant == Grant(1, ("6",))
-    following = room.grant(held.job, [attempt.grant], 1)
+    job = QueuedJob(held.job_id, held.job.queued_at, held.job.parameters, held.job.inputs)
+    following = capacity.grant(job, [attempt.grant], 1)
     assert following is not None
     assert (following.ranks, following.gpus) == (2, ("5", "7"))
 

@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import event, select
 
-from service.scheduling.backfill import Holding
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.machine import Machine
-from service.scheduling.packing import Grant, Room
+from service.scheduling.packing import Capacity, Grant, QueuedJob
+from service.scheduling.scheduler import Holding
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from service.store.tables import JobRow, ReservationRow
+from service.store.tables import ReservationRow
 
 GB = 1_000_000_000
 SHA = "a" * 64
@@ -61,7 +61,7 @@ class Queue:
     def start(self) -> list[str]:
         """Start the jobs that fit, as the dispatcher does; return their ids in order."""
         started = []
-        while (found := self.dispatcher.next_job(self.holdings())) is not None:
+        while (found := self.dispatcher.lease_next_job(self.holdings())) is not None:
             lease, grant = found
             self.held[lease.job_id] = grant
             started.append(lease.job_id)
@@ -267,7 +267,7 @@ def test_dispatchers_share_the_queue(eight: Queue) -> None:
     for name in ("here", "there"):
         eight.store.operations.beat(name, 8, 8)
     first, _ = eight.add(), eight.add()
-    found = eight.dispatcher.next_job([])
+    found = eight.dispatcher.lease_next_job([])
     assert found is not None
     assert (found[0].job_id, found[1].ranks) == (first, 8), "the other job is for the other dispatcher"
 
@@ -282,15 +282,15 @@ def test_no_more_jobs_than_the_operator_wants(tmp_path: Path) -> None:
 
 
 def test_jobs_on_gpus_wait_for_memory_of_the_machine() -> None:
-    room = Room(machine(8), None)
-    alone = room.grant(job(200 * GB, workers=1), [], 1)
+    capacity = Capacity(machine(8), None)
+    alone = capacity.grant(job(200 * GB, workers=1), [], 1)
     assert alone is not None, "were it too big: it may try"
     assert alone.beside_gpus == 3 * GB + 400 * GB
-    first = room.grant(job(20 * GB, workers=4), [], 9)
+    first = capacity.grant(job(20 * GB, workers=4), [], 9)
     assert first is not None
     assert first.beside_gpus == 4 * 3 * GB + 40 * GB
-    assert room.grant(job(15 * GB, workers=1), [first], 9) is None, "52 + 33 GB are more than four fifths of 100 GB"
-    second = room.grant(job(10 * GB, workers=1), [first], 9)
+    assert capacity.grant(job(15 * GB, workers=1), [first], 9) is None, "52 + 33 GB are more than four fifths of 100 GB"
+    second = capacity.grant(job(10 * GB, workers=1), [first], 9)
     assert second is not None
     assert second.gpus == ("gpu4",)
     fewer = replace(first, ranks=1, gpus=first.gpus[:1])
@@ -300,9 +300,9 @@ def test_jobs_on_gpus_wait_for_memory_of_the_machine() -> None:
 @given(st.lists(st.tuples(st.integers(1, 60 * GB), st.integers(1, 8)), max_size=12))
 def test_jobs_on_gpus_never_take_more_memory_than_there_is(jobs: list[tuple[int, int]]) -> None:
     held: list[Any] = []
-    room = Room(machine(8), None)
+    capacity = Capacity(machine(8), None)
     for scene, workers in jobs:
-        grant = room.grant(job(scene, workers=workers), held, len(jobs))
+        grant = capacity.grant(job(scene, workers=workers), held, len(jobs))
         if grant is not None:
             held.append(grant)
     assert bool(held) == bool(jobs), "the first one always runs, were it too big"
@@ -322,29 +322,29 @@ def test_without_gpus_one_job_at_a_time_has_the_machine(tmp_path: Path) -> None:
     queue.store.close()
 
 
-def job(scene: int, **parameters: Any) -> JobRow:
-    return JobRow(parameters=parameters, inputs=[{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}])
+def job(scene: int, **parameters: Any) -> QueuedJob:
+    return QueuedJob("job", 0.0, parameters, [{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}])
 
 
 def test_a_cluster_gives_its_memory_out_itself() -> None:
-    assert Room(machine(0, cluster=True), 4).grant(job(50 * GB, workers=3), [], 1) == Grant(3)
+    assert Capacity(machine(0, cluster=True), 4).grant(job(50 * GB, workers=3), [], 1) == Grant(3)
 
 
 def test_places_are_parts_of_cores_and_memory() -> None:
-    room = Room(machine(0), 4)
-    small = room.grant(job(GB), [], 9)
+    capacity = Capacity(machine(0), 4)
+    small = capacity.grant(job(GB), [], 9)
     assert small is not None
     assert (small.places, small.threads) == (1, 4)
     assert small.memory == 20 * GB - 4 * GB
-    large = room.grant(job(8 * GB), [small], 9)
+    large = capacity.grant(job(8 * GB), [small], 9)
     assert large is not None
     assert (large.places, large.threads) == (2, 8)
-    assert room.free([small, large]) == 1
-    assert room.grant(job(8 * GB), [small, large], 9) is None, "two places, and one is free"
-    asked = room.grant(job(GB, memory_limit=3 * GB), [small, large], 9)
+    assert capacity.free([small, large]) == 1
+    assert capacity.grant(job(8 * GB), [small, large], 9) is None, "two places, and one is free"
+    asked = capacity.grant(job(GB, memory_limit=3 * GB), [small, large], 9)
     assert asked is not None
     assert (asked.places, asked.memory) == (1, 3 * GB)
-    assert room.grant(job(1), [small, large, asked], 9) is None
+    assert capacity.grant(job(1), [small, large, asked], 9) is None
 
 
 @given(
@@ -355,9 +355,9 @@ def test_jobs_side_by_side_never_plan_with_more_memory_than_there_is(
     places: int, jobs: list[tuple[int, int | None]]
 ) -> None:
     held: list[Any] = []
-    room, planned = Room(machine(0), places), []
+    capacity, planned = Capacity(machine(0), places), []
     for scene, limit in jobs:
-        grant = room.grant(job(scene, memory_limit=limit), held, len(jobs))
+        grant = capacity.grant(job(scene, memory_limit=limit), held, len(jobs))
         if grant is not None:
             held.append(grant)
             planned.append((grant.memory or 0) + 4 * scene)
