@@ -33,6 +33,7 @@ from sgsst_core.report.palette import INK, color_of
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.warm_start import warm_start
 
@@ -167,7 +168,7 @@ def compare_quality(
         return Outcome(name, what, sh_dc, judgment, found.short, found.long)
 
     blend_weights = stylizer.plan.survey.total_blend_weights
-    transferred = warm_start(scene.sh_dc, blend_weights, style)
+    transferred = warm_start(scene.sh_dc, blend_weights, Style.of(style))
     outcomes = [
         outcome(UNSTYLIZED, "the scene as it came", scene.sh_dc),
         outcome(TRANSFER, "the style's distribution of colors, no step", transferred),

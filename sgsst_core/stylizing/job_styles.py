@@ -148,11 +148,11 @@ def prepared_style(style: Style, settings: Settings, sh_dc: Tensor, weights: Ten
     return style
 
 
-def check_style_size(style: Tensor | Style, cameras: Sequence[Camera], scale: float) -> None:
+def check_style_size(style: Style, cameras: Sequence[Camera], scale: float) -> None:
     """Check that no view requires a style image with a longer side of more than `MAX_RESOLUTION` pixels.
 
     Args:
-        style: Image [H, W, 3], or a mixture.
+        style: Style.
         cameras: Cameras at the sizes used for stylization.
         scale: Scale of the strokes.
 
@@ -161,9 +161,8 @@ def check_style_size(style: Tensor | Style, cameras: Sequence[Camera], scale: fl
     """
     if scale <= 1:
         return
-    images = Style.of(style).images
     sizes = {(camera.height, camera.width) for camera in cameras}
-    for size, image in itertools.product(sizes, images):
+    for size, image in itertools.product(sizes, style.images):
         height, width = style_size((image.shape[0], image.shape[1]), size, scale)
         if max(height, width) > MAX_RESOLUTION:
             raise SettingsError(

@@ -24,7 +24,7 @@ Color = tuple[float, float, float]
 _BITS = 53  # bits of a float64's fraction
 
 
-def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style: Tensor | Style) -> Color | None:
+def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style: Style) -> Color | None:
     """Return the background color of a view in one step; None for the background of the settings.
 
     Args:
@@ -39,7 +39,7 @@ def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style:
         return None
     red, green, blue = _uniform(seed, step, view)
     if kind == "palette":
-        pixels = _drawn_picture(Style.of(style), green).reshape(-1, 3)
+        pixels = _drawn_picture(style, green).reshape(-1, 3)
         red, green, blue = pixels[int(red * len(pixels))].tolist()
     return red, green, blue
 

@@ -30,19 +30,19 @@ _FLAT = 1e-9
 _PIXELS = 1 << 16
 
 
-def warm_start(sh_dc: Tensor, weights: Tensor, style: Tensor | Style) -> Tensor:
+def warm_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
     """Return DC coefficients with the distribution of the style's colors, all of them displayable (0..1).
 
     Args:
         sh_dc: [N, 3] float32.
         weights: [N] float64, total blend weights, at least one positive.
-        style: Image [H, W, 3] in 0..1, or a mixture, in whose proportions colors then occur.
+        style: Style, in whose proportions colors then occur.
 
     Returns:
         [N, 3] float32.
     """
     colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
-    wanted = _some_pixels(Style.of(style)).to(colors)
+    wanted = _some_pixels(style).to(colors)
     moved = transported(colors, weights.double() / weights.double().amax(), wanted)
     return on_screen(((moved.clamp(0, 1) - COLOR_OFFSET) / SH_C0).to(sh_dc.dtype))
 
@@ -59,11 +59,11 @@ def _some_pixels(style: Style) -> Tensor:
     return torch.cat(parts)
 
 
-def with_moments(sh_dc: Tensor, weights: Tensor, style: Tensor | Style) -> Tensor:
+def with_moments(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
     """Return DC coefficients with the style's mean and covariance, clipped to 0..1; arguments as in `warm_start`."""
     colors = 0.5 + SH_C0 * sh_dc.double()
     mean, covariance = _moments(colors, weights.double() / weights.double().amax())
-    wanted_mean, wanted = _style_moments(Style.of(style))
+    wanted_mean, wanted = _style_moments(style)
     matched = (colors - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
     return on_screen(((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype))
 
@@ -99,7 +99,7 @@ def _style_moments(style: Style) -> tuple[Tensor, Tensor]:
     return mixed_moments(found, style.weights)
 
 
-def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | Style) -> Tensor:
+def luminance_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
     """Return DC coefficients with the style's mean and spread of luminance, clamped to 0..1, and their own chroma.
 
     Arguments are as in `warm_start`.
@@ -108,7 +108,7 @@ def luminance_start(sh_dc: Tensor, weights: Tensor, style: Tensor | Style) -> Te
         [N, 3] float32.
     """
     own = luminance(COLOR_OFFSET + SH_C0 * sh_dc.double())
-    matched = _matched(own, _luminance_moments(own, weights.double()), _style_luminance(Style.of(style)))
+    matched = _matched(own, _luminance_moments(own, weights.double()), _style_luminance(style))
     return (sh_dc.double() + ((matched - own) / SH_C0)[:, None]).to(sh_dc.dtype)
 
 

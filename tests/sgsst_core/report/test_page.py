@@ -509,7 +509,7 @@ def test_long_history_stays_small() -> None:
     report = sample_report(10_000, 10_000, scales=4)
     page = parsed(report)
     assert len(page.html.encode()) < 1_500_000  # leaves as much again for the sheet
-    points = [attributes["d"] or "" for tag, attributes in page.elements if tag == "path"]
+    points = [attributes.get("d") or "" for tag, attributes in page.elements if tag == "path"]
     assert max(path.count("L") for path in points) < 2 * PLACES + 10
 
 

@@ -125,10 +125,10 @@ def test_strokes_as_they_are_leave_a_small_style_alone() -> None:
 
 def test_a_style_may_be_as_large_as_a_view_may_be() -> None:
     (view,) = cameras()[:1]
-    line = torch.zeros(1, 100, 3)
+    line = Style.of(torch.zeros(1, 100, 3))
     most = MAX_RESOLUTION / 100
     check_style_size(line, [view], most)
-    check_style_size(torch.zeros(1, MAX_RESOLUTION + 1, 3), [view], 1)  # the style is never enlarged
+    check_style_size(Style.of(torch.zeros(1, MAX_RESOLUTION + 1, 3)), [view], 1)  # the style is never enlarged
     with pytest.raises(SettingsError, match=rf"for views of {view.width} x {view.height}\. .* at most 16,384"):
         check_style_size(line, [view], most + 0.1)
 

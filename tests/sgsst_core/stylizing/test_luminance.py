@@ -168,7 +168,7 @@ def test_flat_styles_and_scenes_are_finite(value: float) -> None:
         assert bool(found.isfinite().all())
         wanted = luminance((0.5 + SH_C0 * scene_colors).clamp(0, 1)).mean()
         torch.testing.assert_close(found.mean(), wanted, atol=1e-4, rtol=0)
-        start = luminance_start(scene_colors, ones, painting)
+        start = luminance_start(scene_colors, ones, Style.of(painting))
         assert chroma_off(start, replace(wall(), sh_dc=scene_colors)) < ROUNDING
         brightness = luminance(0.5 + SH_C0 * start.double())
         assert -1e-6 <= float(brightness.min()) <= float(brightness.max()) <= 1 + 1e-6

@@ -13,6 +13,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
@@ -36,19 +37,19 @@ def make(weights: BackboneWeights, scene: Scene, views: int = 3, **values: Any) 
 
 def test_a_color_follows_from_seed_step_and_view_alone() -> None:
     """One color is hard-coded, because it must be the same on every machine and with every version."""
-    picture_ = style()
-    assert drawn_color("random", 5, 7, 11, picture_) == (0.659657205637411, 0.3164479498593752, 0.6750821160034983)
+    image = Style.of(style())
+    assert drawn_color("random", 5, 7, 11, image) == (0.659657205637411, 0.3164479498593752, 0.6750821160034983)
     colors = {
-        numbers: drawn_color("random", *numbers, picture_)
+        numbers: drawn_color("random", *numbers, image)
         for numbers in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (2**63 - 1, 10**6, 300), (0, 11, 1), (0, 1, 11))
     }
     assert len(set(colors.values())) == len(colors)
-    assert all(drawn_color("random", *numbers, picture_) == color for numbers, color in colors.items())
-    assert drawn_color("background", 0, 0, 0, picture_) is None
+    assert all(drawn_color("random", *numbers, image) == color for numbers, color in colors.items())
+    assert drawn_color("background", 0, 0, 0, image) is None
 
 
 def test_random_colors_are_uniform() -> None:
-    drawn = torch.tensor([drawn_color("random", 7, step, 2, style()) for step in range(4000)])
+    drawn = torch.tensor([drawn_color("random", 7, step, 2, Style.of(style())) for step in range(4000)])
     assert 0 <= float(drawn.min()) < 0.01
     assert 0.99 < float(drawn.max()) < 1
     # Standard errors are 0.0046 for the means and about 0.0013 for the covariances.
@@ -57,11 +58,11 @@ def test_random_colors_are_uniform() -> None:
 
 
 def test_colors_of_the_palette_are_those_of_the_styles_pixels() -> None:
-    picture_ = torch.tensor([[[0.1, 0.2, 0.3], [0.9, 0.5, 0.0], [0.9, 0.5, 0.0]], [[1.0, 1.0, 1.0]] * 3])
-    drawn = [drawn_color("palette", 0, step, 0, picture_) for step in range(3000)]
+    image = Style.of(torch.tensor([[[0.1, 0.2, 0.3], [0.9, 0.5, 0.0], [0.9, 0.5, 0.0]], [[1.0, 1.0, 1.0]] * 3]))
+    drawn = [drawn_color("palette", 0, step, 0, image) for step in range(3000)]
     shares = {color: drawn.count(color) / len(drawn) for color in set(drawn)}
-    expected = {tuple(pixel.tolist()): 1 / 6 for pixel in picture_.reshape(-1, 3)}
-    expected |= {tuple(picture_[0, 1].tolist()): 2 / 6, (1.0, 1.0, 1.0): 3 / 6}
+    expected = {tuple(pixel.tolist()): 1 / 6 for pixel in image.images[0].reshape(-1, 3)}
+    expected |= {tuple(image.images[0][0, 1].tolist()): 2 / 6, (1.0, 1.0, 1.0): 3 / 6}
     assert shares == pytest.approx(expected, abs=0.03)
 
 

@@ -13,7 +13,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.warm_start import warm_start, with_moments
 from tests.sgsst_core.pictures import picture
 
-Start = Callable[[Tensor, Tensor, Tensor], Tensor]
+Start = Callable[[Tensor, Tensor, Style], Tensor]
 
 
 def moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -38,7 +38,7 @@ def test_weighted_mean_and_covariance_become_the_styles(scale: float) -> None:
     style = 0.45 + 0.1 * picture(40, 50, seed=3).float()
     sh_dc = torch.randn(500, 3, generator=generator) @ torch.tensor([[1.0, 0.5, 0], [0, 1, 0.3], [0, 0, 0.2]])
     weights = scale * torch.rand(500, generator=generator, dtype=torch.float64) ** 4
-    found = moments(colors_of(with_moments(sh_dc, weights, style)), weights)
+    found = moments(colors_of(with_moments(sh_dc, weights, Style.of(style))), weights)
     pixels = style.reshape(-1, 3).double()
     wanted = moments(pixels, torch.ones(len(pixels), dtype=torch.float64))
     torch.testing.assert_close(found[0], wanted[0], rtol=1e-5, atol=1e-6)
@@ -49,7 +49,7 @@ def test_weighted_mean_and_covariance_become_the_styles(scale: float) -> None:
 def test_colors_that_match_already_stay(start: Start) -> None:
     style = picture(30, 30, seed=2).float()
     sh_dc = (style.reshape(-1, 3) - 0.5) / SH_C0
-    found = start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), style)
+    found = start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style))
     if start is with_moments:
         torch.testing.assert_close(found, sh_dc, rtol=1e-4, atol=1e-4)
     else:
@@ -62,7 +62,7 @@ def test_a_dark_scene_gets_both_colors_of_a_bright_style() -> None:
     style[:10] = torch.tensor([0.1, 0.2, 0.6])
     generator = torch.Generator().manual_seed(4)
     sh_dc = (0.2 * torch.rand(3000, 1, generator=generator) ** 4 - 0.5).expand(-1, 3) / SH_C0
-    found = colors_of(warm_start(sh_dc, torch.ones(3000, dtype=torch.float64), style))
+    found = colors_of(warm_start(sh_dc, torch.ones(3000, dtype=torch.float64), Style.of(style)))
     blue = (found - style[0, 0]).norm(dim=1) < 0.1
     white = (found - style[-1, 0]).norm(dim=1) < 0.1
     assert float(blue.double().mean()) == pytest.approx(1 / 3, abs=0.02)
@@ -94,7 +94,7 @@ def test_flat_scenes_and_styles_give_finite_colors_in_range(case: str, start: St
         style = torch.full((10, 10, 3), 0.25)
     else:
         style = torch.zeros((10, 10, 3))
-    found = colors_of(start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), style))
+    found = colors_of(start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style)))
     assert bool(found.isfinite().all())
     assert -1e-6 <= float(found.min()) <= float(found.max()) <= 1 + 1e-6
     expected = style.reshape(-1, 3).double().mean(0)
