@@ -46,7 +46,7 @@ def _answers(url: str) -> bool:
 def dispatcher_is_well(store: Store) -> bool:
     """Return whether a dispatcher of this machine or container has sent a heartbeat lately, or the database is down."""
     from service.errors import DatabaseUnavailableError
-    from service.scheduling.identity import is_of_this_machine
+    from service.scheduling.machine import is_of_this_machine
 
     try:
         alive = store.operations.dispatchers()

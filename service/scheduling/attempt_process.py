@@ -21,9 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 from service.files.staging import Staged
 from service.parameters import JobParameters
-from service.scheduling.endings import OUTAGE, is_outage
-from service.scheduling.messages import Message
-from service.scheduling.workplace import StoreWorkplace
+from service.scheduling.endings import OUTAGE, Message, is_outage
+from service.scheduling.store_workplace import StoreWorkplace
 from service.store.leases import Published
 from worker.processes import die_with_parent
 

@@ -23,8 +23,7 @@ from service.files.stored_blobs import open_blobs
 from service.logs import set_up
 from service.private import keep_private
 from service.scheduling.clock_watch import ClockWatch
-from service.scheduling.identity import is_dead, own_name
-from service.scheduling.machine import Machine
+from service.scheduling.machine import Machine, is_dead, own_name
 from service.scheduling.packing import Capacity, Grant, QueuedJob
 from service.scheduling.publishing import sweep
 from service.scheduling.running import RunningAttempt

@@ -1,4 +1,4 @@
-"""Pure functions that decide how an attempt ended: from its process' messages, its exit code, and external requests."""
+"""Messages of an attempt's process, and pure functions that decide from them how the attempt ended."""
 
 from __future__ import annotations
 
@@ -6,11 +6,30 @@ import errno
 import signal
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal, TypedDict
 
-from service.scheduling.messages import Message
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
+
+
+class Message(TypedDict, total=False):
+    """Message with its `kind` and the fields of that kind."""
+
+    kind: Literal["stage", "prepared", "left-out", "stored", "progress", "preview", "done", "interrupted", "failed"]
+    stage: str
+    step: int
+    total: int
+    loss: float
+    seconds: float
+    seconds_left: float | None
+    scales: list[float | None] | None
+    path: str
+    gpus: list[str]
+    file: dict[str, Any]
+    result: dict[str, Any]
+    error: dict[str, Any]
+    permanent: bool
+    detail: str
 
 
 class Wish(StrEnum):

@@ -24,14 +24,12 @@ from service.files.names import CHECKPOINT, RESULT
 from service.files.staging import Staged, layout, stage
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.attempt_process import Task
-from service.scheduling.endings import OUTAGE, Ending, Wish, attempt_ending, is_outage
+from service.scheduling.endings import OUTAGE, Ending, Message, Wish, attempt_ending, is_outage
 from service.scheduling.job_size import estimated_seconds
-from service.scheduling.messages import Message
 from service.scheduling.packing import Grant
 from service.scheduling.publishing import Publisher
 from service.scheduling.scheduler import Holding
-from service.scheduling.stored_weights import store_weights
-from service.scheduling.workplace import StoredFile, StoreWorkplace
+from service.scheduling.store_workplace import StoredFile, StoreWorkplace, store_weights
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.leases import Lease, Published

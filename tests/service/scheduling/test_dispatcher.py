@@ -15,9 +15,8 @@ import pytest
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.scheduling.dispatcher import Dispatcher
-from service.scheduling.identity import is_dead, own_name
 from service.scheduling.job_size import estimated_seconds
-from service.scheduling.machine import Machine
+from service.scheduling.machine import Machine, is_dead, own_name
 from service.scheduling.packing import Capacity, Grant, QueuedJob
 from service.scheduling.running import RunningAttempt
 from service.scheduling.scheduler import Holding
@@ -125,7 +124,7 @@ def test_a_job_with_parameters_of_an_earlier_version_fails_with_a_sentence(
 
 
 def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store: Store) -> None:
-    script = "from service.scheduling.identity import own_name; print(own_name())"
+    script = "from service.scheduling.machine import own_name; print(own_name())"
     dead = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
     assert is_dead(dead)
     assert not is_dead(own_name())

@@ -10,8 +10,7 @@ import pytest
 
 from service.errors import NoSpaceError, StoreError
 from service.scheduling.attempt_process import failure
-from service.scheduling.endings import OUTAGE, Ending, Wish, attempt_ending, is_outage
-from service.scheduling.messages import Message
+from service.scheduling.endings import OUTAGE, Ending, Message, Wish, attempt_ending, is_outage
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import (
     ClusterAwayError,

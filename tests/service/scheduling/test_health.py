@@ -12,7 +12,7 @@ import pytest
 from service.errors import DatabaseUnavailableError
 from service.health import dispatcher_is_well
 from service.prepare import main as prepare
-from service.scheduling.identity import is_dead, is_of_this_machine, own_name
+from service.scheduling.machine import is_dead, is_of_this_machine, own_name
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 

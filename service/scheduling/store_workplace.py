@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,11 @@ from service.files.objects import ObjectStore
 from service.files.staging import stage
 from service.files.stored_blobs import open_cache
 from service.private import keep_private
-from service.scheduling.outbox import Outbox
-from service.scheduling.publishing import put_patiently
+from service.scheduling.publishing import Outbox, put_patiently
 from service.settings import ServiceSettings
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
+from sgsst_core.files.cache_folder import cache_folder
 from worker.ranks import sweeper
 from worker.ranks.host_memory import scene_bytes
 from worker.workplace import Stored
@@ -42,6 +42,8 @@ from worker.workplace import Stored
 _LOOK_SECONDS = 0.5
 #: Delay in seconds before files that the store rejected are uploaded again.
 _AGAIN_SECONDS = 5.0
+#: Prefix of the names of feature network weights in the store.
+_WEIGHTS_FOLDER = "weights"
 
 _log = logging.getLogger(__name__)
 
@@ -243,6 +245,28 @@ class _Shipper:
         self._stop.set()
         if self._thread is not threading.current_thread():
             self._thread.join()
+
+
+def store_weights(objects: ObjectStore) -> dict[str, StoredFile]:
+    """Upload this machine's installed weights unless they are stored already; return them by file name.
+
+    Raises:
+        StoreError: If the store cannot be reached.
+    """
+    found = {}
+    for path in sorted(cache_folder().glob("*.safetensors")):
+        status = path.stat()
+        sha256 = _digest(path, status.st_size, status.st_mtime_ns)
+        file = StoredFile(f"{_WEIGHTS_FOLDER}/{sha256}", sha256, status.st_size)
+        if not objects.exists(file.name):
+            objects.put(path, file.name)
+        found[path.name] = file
+    return found
+
+
+@lru_cache
+def _digest(path: Path, _size: int, _changed: int) -> str:
+    return file_digest(path)
 
 
 def node_settings() -> ServiceSettings:

@@ -23,9 +23,8 @@ from service.errors import LostFileError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.cache import file_digest
 from service.files.names import CHECKPOINT
-from service.scheduling import publishing, workplace
-from service.scheduling.stored_weights import store_weights
-from service.scheduling.workplace import StoredFile, StoreWorkplace
+from service.scheduling import publishing, store_workplace
+from service.scheduling.store_workplace import StoredFile, StoreWorkplace, store_weights
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.network_weights import load_network_weights
@@ -47,8 +46,8 @@ def s3(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "node"))
     monkeypatch.setenv("SGSST_CACHE", os.environ.get("SGSST_CACHE", ""))
-    monkeypatch.setattr(workplace, "_LOOK_SECONDS", 0.05)
-    monkeypatch.setattr(workplace, "_AGAIN_SECONDS", 0.1)
+    monkeypatch.setattr(store_workplace, "_LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(store_workplace, "_AGAIN_SECONDS", 0.1)
     monkeypatch.setattr(publishing, "_AGAIN_SECONDS", 0.1)
     yield faulty
     faulty.heal()
