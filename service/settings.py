@@ -60,6 +60,7 @@ class ServiceSettings(BaseSettings):
         checkpoint_seconds: Interval between checkpoints of a running job.
         preview_seconds: Interval between preview images of a running job; its log is updated as often if it has grown.
         stop_seconds: Time that a job has for stopping before it is killed.
+        poll_seconds: Interval between a dispatcher's searches for jobs to start, stop or clean up after.
         webhooks: Whether jobs may name a URL that is notified when they end.
         webhook_private_addresses: Whether webhook URLs may lead to private networks.
         log_format: "json" or "text".

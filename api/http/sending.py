@@ -25,6 +25,8 @@ _LARGE_BYTES, _LARGE_CHECKS = 64 << 20, anyio.CapacityLimiter(2)
 #: Maximum number of characters of a suggested file name.
 _MAX_NAME = 120
 
+_ETAG = re.compile(r'"[^"]*"')
+
 IfNoneMatch = Annotated[
     str | None,
     Header(alias="If-None-Match", description="An ETag; the same one is answered with 304.", examples=['"e7d2c939"']),
@@ -100,6 +102,12 @@ def file_answers(begins: dict[str, Any], *, always_policy: bool = False) -> Resp
     }
 
 
+def names_etag(if_none_match: str | None, tag: str) -> bool:
+    """Return whether an If-None-Match header names an entity tag, by weak comparison (RFC 9110, section 13.1.2)."""
+    header = (if_none_match or "").strip()
+    return header == "*" or tag in _ETAG.findall(header)
+
+
 async def send_file(
     request: Request, file: SentFile, range_: str | None, if_range: str | None, if_none_match: str | None
 ) -> Response:
@@ -112,7 +120,7 @@ async def send_file(
     """
     tag = f'"{file.sha256}"'
     sent = _headers(file, tag)
-    if if_none_match is not None and (tag in if_none_match or if_none_match.strip() == "*"):
+    if names_etag(if_none_match, tag):
         return Response(status_code=304, headers=sent)
     span = _parse_range(range_, file.size) if range_ and if_range in (None, tag) else None
     start, stop = span or (0, file.size)

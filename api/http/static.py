@@ -18,14 +18,14 @@ from pathlib import Path
 
 from fastapi import FastAPI, Request, Response
 
+from api.http.sending import names_etag
 from service.errors import NotFoundError
+from service.store.states import CANCELABLE, RETRYABLE, TITLES, UNFINISHED
 from sgsst_core.files.formats import FORMATS
 
 FOLDER = Path(__file__).parents[1] / "static"
 #: Placeholder in pages for the URL prefix of the files.
 _PLACE = b"{{static}}"
-#: Placeholder in `scene_formats.js` for the registry of scene formats.
-_SCENE_FORMATS = b'"{{scene_formats}}"'
 _DIGEST_LETTERS = 16
 #: Minimum size in bytes of files to compress. Smaller files fit in one packet anyway.
 _LEAST_PACKED = 1000
@@ -86,8 +86,9 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
         for path in sorted(folder.rglob("*"))
         if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     }
-    if "scene_formats.js" in contents:
-        contents["scene_formats.js"] = contents["scene_formats.js"].replace(_SCENE_FORMATS, _scene_formats())
+    for name, (placeholder, value) in _filled_modules().items():
+        if name in contents:
+            contents[name] = contents[name].replace(placeholder, json.dumps(value).encode())
     whole = hashlib.sha256()
     for name, body in contents.items():
         whole.update(f"{name}\0{len(body)}\0".encode() + body)
@@ -98,14 +99,16 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
     )
 
 
-def _scene_formats() -> bytes:
-    """Return the scene formats for the page, as JSON."""
-    return json.dumps(
-        [
-            {"suffix": each.suffix, "title": each.title, "shown": each.shown, "magic": list(each.magic)}
-            for each in FORMATS
-        ]
-    ).encode()
+def _filled_modules() -> dict[str, tuple[bytes, object]]:
+    """Return the placeholder and its JSON value for each module that shows a table of the server."""
+    formats = [
+        {"suffix": each.suffix, "title": each.title, "shown": each.shown, "magic": list(each.magic)} for each in FORMATS
+    ]
+    statuses = {"titles": TITLES, "unfinished": UNFINISHED, "cancelable": CANCELABLE, "retryable": RETRYABLE}
+    return {
+        "scene_formats.js": (b'"{{scene_formats}}"', formats),
+        "statuses.js": (b'"{{job_states}}"', statuses),
+    }
 
 
 def _file(name: str, body: bytes) -> StaticFile:
@@ -146,7 +149,7 @@ def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Re
         "X-Content-Type-Options": "nosniff",
         "Referrer-Policy": "no-referrer",
     }
-    if tag in request.headers.get("if-none-match", ""):
+    if names_etag(request.headers.get("if-none-match"), tag):
         return Response(status_code=304, headers=sent)
     if packed is not None:
         sent["Content-Encoding"] = "gzip"

@@ -5,15 +5,15 @@ import { LossChart } from "./chart.js";
 import { announce, h, icon, put } from "./dom.js";
 import { decisions } from "./plan.js";
 import { ResultStage } from "./result_stage.js";
+import { CANCELABLE, RETRYABLE, titles, UNFINISHED } from "./statuses.js";
 import { size, time, words } from "./words.js";
 
 const say = words.job;
-const UNFINISHED = new Set(["queued", "starting", "running", "canceling"]), RETRIED = new Set(["failed", "canceled"]);
 /** Milliseconds after which a lost stream is reopened by the page. */
 const AGAIN = 3000;
 
 /** @param {string} status */
-export const badge = (status) => h(`span.badge.${status}`, say.statuses[status] ?? status);
+export const badge = (status) => h(`span.badge.${status}`, titles[status] ?? status);
 
 export class JobView {
   /** @param {string} id */
@@ -130,7 +130,7 @@ export class JobView {
   /** @param {{status: string}} told */
   async onStatus({ status }) {
     await this.refresh().catch(() => {});
-    announce(say.statuses[status] ?? status);
+    announce(titles[status] ?? status);
     if (!UNFINISHED.has(this.job.status)) {
       this.source?.close();
       this.setConnected(true);
@@ -158,7 +158,7 @@ export class JobView {
     this.state.hidden = !running;
     if (!running) return;
     if (job.status === "queued" || !progress) {
-      this.stateText.textContent = job.status !== "queued" ? say.statuses[job.status] : job.queue_position === 1 ? say.next : job.queue_position ? say.queue(job.queue_position) : say.statuses.queued;
+      this.stateText.textContent = job.status !== "queued" ? titles[job.status] : job.queue_position === 1 ? say.next : job.queue_position ? say.queue(job.queue_position) : titles.queued;
       this.leftText.textContent = "";
       this.bar.removeAttribute("value");
       return;
@@ -176,8 +176,8 @@ export class JobView {
     if (this.shownFor === job.status) return;
     this.shownFor = job.status;
     put(this.actions,
-      UNFINISHED.has(job.status) && job.status !== "canceling" ? button(say.cancel, () => ask("POST", `/v1/jobs/${this.id}/cancel`)) : null,
-      RETRIED.has(job.status) ? button(say.retry, () => ask("POST", `/v1/jobs/${this.id}/retry`), "primary") : null,
+      CANCELABLE.has(job.status) ? button(say.cancel, () => ask("POST", `/v1/jobs/${this.id}/cancel`)) : null,
+      RETRYABLE.has(job.status) ? button(say.retry, () => ask("POST", `/v1/jobs/${this.id}/retry`), "primary") : null,
       UNFINISHED.has(job.status) ? null : deleteButton(say.remove, async () => {
         await ask("DELETE", `/v1/jobs/${this.id}`);
         location.hash = "#/jobs";

@@ -4,10 +4,10 @@ import { artifactPath, ask, get } from "./api.js";
 import { announce, h, put } from "./dom.js";
 import { badge, deleteButton } from "./job.js";
 import { sceneOf } from "./result_stage.js";
+import { titles, UNFINISHED } from "./statuses.js";
 import { percent, time, words } from "./words.js";
 
 const say = words.jobs;
-const UNFINISHED = ["queued", "starting", "running", "canceling"];
 /** Milliseconds between polls while a job runs, and otherwise. */
 const OFTEN = 3000, SELDOM = 20000;
 const PAGE = 60;
@@ -26,7 +26,7 @@ export class JobsView {
     this.cards = new Map();
     this.name = h("input", { type: "search", "aria-label": say.filter, placeholder: say.filter, oninput: () => this.show() });
     this.status = h("select", { "aria-label": say.status, onchange: () => this.show() }, h("option", { value: "" }, say.any),
-      Object.entries(words.job.statuses).map(([value, text]) => h("option", { value }, text)));
+      Object.entries(titles).map(([value, text]) => h("option", { value }, text)));
     this.compare = h("button.quiet", { type: "button", disabled: true, title: say.chooseTwo, onclick: () => this.compareChosen() }, say.compare);
     this.problem = h("p.wrong.block", { hidden: true, role: "alert" });
     this.list = h("ul.grid");
@@ -55,7 +55,7 @@ export class JobsView {
       this.problem.textContent = error instanceof Error ? error.message : String(error);
       put(this.element, this.body);
     }
-    const running = this.jobs.some((job) => UNFINISHED.includes(job.status));
+    const running = this.jobs.some((job) => UNFINISHED.has(job.status));
     this.timer = setTimeout(() => (document.hidden ? this.later() : this.load(false)), running ? OFTEN : SELDOM);
   }
 
@@ -83,7 +83,7 @@ export class JobsView {
     const told = JSON.stringify([job.status, job.preview, job.progress?.fraction, job.queue_position, job.name]), known = this.cards.get(job.id);
     if (known?.told === told || known?.element.contains(document.activeElement)) return known.element;
     const name = job.name || words.job.unnamed, style = job.inputs.filter((/** @type {any} */ input) => input.role === "style").map((/** @type {any} */ input) => input.name).join(", ");
-    const running = UNFINISHED.includes(job.status), done = job.status === "succeeded";
+    const running = UNFINISHED.has(job.status), done = job.status === "succeeded";
     const picture = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: "", loading: "lazy", decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
     const choose = done ? h("label.check", h("input", { type: "checkbox", checked: this.chosen.has(job.id), "aria-label": say.select(name), onchange: (/** @type {any} */ event) => this.choose(job.id, event.target.checked) }), h("small", { "aria-hidden": "true" }, say.choose)) : null;
     const element = h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", picture), h("strong", name), h("small", [style, time(job.created_at)].filter(Boolean).join(" · "))),

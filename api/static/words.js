@@ -107,9 +107,6 @@ export const words = {
     item: "What", decision: "Decision", reason: "Why", none: "Nothing was left out.",
   },
   job: {
-    statuses: /** @type {Record<string, string>} */ ({
-      queued: "Queued", starting: "Starting", running: "Running", canceling: "Canceling", succeeded: "Done", failed: "Failed", canceled: "Canceled", expired: "Expired",
-    }),
     stages: /** @type {Record<string, string>} */ ({
       reading: "Reading the files", planning: "Analyzing views", starting: "Starting workers", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality",
     }),

@@ -6,6 +6,7 @@ the file store (`service.files.stored_blobs`). Both implement `Blobs`.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import secrets
@@ -18,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Protocol
 
-from service.errors import LockedError, NoSpaceError, NotFoundError, TooLargeError
+from service.errors import LockedError, NoSpaceError, NotFoundError, StoreError, TooLargeError
 from service.files.cache import file_digest
 from service.files.objects import ObjectStore
 from service.store.inputs import Inputs, check_offset
@@ -387,13 +388,19 @@ def gone(upload: UploadRow) -> NotFoundError:
 
 
 def write_all(file: object, data: bytes) -> None:
-    """Write all bytes to an unbuffered file; any OSError becomes NoSpaceError."""
+    """Write all bytes to an unbuffered file.
+
+    Raises:
+        NoSpaceError: If the disk or a quota is full, or the file is too large for the file system.
+        StoreError: If the disk fails otherwise.
+    """
     view = memoryview(data)
     try:
         while view:
             view = view[file.write(view) :]  # type: ignore[attr-defined]
     except OSError as error:
-        raise NoSpaceError(f"The service cannot write what it receives: {error.strerror}.") from error
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        raise (NoSpaceError if full else StoreError)(f"The service cannot write the file: {error.strerror}.") from error
 
 
 def flush_folder(folder: Path) -> None:

@@ -299,7 +299,7 @@ class Jobs:
         """Return the number of the newest event of each job; jobs without events and missing jobs are left out."""
         query = select(EventRow.job_id, func.max(EventRow.id)).where(EventRow.job_id.in_(job_ids))
         with self._database.reading() as session:
-            return dict(session.execute(query.group_by(EventRow.job_id)).tuples().all())
+            return dict(session.execute(query.group_by(EventRow.job_id)).all())
 
 
 def _row_of_new_job(new: NewJob, now: float) -> dict[str, Any]:

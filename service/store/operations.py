@@ -91,7 +91,7 @@ class Operations:
     def heartbeats(self) -> dict[str, float]:
         """Return the time of each dispatcher's last heartbeat by its own clock, for dead dispatchers too."""
         with self._database.reading() as session:
-            return dict(session.execute(select(DispatcherRow.name, DispatcherRow.seen_at)).tuples().all())
+            return dict(session.execute(select(DispatcherRow.name, DispatcherRow.seen_at)).all())
 
     def _span(self) -> dict[str, float]:
         now = self._database.clock()
@@ -107,7 +107,7 @@ class Operations:
         """Return the number of jobs by status."""
         query = select(JobRow.status, func.count()).group_by(JobRow.status)
         with self._database.reading() as session:
-            return dict(session.execute(query).tuples().all())
+            return dict(session.execute(query).all())
 
     def oldest_queued(self) -> float:
         """Return the waiting time of the oldest queued job in seconds; 0 if none is queued."""

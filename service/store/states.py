@@ -62,6 +62,11 @@ FINISHED = (_S.SUCCEEDED, _S.FAILED, _S.CANCELED)
 #: Final states, unless the user retries the job.
 ENDED = (*FINISHED, _S.EXPIRED)
 
+#: Texts that the page displays.
+TITLES: Mapping[JobStatus, str] = {
+    status: "Done" if status is _S.SUCCEEDED else status.capitalize() for status in JobStatus
+}
+
 #: Target state per transition and initial state; other combinations are not allowed. A job that is being canceled is
 #: stopped however its attempt ends, unless the attempt succeeds first.
 TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
@@ -81,6 +86,11 @@ TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
     Transition.RETRY: dict.fromkeys((_S.FAILED, _S.CANCELED), _S.QUEUED),
     Transition.EXPIRE: dict.fromkeys(FINISHED, _S.EXPIRED),
 }
+
+
+#: Statuses whose jobs a user can cancel, and retry.
+CANCELABLE = tuple(status for status, target in TRANSITIONS[Transition.CANCEL].items() if target is not status)
+RETRYABLE = tuple(TRANSITIONS[Transition.RETRY])
 
 
 class TransitionError(Exception):

@@ -31,7 +31,7 @@ from api.http.schemas import (
     poll_seconds,
     progress_history,
 )
-from api.http.sending import IfNoneMatch
+from api.http.sending import IfNoneMatch, names_etag
 from api.http.submission import BODY, REFUSALS, JobFromUploads
 from service.errors import (
     ConflictError,
@@ -438,6 +438,6 @@ def _job_response(
     wait = poll_seconds(job)
     if wait is not None:
         sent["Retry-After"] = str(wait)
-    if if_none_match is not None and tag in if_none_match:
+    if names_etag(if_none_match, tag):
         return Response(status_code=304, headers=sent)
     return Response(body, status, sent, media_type="application/json")

@@ -13,6 +13,7 @@ import httpx
 import pytest
 
 from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
+from service.store.states import JobStatus
 from sgsst_core.files.formats import FORMATS
 from tests.api.service import Service
 
@@ -58,7 +59,7 @@ def test_files_are_kept_for_ever_under_their_digest(client: httpx.Client, files:
     for name in files.files:
         path = f"/static/{files.digest}/{name}"
         plain = client.get(path, headers={"Accept-Encoding": "identity"})
-        if name != "scene_formats.js":
+        if name not in ("scene_formats.js", "statuses.js"):  # filled in by the server
             assert plain.content == Path(FOLDER, name).read_bytes()
         assert "max-age=31536000" in plain.headers["cache-control"]
         assert "immutable" in plain.headers["cache-control"]
@@ -72,6 +73,29 @@ def test_page_knows_the_registered_scene_formats(client: httpx.Client, files: St
     found = re.search(r"sceneFormats = .*\((\[.*\])\);", module)
     assert found
     assert [entry["suffix"] for entry in json.loads(found[1])] == [format.suffix for format in FORMATS]
+
+
+def test_page_knows_the_states_of_jobs(client: httpx.Client, files: StaticFiles) -> None:
+    module = client.get(f"/static/{files.digest}/statuses.js").text
+    states = re.search(r"states = .*\((\{.*\})\);", module)
+    assert states
+    assert json.loads(states[1]) == {
+        "titles": {status: "Done" if status == "succeeded" else status.capitalize() for status in JobStatus},
+        "unfinished": ["queued", "starting", "running", "canceling"],
+        "cancelable": ["queued", "starting", "running"],
+        "retryable": ["failed", "canceled"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("header", "status"),
+    [("{}", 304), ("W/{}", 304), ('"a,b", {}', 304), ("*", 304), ('"x' + "{}", 200), ("", 200)],
+)
+def test_if_none_match_is_a_list_of_tags(client: httpx.Client, files: StaticFiles, header: str, status: int) -> None:
+    path = f"/static/{files.digest}/api.js"
+    tag = client.get(path, headers={"Accept-Encoding": "identity"}).headers["etag"]
+    sent = {"Accept-Encoding": "identity", "If-None-Match": header.format(tag)}
+    assert client.get(path, headers=sent).status_code == status
 
 
 def test_modules_have_the_type_that_browsers_ask_for(client: httpx.Client, files: StaticFiles) -> None:

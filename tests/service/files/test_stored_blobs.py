@@ -15,7 +15,7 @@ import pytest
 from service.errors import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
 from service.files import stored_blobs
 from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder, Receiver
+from service.files.blobs import BlobFolder, Receiver, write_all
 from service.files.stored_blobs import StoredBlobs
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -306,3 +306,11 @@ def test_a_store_that_is_silent_is_asked_again(fleet: Fleet, monkeypatch: pytest
     two = fleet.host("two")
     fleet.s3.fail("silence", 1, lambda method, path: "blobs" in path)
     assert fleet.read(two, sha256) == data
+
+
+@pytest.mark.parametrize(
+    ("path", "flags", "error"), [("/dev/full", "wb", NoSpaceError), ("/proc/self/mem", "r+b", StoreError)]
+)
+def test_only_a_full_disk_counts_as_no_space(path: str, flags: str, error: type[Exception]) -> None:
+    with open(path, flags, buffering=0) as file, pytest.raises(error):
+        write_all(file, b"bytes")
