@@ -17,7 +17,7 @@ def camera(width: int = 70, height: int = 45, *, focal: float = 60.0, pose: Tens
     return Camera("test", width, height, focal, focal * 1.1, width / 2 + 1.3, height / 2 - 0.7, pose)
 
 
-def turned_pose(angle: float = 0.3) -> Tensor:
+def rotated_pose(angle: float = 0.3) -> Tensor:
     """Return a pose with a translation and a rotation about a slanted axis."""
     axis = torch.tensor([1.0, 2.0, -0.5], dtype=torch.float64)
     x, y, z = (axis / axis.norm()).tolist()

@@ -13,13 +13,13 @@ import torch
 from sgsst_core.constants import ALPHA_MIN, EPS2D
 from sgsst_core.rasterizer.projection import Column, Outcome, project
 from sgsst_core.rasterizer.reference import splat
-from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, single, together, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, rotated_pose, single, together
 
 _HALF_LOG2_E = 0.5 * math.log2(math.e)
 
 
 def test_projection_agrees_with_plain_pytorch() -> None:
-    scene, view = cloud(3000, log_scale=-2.0), camera(pose=turned_pose())
+    scene, view = cloud(3000, log_scale=-2.0), camera(pose=rotated_pose())
     fast, plain = project(scene, view), splat(scene, view)
     place = {int(g): i for i, g in enumerate(plain.gaussians)}
     assert set(fast.gaussians.tolist()) <= set(place), "the reference keeps what is off the image, never less"
@@ -116,7 +116,7 @@ def test_huge_gaussians_and_an_empty_scene() -> None:
 
 
 def test_scene_far_from_origin_projects_alike() -> None:
-    scene, view = cloud(300), camera(pose=turned_pose())
+    scene, view = cloud(300), camera(pose=rotated_pose())
     scene = replace(scene, means=(scene.means * 16).round() / 16)
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     pose = view.world_to_camera.clone()

@@ -39,9 +39,9 @@ from tests.sgsst_core.splat_scenes import (
     colors_of,
     empty_scene,
     pixels_like,
+    rotated_pose,
     single,
     together,
-    turned_pose,
 )
 
 #: Relative distance from a cutoff within which float32 rounding may change the decision.
@@ -54,7 +54,7 @@ BLACK = (0.0, 0.0, 0.0)
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "cloud": lambda: (cloud(), camera()),
-    "turned": lambda: (cloud(600, seed=1), camera(pose=turned_pose())),
+    "rotated": lambda: (cloud(600, seed=1), camera(pose=rotated_pose())),
     "crowded": lambda: (
         replace(cloud(1500, seed=2, log_scale=-1.5), opacities=torch.full((1500,), 3.0)),
         camera(40, 33),
@@ -289,7 +289,7 @@ def test_distant_center_keeps_its_digits() -> None:
 
 
 def test_scene_far_from_origin_renders_alike() -> None:
-    scene, view = cloud(300, seed=16), camera(pose=turned_pose())
+    scene, view = cloud(300, seed=16), camera(pose=rotated_pose())
     scene = replace(scene, means=(scene.means * 16).round() / 16)
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     pose = view.world_to_camera.clone()
@@ -340,7 +340,7 @@ def test_half_precision_weights_are_rounded_to_float16() -> None:
 
 def test_weights_beyond_the_budget_are_recomputed() -> None:
     scene = cloud(800, seed=20)
-    views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
+    views = [camera(), camera(pose=rotated_pose(0.1)), camera(pose=rotated_pose(0.2))]
     colors, pixels = colors_of(scene), pixels_like(views[0])
     sizes = [CpuRasterizer(scene).count_weights(view).nbytes("float32") for view in views]
     budget = sizes[0] + sizes[1]
@@ -358,7 +358,7 @@ def test_weights_beyond_the_budget_are_recomputed() -> None:
 
 def test_tile_intersections_beyond_the_budget_are_cached_for_the_last_view_only() -> None:
     scene = cloud(300, seed=21)
-    views = [camera(), camera(pose=turned_pose(0.1)), camera(pose=turned_pose(0.2))]
+    views = [camera(), camera(pose=rotated_pose(0.1)), camera(pose=rotated_pose(0.2))]
     first = CpuRasterizer(scene).intersections(views[0])
     cpu = CpuRasterizer(scene, max_intersection_bytes=first.nbytes)
     cached = [cpu.intersections(view) for view in views]
@@ -369,7 +369,7 @@ def test_tile_intersections_beyond_the_budget_are_cached_for_the_last_view_only(
 
 def test_weights_and_tile_intersections_share_a_budget() -> None:
     scene = cloud(800, seed=20)
-    views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
+    views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
     colors = colors_of(scene)
     weights = [CpuRasterizer(scene).count_weights(view).nbytes("float32") for view in views]
     isects = [CpuRasterizer(scene).intersections(view).nbytes for view in views]

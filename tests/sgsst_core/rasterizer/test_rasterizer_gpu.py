@@ -13,7 +13,7 @@ from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, pixels_like, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, pixels_like, rotated_pose
 
 HAS_GSPLAT = importlib.util.find_spec("gsplat") is not None
 HAS_GPU = torch.cuda.is_available()
@@ -35,7 +35,7 @@ def test_gsplat_renders() -> None:
 @needs_gsplat
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_cuda_agrees_with_the_reference(seed: int) -> None:
-    scene, view = cloud(800, seed=seed), camera(130, 75, pose=turned_pose())
+    scene, view = cloud(800, seed=seed), camera(130, 75, pose=rotated_pose())
     background = (0.2, 0.5, 1.0)
     cuda = CudaRasterizer(scene, background=background)
     reference = ReferenceRasterizer(scene, background=background, alpha_max=cuda.alpha_max)

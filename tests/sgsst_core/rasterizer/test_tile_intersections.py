@@ -20,7 +20,7 @@ from sgsst_core.rasterizer.tile_intersections import (
 )
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
 _RANDOM = np.random.default_rng(0)
 DEPTHS: dict[str, NDArray[np.float64]] = {
@@ -116,7 +116,7 @@ def test_tile_intersections_of_a_subset_equal_rebuilt_ones(share: float, threads
 
 def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
     scene = cloud(600, seed=34)
-    views = [camera(97, 61, pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
+    views = [camera(97, 61, pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
     chosen = torch.arange(600) % 4 > 0
     sizes = [build_tile_intersections(scene, view).nbytes for view in views]
     whole = CpuRasterizer(scene, max_intersection_bytes=sum(sizes[:3]))
@@ -137,7 +137,7 @@ def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
 
 def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
     scene = cloud(300, seed=35)
-    views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
+    views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
     cpu = CpuRasterizer(scene)
     sizes = [cpu.intersections(view).nbytes for view in views]
     cpu.release_view(views[0], sizes[1])
@@ -146,7 +146,7 @@ def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
 
 def test_guests_use_the_rest_of_the_budget_for_tile_intersections() -> None:
     scene = cloud(300, seed=36)
-    views = [camera(pose=turned_pose(angle)) for angle in (0.0, 0.1, 0.2)]
+    views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
     sizes = [build_tile_intersections(scene, view).nbytes for view in views]
     host = CpuRasterizer(scene, max_intersection_bytes=sum(sizes))
     guests = [host.beside(scene) for _ in range(2)]

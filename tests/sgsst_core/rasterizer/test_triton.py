@@ -29,7 +29,7 @@ from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, rotated_pose
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -66,7 +66,7 @@ def far_away() -> tuple[Scene, Camera]:
 
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
-    "turned": lambda: (cloud(150, seed=1), camera(40, 35, pose=turned_pose())),
+    "rotated": lambda: (cloud(150, seed=1), camera(40, 35, pose=rotated_pose())),
     "opaque": lambda: (opaque(), camera(33, 18)),
     "needles": lambda: (needles(), camera(49, 31)),
     "huge": lambda: (cloud(40, seed=3, log_scale=3.0), camera(33, 17)),

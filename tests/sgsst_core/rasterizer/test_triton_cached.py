@@ -28,7 +28,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, rotated_pose
 from tests.small_scenes import ball, cameras, style
 
 pytest.importorskip("triton")
@@ -41,7 +41,7 @@ CLOSE = 2e-5
 ERRORS: dict[Precision, float] = {"float32": 5e-6, "half": 2**-11}
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
-    "turned": lambda: (cloud(120, seed=1), camera(33, 20, pose=turned_pose())),
+    "rotated": lambda: (cloud(120, seed=1), camera(33, 20, pose=rotated_pose())),
     "opaque": lambda: (
         replace(cloud(200, seed=2, log_scale=-1.5), opacities=torch.full((200,), 7.0)),
         camera(18, 17),
@@ -138,7 +138,7 @@ def test_view_without_gaussians_is_background(scene: Scene) -> None:
 
 def test_weights_beyond_the_budget_are_recomputed_on_the_device() -> None:
     scene = cloud(100, seed=20)
-    views = [camera(20, 17), camera(20, 17, pose=turned_pose(0.1)), camera(17, 20, pose=turned_pose(0.2))]
+    views = [camera(20, 17), camera(20, 17, pose=rotated_pose(0.1)), camera(17, 20, pose=rotated_pose(0.2))]
     colors, pixels, uncached = colors_of(scene), pixels_like(views[0]), on_device(scene)
     for precision in ERRORS:
         sizes = [uncached.count_weights(view).nbytes(precision) for view in views[:2]]

@@ -22,11 +22,11 @@ from sgsst_core.refine.choice import (
 )
 from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.settings import make_settings
-from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
 
 def test_projected_axes_add_up_to_the_projected_covariance() -> None:
-    scene, view = cloud(300), camera(pose=turned_pose())
+    scene, view = cloud(300), camera(pose=rotated_pose())
     found = project(scene, view)
     rows = torch.from_numpy(found.gaussians).long()
     x, y = (torch.from_numpy(found.values[:, column]) for column in (Column.X, Column.Y))
@@ -46,7 +46,7 @@ def test_projected_axes_add_up_to_the_projected_covariance() -> None:
 
 
 def test_footprints_are_means_weighted_by_visibility() -> None:
-    scene, views = cloud(200), [camera(pose=turned_pose()), camera(40, 30, focal=30.0)]
+    scene, views = cloud(200), [camera(pose=rotated_pose()), camera(40, 30, focal=30.0)]
     rasterizer, prints = CpuRasterizer(scene), Footprints(scene)
     weights = [rasterizer.survey(view)[1] for view in views]
     for view, own in zip(views, weights, strict=True):

@@ -23,7 +23,7 @@ from sgsst_core.scene.spherical_harmonics import (
     view_directions,
 )
 from sgsst_core.scene.stored_harmonics import held
-from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
 
 def sphere(polar: int = 64, around: int = 128) -> tuple[Tensor, Tensor]:
@@ -82,7 +82,7 @@ def test_basis_has_signs_and_order_of_3dgs_files() -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_rest_colors_of_a_degree_use_only_its_coefficients(degree: int) -> None:
-    scene, view = cloud(50, degree=3), camera(pose=turned_pose())
+    scene, view = cloud(50, degree=3), camera(pose=rotated_pose())
     count = (degree + 1) ** 2 - 1
     alone = rest_colors(held(scene.sh_rest)[:, :count], scene.means, view)
     assert torch.equal(rest_colors(scene.sh_rest, scene.means, view, degree=degree), alone)
@@ -94,7 +94,7 @@ def test_rest_colors_of_a_degree_use_only_its_coefficients(degree: int) -> None:
 
 
 def test_scene_far_from_origin_keeps_its_colors() -> None:
-    scene, view = cloud(50, degree=3), camera(pose=turned_pose())
+    scene, view = cloud(50, degree=3), camera(pose=rotated_pose())
     scene = replace(scene, means=(scene.means * 16).round() / 16)  # so that a translation by 1e6 is exact
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     moved_pose = view.world_to_camera.clone()
@@ -111,7 +111,7 @@ def test_directions_of_extreme_length_are_unit_or_zero() -> None:
 
 
 def far_from_the_origin() -> tuple[Scene, Camera]:
-    scene, view = cloud(300, degree=3), camera(pose=turned_pose())
+    scene, view = cloud(300, degree=3), camera(pose=rotated_pose())
     offset = torch.tensor([1e6, -2e6, 1.5e6], dtype=torch.float64)
     pose = view.world_to_camera.clone()
     pose[:3, 3] -= pose[:3, :3] @ offset
@@ -129,11 +129,11 @@ def huge_coefficients() -> tuple[Scene, Camera]:
     """Return Gaussians with huge SH coefficients, some of which cancel each other."""
     scene = cloud(300, degree=3)
     sizes = torch.logspace(0, 36, 300)[:, None, None]
-    return replace(scene, sh_rest=held(scene.sh_rest) * sizes), camera(pose=turned_pose())
+    return replace(scene, sh_rest=held(scene.sh_rest) * sizes), camera(pose=rotated_pose())
 
 
 KERNEL_CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
-    "ordinary": lambda: (cloud(300, degree=3), camera(pose=turned_pose())),
+    "ordinary": lambda: (cloud(300, degree=3), camera(pose=rotated_pose())),
     "camera far from the origin": far_from_the_origin,
     "a Gaussian at the center": at_the_center,
     "huge coefficients": huge_coefficients,
@@ -175,7 +175,7 @@ def test_cpu_sums_are_float64_rounded_once(name: str, degree: int) -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")
 def test_gpu_colors_come_from_the_kernel() -> None:
-    scene, view = cloud(300, degree=3), camera(pose=turned_pose())
+    scene, view = cloud(300, degree=3), camera(pose=rotated_pose())
     sh_rest, means = held(scene.sh_rest).cuda(), scene.means.cuda()
     found = rest_colors(sh_rest, means, view)
     assert torch.equal(found, kernel_rest_colors(sh_rest, means, view, 3))

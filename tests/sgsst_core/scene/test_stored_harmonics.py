@@ -29,7 +29,7 @@ from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import RowFile, StoredHarmonics, held
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import fingerprint
-from tests.sgsst_core.splat_scenes import camera, cloud, turned_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
 
 @pytest.fixture(autouse=True)
@@ -96,7 +96,7 @@ def test_stored_harmonics_of_any_layout_equal_those_in_memory(
     path = written(tmp_path_factory.mktemp("stored"), count, degree)
     rewritten(path, comment, extra, position, elements)
     stored, plain = both(path)
-    view = camera(pose=turned_pose())
+    view = camera(pose=rotated_pose())
     for name in ("means", "quats", "scales", "opacities", "sh_dc"):
         assert torch.equal(getattr(stored, name), getattr(plain, name))
     assert torch.equal(held(stored.sh_rest), held(plain.sh_rest))
