@@ -611,20 +611,19 @@ class CostModel:
         groups = math.gcd(self._settings.views_per_step, ranks)
         each, turns = ranks // groups, self._settings.views_per_step // groups
 
-        def mean(values: Iterable[float]) -> float:
-            every = list(values)
-            return turns * sum(every) / len(every)
+        def per_step(seconds: Sequence[float]) -> float:
+            return turns * sum(seconds) / len(seconds)
 
         largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in sos)
         # With fewer ranks, each has more memory.
         memory = memory_for("activations", self._probe.machine.memory) * sharing / min(ranks, sharing)
         activations = int(min(largest * (network.held_bytes + network.working_bytes), memory))
         prediction = Prediction(
-            mean(work.seconds(each, link, groups) for work in sos),
-            mean(work.seconds(each, link, groups) for work in coarse),
+            per_step([work.seconds(each, link, groups) for work in sos]),
+            per_step([work.seconds(each, link, groups) for work in coarse]),
             0,
-            mean(work.communication(each, link) for work in sos),
-            mean(work.seconds(1, link) for work in sos) * groups,
+            per_step([work.communication(each, link) for work in sos]),
+            per_step([work.seconds(1, link) for work in sos]) * groups,
         )
         return prediction, activations
 
