@@ -25,6 +25,7 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.settings import Precision, make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import comparing_pixels, tiny_weights
 from tests.pretend_cuda.counts import Counts
@@ -50,7 +51,9 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
         plan, planning_context = make_plan(scene, cameras(1, *SMALL), settings, weights=weights)
         plan = replace(plan, precision=precision)  # independent of what is fastest on this processor
         kept = planning_context if plan.precision == planning_context.network.precision else None
-        stylizer = Stylizer(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, planning_context=kept)
+        stylizer = Stylizer(
+            prepare_job(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, planning_context=kept)
+        )
         steps = []
         for _ in range(2):
             counts.clear()
@@ -58,12 +61,12 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
             steps.append(counts.copy())
         losses = {}
         for width, height in (SMALL, size):
-            loss = SosLoss(stylizer.network, coarsest=max(16, min(width, height) // 4))
+            loss = SosLoss(stylizer.job.network, coarsest=max(16, min(width, height) // 4))
             losses[f"{width}x{height}"] = launches_of(loss, counts, (height, width), scan)
     return {
         "launches of the loss": losses,
-        "scales": stylizer.scale_count(0),
-        "rasterizer": stylizer.plan.rasterizer,
+        "scales": stylizer.job.scale_count(0),
+        "rasterizer": stylizer.job.plan.rasterizer,
         "first": totals(steps[0]),
         "steady": totals(steps[1]),
         "lines": {kind: dict(getattr(steps[1], kind).most_common()) for kind in ("launches", "waits", "copies")},

@@ -89,7 +89,7 @@ def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: d
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
     novel_views = make_novel_views(stylizer)
     views = [novel_views.cameras[index] for index in novel_views.views]
-    return Judge(Lpips(), style, scene, novel_views.rasterizer, views, stylizer.settings.background)
+    return Judge(Lpips(), style, scene, novel_views.rasterizer, views, stylizer.job.settings.background)
 
 
 def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[str, float]:
@@ -129,7 +129,7 @@ def _run(
     weights = _weights(values.pop("factor", None))
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **values), weights=weights)
     before = time.process_time()
-    while stylizer.step < stylizer.total:
+    while stylizer.step < stylizer.job.total_steps:
         stylizer.run_step()
     return stylizer.stylized(), time.process_time() - before
 

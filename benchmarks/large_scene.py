@@ -40,6 +40,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.unseen import NEIGHBORS, neighbors_change
 from sgsst_core.timing import Timer
@@ -151,7 +152,9 @@ def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     timer, weights, style = Timer(), load_network_weights("auto"), soft_image(512)
     plan, planning_context = make_plan(scene, cameras, settings, weights=weights, timer=timer)
     with timer("preparing"):
-        stylizer = Stylizer(plan, scene, cameras, style, settings, weights=weights, planning_context=planning_context)
+        stylizer = Stylizer(
+            prepare_job(plan, scene, cameras, style, settings, weights=weights, planning_context=planning_context)
+        )
     with timer("first_step"):
         stylizer.run_step()
     return {f"{name}_seconds_of_a_job": seconds for name, seconds in timer.seconds.items()}

@@ -88,7 +88,7 @@ def _measure(arguments: argparse.Namespace) -> None:
     started = time.perf_counter()
     stylizer = Stylizer.planned(scene, [view], load_image(arguments.style), settings)
     planning = time.perf_counter() - started
-    prediction = stylizer.plan.prediction
+    prediction = stylizer.job.plan.prediction
     assert prediction is not None
     seconds: list[float] = []
     for _ in range(arguments.steps):

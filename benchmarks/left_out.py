@@ -69,10 +69,10 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     kept = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
     settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, early_stop=False, keep=kept)
     stylizer = Stylizer.planned(scene, views, load_image(arguments.style), settings)
-    for _ in range(arguments.rounds * len(stylizer.views.covered)):
+    for _ in range(arguments.rounds * len(stylizer.job.views.covered)):
         stylizer.run_step()
-    steps = [sum(record.parts.values()) for record in stylizer.history[len(stylizer.views.covered) :]]
-    prediction = stylizer.plan.prediction
+    steps = [sum(record.parts.values()) for record in stylizer.history[len(stylizer.job.views.covered) :]]
+    prediction = stylizer.job.plan.prediction
     assert prediction is not None
     return {
         "seconds": median(steps),

@@ -83,12 +83,12 @@ def _run(stylizer: Stylizer, own: Tensor) -> list[dict[str, Any]]:
 
     The scene's own colors are the reference, not the first step's, because `standard` starts from the style's colors.
     """
-    views = stylizer.views.covered
-    start = stylizer.evaluate(views, own[stylizer.plan.seen])
-    coarse, sos = stylizer.plan.steps_coarse, stylizer.settings.steps_sos
+    views = stylizer.job.views.covered
+    start = stylizer.evaluate(views, own[stylizer.job.plan.seen])
+    coarse, sos = stylizer.job.plan.steps_coarse, stylizer.job.settings.steps_sos
     marks = {int(coarse * mark) for mark in MARKS} | {coarse + int(sos * mark) for mark in MARKS}
     points, seconds = [], 0.0
-    while stylizer.step < stylizer.total:
+    while stylizer.step < stylizer.job.total_steps:
         before = time.process_time()
         stylizer.run_step()
         seconds += time.process_time() - before

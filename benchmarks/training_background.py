@@ -105,11 +105,11 @@ def _run(
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
     start = mean_loss(stylizer.start())
     before = time.process_time()
-    while stylizer.step < stylizer.total:
+    while stylizer.step < stylizer.job.total_steps:
         stylizer.run_step()
     seconds = time.process_time() - before
     sh_dc = stylizer.stylized()
-    loss = mean_loss(stylizer.evaluate(stylizer.evaluation_views)) / start
+    loss = mean_loss(stylizer.evaluate(stylizer.job.evaluation_views)) / start
     return sh_dc, {**_row(judge, sh_dc), "loss": loss, "seconds": seconds}
 
 

@@ -24,24 +24,24 @@ class Prepared:
 
 def describe(job: Job) -> Prepared:
     """Summarize the inputs and the plan for the user."""
-    stylizer, settings = job.stylizer, job.stylizer.settings
+    stylizer, settings = job.stylizer, job.stylizer.job.settings
     lines = [("scene", _describe_scene(job)), ("views", _describe_views(job)), ("network", _describe_network(job))]
-    lines += [(decision.item, f"{decision.decision}: {decision.reason}") for decision in stylizer.plan.decisions]
+    lines += [(decision.item, f"{decision.decision}: {decision.reason}") for decision in stylizer.job.plan.decisions]
     rate = f"learning rate {settings.learning_rate:g}"
     if settings.learning_rate_end != settings.learning_rate:
         rate += f" to {settings.learning_rate_end:g}"
-    steps = f"{stylizer.plan.steps_coarse} steps on the coarsest scale, then {settings.steps_sos} on all"
-    if not stylizer.plan.steps_coarse:
+    steps = f"{stylizer.job.plan.steps_coarse} steps on the coarsest scale, then {settings.steps_sos} on all"
+    if not stylizer.job.plan.steps_coarse:
         steps = f"{settings.steps_sos} steps"
     lines.append(("schedule", f"{steps}; {rate} (preset {settings.preset})"))
     if job.resumed:
-        lines.append(("resuming", f"at step {job.resumed.state.step} of {stylizer.total}"))
+        lines.append(("resuming", f"at step {job.resumed.state.step} of {stylizer.job.total_steps}"))
     elif job.outputs.checkpoints.exist:
         note = (
             f"{job.outputs.checkpoint} exists from an earlier run. This run starts from the beginning and replaces it; "
         )
         lines.append(("note", note + "use --resume to continue from it."))
-    return Prepared(lines, job.resumed.state.step if job.resumed else 0, stylizer.total)
+    return Prepared(lines, job.resumed.state.step if job.resumed else 0, stylizer.job.total_steps)
 
 
 def _describe_scene(job: Job) -> str:
@@ -51,12 +51,12 @@ def _describe_scene(job: Job) -> str:
 
 
 def _describe_views(job: Job) -> str:
-    views = job.stylizer.views
+    views = job.stylizer.job.views
     sizes = sorted({(camera.width, camera.height) for camera in views.cameras})
     text = f"{len(views)} of {sizes[0][0]}x{sizes[0][1]}"
     if len(sizes) > 1:
         text = f"{len(views)} of {len(sizes)} sizes, {sizes[0][0]}x{sizes[0][1]} to {sizes[-1][0]}x{sizes[-1][1]}"
-    tiling = job.stylizer.loss.tiling
+    tiling = job.stylizer.job.loss.tiling
     scales = max(tiling.scale_count((height, width)) for width, height in sizes)
     chosen = max(len(tiling.scales((height, width))) for width, height in sizes)
     text += f", {f'{chosen} of ' if chosen < scales else ''}{scales} scale{'s' if scales > 1 else ''}"

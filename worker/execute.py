@@ -95,13 +95,13 @@ def execute(
         OutputError: If the PLY, or the checkpoint of an interrupted job, cannot be written.
     """
     stylizer = job.stylizer
-    first = stylizer.collectives.rank == 0
+    first = stylizer.job.collectives.rank == 0
     measure = Measurements(stylizer)
     if job.resumed:
         stylizer.load_state(job.resumed.state)
     if first:
         _make_room(job.outputs)
-    stylizer.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.plan)))
+    stylizer.job.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.job.plan)))
     if first:
         _write_views(job, warn)
     checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), saved, warn)
@@ -114,7 +114,7 @@ def execute(
     if stopped == "interrupted":
         if checkpoint.error is not None:
             raise checkpoint.error
-        return Result(stopped, stylizer.step, stylizer.total, {}, {})
+        return Result(stopped, stylizer.step, stylizer.job.total_steps, {}, {})
     return _finish(job, stopped, measure)
 
 
@@ -130,7 +130,7 @@ def _write_views(job: Job, warn: Warn) -> None:
     path = job.outputs.views
     if job.request.source.orbit is None or (job.resumed and path.exists()):
         return
-    settings, cameras = job.stylizer.settings, job.stylizer.views.cameras
+    settings, cameras = job.stylizer.job.settings, job.stylizer.job.views.cameras
     try:
         write_views(path, job.scene_file.scene, cameras, background=settings.background, near=settings.near)
     except OutputError as error:
@@ -153,7 +153,7 @@ class _CheckpointWriter:
         """Write a checkpoint; if that fails, warn and store the error."""
         job = self._job
         self.error = None
-        checkpoint = Checkpoint(stylizer.state(), stylizer.plan, job.planned_ranks, self._run_id, versions())
+        checkpoint = Checkpoint(stylizer.state(), stylizer.job.plan, job.planned_ranks, self._run_id, versions())
         try:
             job.outputs.checkpoints.save(checkpoint, job.fingerprint)
             self._saved(stylizer.step)
@@ -165,9 +165,9 @@ class _CheckpointWriter:
 def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     """Write the PLY, then all other outputs. Every rank must call this function."""
     stylizer, outputs = job.stylizer, job.outputs
-    first = stylizer.collectives.rank == 0
-    stylizer.collectives.broadcast(lambda: _write_ply(job))
-    packed = stylizer.collectives.broadcast(lambda: _write_packed(job))
+    first = stylizer.job.collectives.rank == 0
+    stylizer.job.collectives.broadcast(lambda: _write_ply(job))
+    packed = stylizer.job.collectives.broadcast(lambda: _write_packed(job))
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
     measure.at_the_end()
@@ -176,19 +176,29 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     error = _write_reports(job, stopped, before, after, packed) if first else None
     found = bought(stylizer, before)
     problem = str(error) if error else None
-    return Result(stopped, stylizer.step, stylizer.total, before, after, found, problem, packed, stylizer.loss.weights)
+    return Result(
+        stopped,
+        stylizer.step,
+        stylizer.job.total_steps,
+        before,
+        after,
+        found,
+        problem,
+        packed,
+        stylizer.job.loss.weights,
+    )
 
 
 def _write_ply(job: Job) -> None:
     stylizer = job.stylizer
     write_stylized(
-        job.scene_file, job.outputs.ply, stylizer.stylized(), sh_attenuation=stylizer.settings.sh_attenuation
+        job.scene_file, job.outputs.ply, stylizer.stylized(), sh_attenuation=stylizer.job.settings.sh_attenuation
     )
 
 
 def _only_colors_change(job: Job) -> bool:
     """Return whether the result has the same rows as the scene's file, with only f_dc changed."""
-    file, attenuation = job.scene_file, job.stylizer.settings.sh_attenuation
+    file, attenuation = job.scene_file, job.stylizer.job.settings.sh_attenuation
     return file.retained is None and file.copies is None and not (attenuation and file.scene.sh_degree)
 
 
@@ -197,10 +207,10 @@ def _write_packed(job: Job) -> PackedLoss | None:
     path, format, stylizer = job.outputs.packed, job.outputs.packed_format, job.stylizer
     if path is None or format is None:
         return None
-    scene = replace(stylizer.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
+    scene = replace(stylizer.job.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
     write_scene(path, scene, format)
-    settings = stylizer.settings
-    return measure_packed(path, scene, stylizer.views.cameras, background=settings.background, near=settings.near)
+    settings = stylizer.job.settings
+    return measure_packed(path, scene, stylizer.job.views.cameras, background=settings.background, near=settings.near)
 
 
 def _write_reports(
@@ -211,8 +221,8 @@ def _write_reports(
     try:
         if job.request.colors and _only_colors_change(job):
             write_colors(outputs.colors, stylizer.stylized())
-        near, survey = stylizer.settings.near, stylizer.plan.survey
-        findings = findings_of(job.scene_file, stylizer.views.cameras, stylizer.style, near=near, survey=survey)
+        near, survey = stylizer.job.settings.near, stylizer.job.plan.survey
+        findings = findings_of(job.scene_file, stylizer.job.views.cameras, stylizer.job.style, near=near, survey=survey)
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
         sent = sent_json(stylizer.history)

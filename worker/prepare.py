@@ -24,6 +24,7 @@ from sgsst_core.refine.split import Refinement
 from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
@@ -111,7 +112,7 @@ def prepare(
             refinement=refinement,
         )
     with timer("preparing"):
-        stylizer = Stylizer(
+        stylization = prepare_job(
             plan,
             scene_file.scene,
             inputs.cameras,
@@ -123,6 +124,7 @@ def prepare(
             planning_context=planning_context,
             regions=regions,
         )
+        stylizer = Stylizer(stylization)
     stylizer.seconds_by_part.update(timer.seconds)
     source, images = request.source, request.images
     styles = tuple(file.path for file in request.styles)
@@ -163,13 +165,13 @@ def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan |
 
 
 def _workers_used(stylizer: Stylizer) -> dict[str, Any]:
-    device = stylizer.network.device
+    device = stylizer.job.network.device
     own = {
         "host": socket.gethostname(),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
     }
-    ranks = stylizer.collectives.all_gather(own)
+    ranks = stylizer.job.collectives.all_gather(own)
     return {"used": len(ranks), "ranks": ranks}
 
 

@@ -10,6 +10,7 @@ import torch
 
 from sgsst_core.files.images import save_jpg
 from sgsst_core.scene.camera import resized
+from sgsst_core.stylizing.result_colors import transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Minimum time between two previews, as a fraction of the job's elapsed time. It limits the number of previews.
@@ -54,14 +55,14 @@ class Previews:
         self._last = time.monotonic()
 
     def _write(self, stylizer: Stylizer) -> Path:
-        views = stylizer.views
-        index = stylizer.evaluation_views[0]
+        views = stylizer.job.views
+        index = stylizer.job.evaluation_views[0]
         camera = views.cameras[index]
         if camera.side > _SIDE:
             camera = resized(camera, _SIDE)
         path = self._folder / f"step_{stylizer.step:07d}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)
-        colors = stylizer.shown() if stylizer.step else stylizer.transferred().to(stylizer.sh_dc.device)
+        colors = stylizer.shown() if stylizer.step else transferred_colors(stylizer.job).to(stylizer.sh_dc.device)
         with torch.no_grad():
             # Only this rank renders here, so the distributed renderer cannot be used.
             image = views.rasterizer.render(views.colors(index, colors), camera)

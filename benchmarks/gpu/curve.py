@@ -71,7 +71,7 @@ def follow(sizes: Sizes, rasterizer: str | None) -> tuple[str, list[float]]:
     weights = small_weights() if sizes == QUICK else network_weights()
     style = texture(side, side, seed=3)
     stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, rasterizer=rasterizer)
-    return name, [stylizer.run_step().loss for _ in range(stylizer.total)]
+    return name, [stylizer.run_step().loss for _ in range(stylizer.job.total_steps)]
 
 
 def inputs(side: int, *, small: bool) -> tuple[str, Scene, list[Camera]]:

@@ -65,7 +65,7 @@ def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
         rasterizer=None if device().type == "cuda" else "triton",
         collectives=collectives,
     )
-    gradient = stylizer.gradient(0, range(stylizer.scale_count(0)))[0].cpu()
+    gradient = stylizer.gradient(0, range(stylizer.job.scale_count(0)))[0].cpu()
     for _ in range(STEPS):
         stylizer.run_step()
     return gradient, stylizer.sh_dc.detach().cpu()

@@ -49,10 +49,10 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     records = stylizer.history[_WARM:]
     names = {name for record in records for name in record.parts}
     parts = {name: statistics.median(record.parts.get(name, 0.0) for record in records) for name in sorted(names)}
-    prediction = stylizer.plan.prediction
+    prediction = stylizer.job.plan.prediction
     found.add(f"{place}/gaussians", len(scene))
-    found.add(f"{place}/rasterizer", stylizer.plan.rasterizer)
-    found.add(f"{place}/precision", stylizer.plan.precision)
+    found.add(f"{place}/rasterizer", stylizer.job.plan.rasterizer)
+    found.add(f"{place}/precision", stylizer.job.plan.precision)
     found.add(f"{place}/seconds", statistics.median(taken))
     found.add(f"{place}/seconds_by_part", parts)
     found.add(f"{place}/device_peak_bytes", peak_bytes(device()))

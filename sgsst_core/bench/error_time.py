@@ -239,28 +239,28 @@ def _begin(
     if reason:
         return Curve(variant, [], left_out=reason), None
     stylizer.budget = seconds
-    stylizer.shares = variant.shares(max(len(stylizer.scales(index)) for index in stylizer.views.covered))
+    stylizer.shares = variant.shares(max(len(stylizer.job.scales(index)) for index in stylizer.job.views.covered))
     return Curve(variant, [], preparation=_prepare(stylizer)), stylizer
 
 
 def _prepare(stylizer: _TimedStylizer) -> float:
     """Prepare the style and every view as the first steps would; return the elapsed seconds."""
     started = time.perf_counter()
-    for index in stylizer.views.covered:
-        chosen = stylizer.scales(index)
+    for index in stylizer.job.views.covered:
+        chosen = stylizer.job.scales(index)
         phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.shares]
-        stylizer.style_targets(stylizer.views.cameras[index])
+        stylizer.job.style_targets(stylizer.job.views.cameras[index])
         scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
-        stylizer.views.target(index, scales, stylizer.behind(index))
+        stylizer.job.views.target(index, scales, stylizer.behind(index))
         stylizer.keep_weights(index)
-        stylizer.views.render(index, stylizer.views.colors(index, stylizer.sh_dc.detach()))
+        stylizer.job.views.render(index, stylizer.job.views.colors(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started
 
 
 def _reason_to_leave_out(settings: Settings, stylizer: Stylizer) -> str | None:
     wanted = settings.precision
-    if wanted != stylizer.network.precision:
-        return next(d.reason for d in stylizer.plan.decisions if d.item == "precision")
+    if wanted != stylizer.job.network.precision:
+        return next(d.reason for d in stylizer.job.plan.decisions if d.item == "precision")
     return None
 
 

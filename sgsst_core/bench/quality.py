@@ -153,7 +153,7 @@ def compare_quality(
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings), weights=weights)
     novel_views = make_novel_views(stylizer)
     views = [novel_views.cameras[index] for index in novel_views.views]
-    judge = Judge(lpips, style, scene, novel_views.rasterizer, views, stylizer.settings.background)
+    judge = Judge(lpips, style, scene, novel_views.rasterizer, views, stylizer.job.settings.background)
     if not judge.cameras:
         raise SettingsError(
             "no view between the cameras can be judged: neighboring cameras are too far apart, or views are smaller "
@@ -167,7 +167,7 @@ def compare_quality(
         assert judgment is not None
         return Outcome(name, what, sh_dc, judgment, found.short, found.long)
 
-    blend_weights = stylizer.plan.survey.total_blend_weights
+    blend_weights = stylizer.job.plan.survey.total_blend_weights
     transferred = warm_start(scene.sh_dc, blend_weights, Style.of(style))
     outcomes = [
         outcome(UNSTYLIZED, "the scene as it came", scene.sh_dc),
@@ -186,14 +186,14 @@ def make_novel_views(stylizer: Stylizer) -> NovelViews:
     """Create the novel views of a job, with all Gaussians of its scene."""
     exact = ExactLoss(stylizer, "sos")
     return NovelViews(
-        stylizer.views.cameras,
-        stylizer.views.covered,
-        stylizer.scene,
-        rasterizer_beside(stylizer, stylizer.scene),
+        stylizer.job.views.cameras,
+        stylizer.job.views.covered,
+        stylizer.job.scene,
+        rasterizer_beside(stylizer, stylizer.job.scene),
         exact.loss,
         exact.style_targets,
-        weighted=stylizer.plan.weighted,
-        memory=stylizer.memory // 16,
+        weighted=stylizer.job.plan.weighted,
+        memory=stylizer.job.memory // 16,
     )
 
 

@@ -17,13 +17,12 @@ from torch import Tensor
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.sos import make_loss
-from sgsst_core.loss.targets import StyleTargets
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName
 from sgsst_core.stylizing.evaluation import Evaluation, evaluate
+from sgsst_core.stylizing.job import StyleTargetCache
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
 
@@ -31,9 +30,9 @@ from sgsst_core.stylizing.views import Views
 def approximations(stylizer: Stylizer) -> list[str]:
     """Return the names of a job's approximations whose gradient error exceeds rounding; empty if there are none."""
     found = []
-    if stylizer.network.precision != "float32":
-        found.append("TF32 convolutions" if stylizer.network.tf32 else f"{stylizer.network.precision} features")
-    if stylizer.plan.cached_weights == "half":
+    if stylizer.job.network.precision != "float32":
+        found.append("TF32 convolutions" if stylizer.job.network.tf32 else f"{stylizer.job.network.precision} features")
+    if stylizer.job.plan.cached_weights == "half":
         found.append("half-precision blend weights")
     return found
 
@@ -43,7 +42,7 @@ def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
 
     It shares the job's memory budget for tile intersections, with lower priority.
     """
-    return stylizer.views.rasterizer.uncached.beside(scene)
+    return stylizer.job.views.rasterizer.uncached.beside(scene)
 
 
 @dataclass(frozen=True)
@@ -81,20 +80,12 @@ class ExactLoss:
 
     def __init__(self, stylizer: Stylizer, style_loss: StyleLossName | None = None) -> None:
         self._stylizer = stylizer
-        settings = stylizer.settings
+        settings = stylizer.job.settings
         settings = settings.model_copy(update={"style_loss": style_loss or settings.style_loss})
-        layers = layers_of(settings.style_loss, stylizer.weights, content=settings.content_weight > 0)
-        network = FeatureNetwork(stylizer.weights, layers, torch.float32, stylizer.network.device)
-        self.loss = make_loss(network, settings, stylizer.loss.memory)
-        self._style_targets: dict[tuple[int, int], StyleTargets] = {}
-
-    def style_targets(self, camera: Camera) -> StyleTargets:
-        """Return the style targets for views of the camera's size."""
-        size = (camera.height, camera.width)
-        if size not in self._style_targets:
-            styles = self._stylizer.styles.to(self.loss.network.device)
-            self._style_targets[size] = styles.targets(self.loss, size)
-        return self._style_targets[size]
+        layers = layers_of(settings.style_loss, stylizer.job.weights, content=settings.content_weight > 0)
+        network = FeatureNetwork(stylizer.job.weights, layers, torch.float32, stylizer.job.network.device)
+        self.loss = make_loss(network, settings, stylizer.job.loss.memory)
+        self.style_targets = StyleTargetCache(stylizer.job.styles.to(network.device), self.loss)
 
 
 class Float32Reference(ExactLoss):
@@ -108,23 +99,23 @@ class Float32Reference(ExactLoss):
 
     def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
         super().__init__(stylizer, style_loss)
-        settings = stylizer.settings
-        self.shown = stylizer.plan.survey.total_blend_weights > 0
-        scene, rasterizer = stylizer.views.scene, stylizer.views.rasterizer.uncached
-        if not torch.equal(self.shown, stylizer.plan.seen):
-            scene = stylizer.scene.subset(self.shown).without_zero_bands()
+        settings = stylizer.job.settings
+        self.shown = stylizer.job.plan.survey.total_blend_weights > 0
+        scene, rasterizer = stylizer.job.views.scene, stylizer.job.views.rasterizer.uncached
+        if not torch.equal(self.shown, stylizer.job.plan.seen):
+            scene = stylizer.job.scene.subset(self.shown).without_zero_bands()
             rasterizer = rasterizer_beside(stylizer, scene)
         self.views = Views(
             scene,
-            stylizer.views.cameras,
+            stylizer.job.views.cameras,
             rasterizer,
             self.loss,
-            covered=stylizer.plan.survey.covered,
-            weighted=stylizer.plan.weighted,
-            photos=stylizer.photos,
+            covered=stylizer.job.plan.survey.covered,
+            weighted=stylizer.job.plan.weighted,
+            photos=stylizer.job.photos,
             memory=memory,
             clamp_aware_gradient=settings.clamp_aware_gradient,
-            maps=stylizer.styles.maps(rasterizer, self.shown),
+            maps=stylizer.job.styles.maps(rasterizer, self.shown),
         )
 
     def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:
@@ -156,19 +147,19 @@ class Float32Reference(ExactLoss):
         """
         stylizer = self._stylizer
         if start or not stylizer.history:
-            index, phase = stylizer.views.covered[0], stylizer.schedule[0]
+            index, phase = stylizer.job.views.covered[0], stylizer.job.schedule[0]
         else:
             index, phase = stylizer.history[-1].view, stylizer.phase
-        scales = phase.scales(stylizer.scales(index))
-        colors = stylizer.scene.sh_dc if start else stylizer.stylized()
-        with stylizer.with_colors(colors) if start or stylizer.transfers_last else nullcontext():
+        scales = phase.scales(stylizer.job.scales(index))
+        colors = stylizer.job.scene.sh_dc if start else stylizer.stylized()
+        with stylizer.with_colors(colors) if start or stylizer.job.transfers_last else nullcontext():
             approximate, seconds = stylizer.gradient(index, scales)
         exact, seconds_exact = self.gradient(index, colors, scales)
-        seen = stylizer.plan.seen
+        seen = stylizer.job.plan.seen
         difference = Difference.of(approximate, exact[seen])
         return GradientError(
             0 if start else stylizer.step,
-            stylizer.views.cameras[index].name,
+            stylizer.job.views.cameras[index].name,
             difference.relative_error,
             difference.cosine,
             seconds,

@@ -27,6 +27,7 @@ from sgsst_core.quality.novel_views import NovelViews
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.evaluation import Evaluation
+from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.stylizer import Stylizer
 
 
@@ -58,7 +59,7 @@ class Measurements:
     def exact(self) -> Float32Reference:
         """Exact loss and gradient of the job."""
         if self._exact is None:
-            self._exact = Float32Reference(self._stylizer, measuring_memory(self._stylizer.memory))
+            self._exact = Float32Reference(self._stylizer, measuring_memory(self._stylizer.job.memory))
         return self._exact
 
     @property
@@ -66,13 +67,13 @@ class Measurements:
         """Level, which determines how much is measured."""
         measured = self._stylizer.measured
         # Checkpoints without a level measured everything.
-        return LEVELS[measured[0].get("level", 0) if measured else self._stylizer.plan.measuring]
+        return LEVELS[measured[0].get("level", 0) if measured else self._stylizer.job.plan.measuring]
 
     @property
     def moments(self) -> list[int]:
         """Steps after which the job is measured; empty if measuring is off."""
         stylizer = self._stylizer
-        return self.level.moments(stylizer.total) if stylizer.settings.measure else []
+        return self.level.moments(stylizer.job.total_steps) if stylizer.job.settings.measure else []
 
     def due(self, step: int) -> bool:
         """Return whether to measure the job after the given step."""
@@ -80,7 +81,7 @@ class Measurements:
 
     def seconds_left(self, step: int) -> float:
         """Predict the seconds of all measurements from a step on, including the loss before and after the job."""
-        expected, measured = self._stylizer.plan.prediction, self._stylizer.measured
+        expected, measured = self._stylizer.job.plan.prediction, self._stylizer.measured
         done = {entry["step"] for entry in measured}
         left = sum((moment >= step or not measured) and moment not in done for moment in self.moments)
         price: float
@@ -101,9 +102,9 @@ class Measurements:
             return stylizer.start()
         with stylizer.measuring():
             if not self.approximated:
-                return stylizer.evaluate(stylizer.evaluation_views, stylizer.shown())
-            colors = stylizer.scene.sh_dc if unstylized else stylizer.stylized()
-            return self.exact.evaluate(stylizer.evaluation_views, colors)
+                return stylizer.evaluate(stylizer.job.evaluation_views, stylizer.shown())
+            colors = stylizer.job.scene.sh_dc if unstylized else stylizer.stylized()
+            return self.exact.evaluate(stylizer.job.evaluation_views, colors)
 
     def at_the_end(self) -> None:
         """Measure the step at which the job stopped, if it has not been measured yet, and judge the result."""
@@ -117,7 +118,7 @@ class Measurements:
 
     def __call__(self, stylizer: Stylizer) -> None:
         """Measure the current colors if due, and the unstylized scene if it is required and not measured yet."""
-        if stylizer.step == stylizer.total:
+        if stylizer.step == stylizer.job.total_steps:
             stylizer.stylized()  # the result is needed anyway, so its time does not count as measuring
         with stylizer.measuring():
             self._measure_start()
@@ -130,12 +131,14 @@ class Measurements:
         The judgment is added to the last entry as "judged".
         """
         stylizer, novel_views = self._stylizer, self._novel_views_of_job()
-        if novel_views.lpips is None or stylizer.collectives.rank:
+        if novel_views.lpips is None or stylizer.job.collectives.rank:
             return
         views = [novel_views.cameras[index] for index in novel_views.views]
-        background = stylizer.settings.background
-        judge = Judge(novel_views.lpips, stylizer.styles, novel_views.scene, novel_views.rasterizer, views, background)
-        colors = {"before": stylizer.scene.sh_dc, "after": stylizer.stylized()}
+        background = stylizer.job.settings.background
+        judge = Judge(
+            novel_views.lpips, stylizer.job.styles, novel_views.scene, novel_views.rasterizer, views, background
+        )
+        colors = {"before": stylizer.job.scene.sh_dc, "after": stylizer.stylized()}
         found = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
         stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in found.items() if one} or None
 
@@ -151,8 +154,8 @@ class Measurements:
         if not stylizer.measured:
             stylized = stylizer.stylized()  # timed as part of this moment; later calls return the cached colors
             seconds = time.perf_counter() - started
-            own = self._first(stylizer.scene.sh_dc if start else stylized, seconds)
-        moment = self._moment(stylizer.scene.sh_dc if start else stylizer.stylized(), own, start=start)
+            own = self._first(stylizer.job.scene.sh_dc if start else stylized, seconds)
+        moment = self._moment(stylizer.job.scene.sh_dc if start else stylizer.stylized(), own, start=start)
         step = 0 if start else stylizer.step
         entry = {"step": step, "novel_views": moment, "approximation": approximation, **own}
         entry["seconds"] = time.perf_counter() - started
@@ -187,12 +190,12 @@ class Measurements:
             colors: Colors `sh_dc` [N, 3] to measure with.
             seconds: Time of a moment apart from its views.
         """
-        stylizer, place = self._stylizer, self._stylizer.plan.measuring
+        stylizer, place = self._stylizer, self._stylizer.job.plan.measuring
         again = 0.0
         if LEVELS[place].views and LEVELS[place].start:
             novel_views, prices = self._trial(colors, seconds)
             if novel_views.views:
-                place = stylizer.collectives.broadcast(lambda: self._affordable(place, prices))
+                place = stylizer.job.collectives.broadcast(lambda: self._affordable(place, prices))
                 again = prices.again(LEVELS[place])
             if LEVELS[place].views == 1:
                 self._novel_views = novel_views
@@ -207,7 +210,9 @@ class Measurements:
             colors: Colors `sh_dc` [N, 3] to measure with.
             seconds: Time of a moment apart from its views.
         """
-        lpips = load_lpips_or_none(self._stylizer.network.device)  # loaded before the clock starts: not a cost per view
+        lpips = load_lpips_or_none(
+            self._stylizer.job.network.device
+        )  # loaded before the clock starts: not a cost per view
         clock = [time.perf_counter()]
         novel_views = self._make(1, lpips)
         for _ in range(2 if novel_views.views else 0):  # the first pass includes intersections, depth and warps
@@ -222,21 +227,21 @@ class Measurements:
 
         The times include no compilation, because some steps have already run.
         """
-        stylizer, expected = self._stylizer, self._stylizer.plan.prediction
+        stylizer, expected = self._stylizer, self._stylizer.job.plan.prediction
         if expected is None:
             return place
-        allowed = novel_view_seconds(stylizer.settings.measure, expected)
+        allowed = novel_view_seconds(stylizer.job.settings.measure, expected)
         # One view is already prepared, so measuring it at the end is always affordable.
-        return min(choose_level(prices, allowed, stylizer.total, place), NOTHING - 1)
+        return min(choose_level(prices, allowed, stylizer.job.total_steps, place), NOTHING - 1)
 
-    def _source_of_statistics(self) -> Stylizer | ExactLoss:
+    def _source_of_statistics(self) -> StylizationJob | ExactLoss:
         """Return the object whose loss and style targets define Gram distances.
 
         Its features are float32, and it has Gram statistics even if the job optimizes another loss.
         """
-        if not has_statistics(self._stylizer.settings.style_loss):
+        if not has_statistics(self._stylizer.job.settings.style_loss):
             return ExactLoss(self._stylizer, "sos")
-        return self.exact if self._stylizer.network.precision != "float32" else self._stylizer
+        return self.exact if self._stylizer.job.network.precision != "float32" else self._stylizer.job
 
     def _novel_views_of_job(self) -> NovelViews:
         if self._novel_views is None:
@@ -247,23 +252,23 @@ class Measurements:
         """Create the novel views of the job, at most `views` of them."""
         stylizer = self._stylizer
         if self._seen_by is None:
-            scene = stylizer.scene.without_zero_bands()
+            scene = stylizer.job.scene.without_zero_bands()
             self._seen_by = scene, rasterizer_beside(stylizer, scene)
         scene, rasterizer = self._seen_by
         source = self._source_of_statistics()
         first = stylizer.measured[0]["novel_views"] if stylizer.measured else None
         return NovelViews(
-            stylizer.views.cameras,
-            stylizer.views.covered,
+            stylizer.job.views.cameras,
+            stylizer.job.views.covered,
             scene,
             rasterizer,
             source.loss,
             source.style_targets,
-            weighted=stylizer.plan.weighted,
-            lpips=lpips or load_lpips_or_none(stylizer.network.device),
-            memory=measuring_memory(stylizer.memory),
+            weighted=stylizer.job.plan.weighted,
+            lpips=lpips or load_lpips_or_none(stylizer.job.network.device),
+            memory=measuring_memory(stylizer.job.memory),
             first={int(scale): value for scale, value in first["gram"].items()} if first else None,
             most=views,
             rasterizer_of=partial(rasterizer_beside, stylizer),
-            maps=stylizer.styles.maps(rasterizer),
+            maps=stylizer.job.styles.maps(rasterizer),
         )

@@ -35,17 +35,19 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
     Raises:
         OutputError: If the file cannot be written.
     """
-    views = stylizer.views
+    views = stylizer.job.views
     device = views.rasterizer.device
     pairs = []
     with torch.no_grad():
-        for index in stylizer.evaluation_views:
+        for index in stylizer.job.evaluation_views:
             dcs = (views.scene.sh_dc.to(device), stylizer.shown())
             # Call the rasterizer directly, because only one rank writes the sheet and the other ranks do not render.
             camera = views.cameras[index]
             renders = [_picture(views.rasterizer.render(views.colors(index, dc), camera)) for dc in dcs]
             pairs.append((camera, renders))
-    sheet = _sheet(_stacked([_picture(picture) for style in stylizer.styles.all for picture in style.images]), pairs)
+    sheet = _sheet(
+        _stacked([_picture(picture) for style in stylizer.job.styles.all for picture in style.images]), pairs
+    )
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
 

@@ -73,36 +73,36 @@ def build_report(
         **_outcome_json(stylizer, stopped, before, after),
         "findings": [asdict(finding) for finding in findings],
         **_inputs_json(stylizer, sources),
-        "plan": {**stylizer.plan.as_dict(), "measured": _measured(stylizer)},
-        "rasterizer": stylizer.views.rasterizer.name,
+        "plan": {**stylizer.job.plan.as_dict(), "measured": _measured(stylizer)},
+        "rasterizer": stylizer.job.views.rasterizer.name,
         "memory": {
-            "limit_bytes": stylizer.memory,
+            "limit_bytes": stylizer.job.memory,
             "peak_bytes": peak_memory(),
-            "device_peak_bytes": device_peak(stylizer.network.device),
+            "device_peak_bytes": device_peak(stylizer.job.network.device),
         },
         "graphs": _graphs_json(stylizer),
-        "machine": machine(stylizer.network.device),
-        "history": [_record_json(record, before, stylizer.loss.weights) for record in stylizer.history],
+        "machine": machine(stylizer.job.network.device),
+        "history": [_record_json(record, before, stylizer.job.loss.weights) for record in stylizer.history],
     }
 
 
 def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, after: Evaluation) -> dict[str, Any]:
     """Return program, time, losses and measurements of a job."""
     coarse = sum(record.stage == "coarse" for record in stylizer.history)
-    weights = stylizer.loss.weights
+    weights = stylizer.job.loss.weights
     return {
         "version": REPORT_VERSION,
         "program": {"name": "sgsst-service", "version": program_version()},
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "stopped": stopped,
         "steps": {
-            "coarse": {"planned": stylizer.plan.steps_coarse, "done": coarse},
-            "sos": {"planned": stylizer.settings.steps_sos, "done": len(stylizer.history) - coarse},
+            "coarse": {"planned": stylizer.job.plan.steps_coarse, "done": coarse},
+            "sos": {"planned": stylizer.job.settings.steps_sos, "done": len(stylizer.history) - coarse},
         },
         "seconds": round(stylizer.seconds, 3),
         "seconds_by_part": {name: round(seconds, 3) for name, seconds in sorted(stylizer.seconds_by_part.items())},
         "loss": {
-            "views": [stylizer.views.cameras[index].name for index in stylizer.evaluation_views],
+            "views": [stylizer.job.views.cameras[index].name for index in stylizer.job.evaluation_views],
             "before": _evaluation_json(before, weights),
             "after": _evaluation_json(after, weights),
             "relative": mean_loss(after, weights) / mean_loss(before, weights),
@@ -119,34 +119,34 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
     """Return settings and inputs of a job."""
     backbone, styles = sources.backbone, _styles_json(stylizer, sources)
     return {
-        "settings": stylizer.settings.model_dump(mode="json"),
+        "settings": stylizer.job.settings.model_dump(mode="json"),
         "backbone": {
             "name": backbone.name,
             "source": backbone.source,
             "sha256": backbone.sha256,
-            "scales": stylizer.weights.scales,
+            "scales": stylizer.job.weights.scales,
         },
         "scene": {
             "path": str(sources.scene),
-            "gaussians": len(stylizer.scene),
-            "sh_degree": stylizer.sh_degree,
+            "gaussians": len(stylizer.job.scene),
+            "sh_degree": stylizer.job.sh_degree,
             "dropped": sources.dropped,
-            "refined": _refined_json(stylizer.plan),
+            "refined": _refined_json(stylizer.job.plan),
         },
         "style": {name: styles[0][name] for name in ("path", "width", "height")},
         "styles": styles,
         "regions": _regions_json(stylizer),
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
-            "used": stylizer.views.weighted,
-            "uncovered_share": round(stylizer.plan.survey.uncovered_share, 6),
+            "used": stylizer.job.views.weighted,
+            "uncovered_share": round(stylizer.job.plan.survey.uncovered_share, 6),
         },
     }
 
 
 def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
     """Return the style images that the job used, with their sizes and weights."""
-    style, regions, paths = stylizer.style, stylizer.regions, sources.styles
+    style, regions, paths = stylizer.job.style, stylizer.job.regions, sources.styles
     if regions is not None and not regions.mapped and regions.every[regions.active[0]].style is not None:
         paths = tuple(map(Path, style.names))  # a single active region with its own style covers the whole scene
     return [
@@ -157,10 +157,10 @@ def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
 
 def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
     """Return the regions of the scene, background first; empty if there are none."""
-    regions = stylizer.regions
+    regions = stylizer.job.regions
     if regions is None:
         return []
-    weights = stylizer.plan.survey.total_blend_weights
+    weights = stylizer.job.plan.survey.total_blend_weights
     return [
         {
             "name": region.name,
@@ -199,7 +199,7 @@ def plan_json(plan: Plan) -> dict[str, Any]:
 
 def _graphs_json(stylizer: Stylizer) -> dict[str, Any] | None:
     """Return the state of the CUDA graphs of the loss; None if the plan does not use any."""
-    graphs = stylizer.graphs
+    graphs = stylizer.job.graphs
     return None if graphs is None else {"captured": graphs.captured, "problem": graphs.problem}
 
 
@@ -214,7 +214,7 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
     """
     seconds, first_visits = zip(*(_step_seconds(stylizer, stage) for stage in ("sos", "coarse")), strict=True)
     waited = [record.parts.get("communication", 0.0) for record in stylizer.history if record.stage == "sos"]
-    expected = stylizer.plan.prediction
+    expected = stylizer.job.plan.prediction
     one_rank = expected.seconds_one_rank if expected else None
     return {
         "seconds": seconds[0],
@@ -224,7 +224,7 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
         "communication": median(waited) if waited else None,
         "speed_up": one_rank / seconds[0] if one_rank and seconds[0] else None,
         "peak_bytes": peak_memory(),
-        "device_bytes": device_peak(stylizer.network.device),
+        "device_bytes": device_peak(stylizer.job.network.device),
         "measuring": stylizer.seconds_by_part.get("measuring"),
     }
 
@@ -249,7 +249,7 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float |
             visited.add(record.view)
             bare.append(sum(seconds for name, seconds in record.parts.items() if name != "prepare"))
         before = record.seconds
-    if stylizer.settings.views_per_step > 1 or not again:
+    if stylizer.job.settings.views_per_step > 1 or not again:
         return (median(bare) if bare else None), None
     known = median(again)
     first = first[1:] if stylizer.history[0].stage == stage and len(first) > 1 else first
@@ -258,14 +258,14 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float |
 
 def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
     """Return the number of measurements, their time, and its ratio to the time of the steps."""
-    seconds, expected = stylizer.seconds_by_part.get("measuring", 0.0), stylizer.plan.prediction
-    share = stylizer.settings.measure
+    seconds, expected = stylizer.seconds_by_part.get("measuring", 0.0), stylizer.job.plan.prediction
+    share = stylizer.job.settings.measure
     return {
         "share": share,
         "allowed": allowed_seconds(share, expected.job - expected.measuring) if expected else None,
         "seconds": round(seconds, 3),
         "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
-        "loss_views": len(stylizer.evaluation_views),
+        "loss_views": len(stylizer.job.evaluation_views),
         "novel_view_count": len(stylizer.measured[0].get("novel_view_names", [])) if stylizer.measured else 0,
         "moments": [
             {"step": entry["step"], "seconds": round(entry["seconds"], 3) if "seconds" in entry else None}
@@ -300,8 +300,8 @@ def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
     records = [record for record in stylizer.history if record.stage == "sos"]
     if not records:
         return None
-    start, losses = mean_loss(before, stylizer.loss.weights), [record.loss for record in records]
-    length = stylizer.round_length
+    start, losses = mean_loss(before, stylizer.job.loss.weights), [record.loss for record in records]
+    length = stylizer.job.round_length
     relative = [smoothed(losses[max(0, end - length) : end], length) / start for end in range(1, len(losses) + 1)]
     reached = []
     for wanted in _REACHED:
@@ -332,8 +332,8 @@ def approximations_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | 
 
 
 def _cameras_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
-    cameras = stylizer.views.cameras
-    covered = set(stylizer.views.covered)
+    cameras = stylizer.job.views.cameras
+    covered = set(stylizer.job.views.covered)
     return {
         "path": str(sources.cameras) if sources.cameras else None,
         "form": "file" if sources.cameras else "orbit",

@@ -95,7 +95,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     try:
         return _iterate(stylizer, callbacks or Callbacks())
     finally:
-        stylizer.views.end_look_ahead()
+        stylizer.job.views.end_look_ahead()
 
 
 def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
@@ -105,8 +105,8 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
     if callbacks.preview and not stylizer.step:
         callbacks.preview(stylizer)
     _measure(stylizer, callbacks)  # a resumed job may have been stopped before this measurement
-    while stylizer.step < stylizer.total:
-        reason = stylizer.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
+    while stylizer.step < stylizer.job.total_steps:
+        reason = stylizer.job.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
         if reason:
             return _end_early(stylizer, callbacks, reason)
         _step(stylizer, pace)
@@ -128,23 +128,23 @@ def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
     """Return the reason if the user or the time limit ends the run before the next step. Ranks may disagree."""
     if callbacks.stop and callbacks.stop():
         return "interrupted"
-    seconds = stylizer.settings.max_seconds
+    seconds = stylizer.job.settings.max_seconds
     return "max-seconds" if seconds and stylizer.seconds >= seconds else None
 
 
 def _enough(stylizer: Stylizer) -> Stopped | None:
     """Return the reason if the losses end the run before the next step. Ranks always agree."""
-    settings = stylizer.settings
+    settings = stylizer.job.settings
     if not (settings.target_loss or settings.early_stop):
         return None
     losses = [record.loss for record in stylizer.history if record.stage == "sos"]
-    if settings.target_loss and len(losses) >= stylizer.round_length:  # all views have been visited at this point
-        target = settings.target_loss * mean_loss(stylizer.start(), stylizer.loss.weights)
-        if stylizer.plan.training_background != "background":
+    if settings.target_loss and len(losses) >= stylizer.job.round_length:  # all views have been visited at this point
+        target = settings.target_loss * mean_loss(stylizer.start(), stylizer.job.loss.weights)
+        if stylizer.job.plan.training_background != "background":
             losses = _losses_on_background(stylizer)
-        if has_reached(losses, target, stylizer.round_length):
+        if has_reached(losses, target, stylizer.job.round_length):
             return "target-loss"
-    return "converged" if stylizer.stops_early and has_converged(losses, stylizer.round_length) else None
+    return "converged" if stylizer.job.stops_early and has_converged(losses, stylizer.job.round_length) else None
 
 
 def _losses_on_background(stylizer: Stylizer) -> list[float]:
@@ -153,10 +153,12 @@ def _losses_on_background(stylizer: Stylizer) -> list[float]:
     Losses of steps with different backgrounds are not comparable, so the loss is evaluated at the end of each round, in
     the same way as the initial loss.
     """
-    if stylizer.step % stylizer.round_length:
+    if stylizer.step % stylizer.job.round_length:
         return []
     with stylizer.measuring():
-        return [mean_loss(stylizer.evaluate(stylizer.evaluation_views), stylizer.loss.weights)] * stylizer.round_length
+        return [
+            mean_loss(stylizer.evaluate(stylizer.job.evaluation_views), stylizer.job.loss.weights)
+        ] * stylizer.job.round_length
 
 
 def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
@@ -167,14 +169,14 @@ def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
 
 def _pace(stylizer: Stylizer) -> SecondsLeft:
     """Return the estimator of the remaining time, including the steps of earlier sessions."""
-    expected = stylizer.plan.prediction or Prediction(0.0, 0.0, 0)
+    expected = stylizer.job.plan.prediction or Prediction(0.0, 0.0, 0)
     seconds = {
         "coarse": (expected.seconds_coarse, expected.first_visit_coarse),
         "sos": (expected.seconds, expected.first_visit),
     }
-    phases = [ExpectedPhase(phase.stage, phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.schedule]
-    views_per_step = stylizer.settings.views_per_step
-    pace = SecondsLeft(phases, stylizer.views.covered, views_per_step)
+    phases = [ExpectedPhase(phase.stage, phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.job.schedule]
+    views_per_step = stylizer.job.settings.views_per_step
+    pace = SecondsLeft(phases, stylizer.job.views.covered, views_per_step)
     if views_per_step == 1:  # a record names only one view of its step
         before = 0.0
         for record in stylizer.history:
@@ -186,17 +188,17 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
 
 def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
     """Run and time one step, without the one-off style setup."""
-    before, style_before = stylizer.seconds, stylizer.style_seconds
+    before, style_before = stylizer.seconds, stylizer.job.style_targets.seconds
     record = stylizer.run_step()
-    style = stylizer.style_seconds - style_before
+    style = stylizer.job.style_targets.seconds - style_before
     seconds = stylizer.seconds - before - style
     prepared = max(record.parts.get("prepare", 0.0) - style, 0.0)
     pace.add_step(record.stage, stylizer.latest, seconds, prepared)
 
 
 def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Progress:
-    record, most, measure = stylizer.history[-1], stylizer.settings.max_seconds, callbacks.measure
-    expected = stylizer.plan.prediction
+    record, most, measure = stylizer.history[-1], stylizer.job.settings.max_seconds, callbacks.measure
+    expected = stylizer.job.plan.prediction
     left = pace.left(
         stylizer.step,
         stylizer.coming,
@@ -208,7 +210,7 @@ def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Pr
         left += expected.ending
     terms = record.terms
     scales = tuple(terms[scale].total if scale in terms else None for scale in range(max(terms, default=-1) + 1))
-    return Progress(stage, record.step, stylizer.total, record.loss, stylizer.seconds, left, scales)
+    return Progress(stage, record.step, stylizer.job.total_steps, record.loss, stylizer.seconds, left, scales)
 
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:

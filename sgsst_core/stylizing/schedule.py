@@ -50,6 +50,30 @@ def drawn_round(covered: Sequence[int], generator: torch.Generator) -> list[int]
     return [covered[i] for i in torch.randperm(len(covered), generator=generator).tolist()]
 
 
+class ViewOrder:
+    """Random order of the views of a job, in which every view comes once before any comes again.
+
+    Args:
+        covered: Indices of the views.
+        seed: Seed of the order.
+
+    Attributes:
+        generator: Random generator, part of checkpoints.
+        left: Remaining views of this round, next one last; part of checkpoints.
+    """
+
+    def __init__(self, covered: Sequence[int], seed: int) -> None:
+        self.generator = torch.Generator().manual_seed(seed)
+        self.left: list[int] = []
+        self._covered = covered
+
+    def next_view(self) -> int:
+        """Remove and return the next view; draw a new round only when it is needed, because checkpoints store it."""
+        if not self.left:
+            self.left = drawn_round(self._covered, self.generator)
+        return self.left.pop()
+
+
 def drawn_views(covered: Sequence[int], seed: int) -> Iterator[int]:
     """Yield the views of all steps of a job from its start, round after round."""
     generator = torch.Generator().manual_seed(seed)

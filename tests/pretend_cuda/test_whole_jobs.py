@@ -76,11 +76,11 @@ def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, se
     """Run survey, plan, both phases, measurements, a checkpoint, a resumed job and the report."""
     asked = request_(tmp_path, scan=scan, preset=preset, **settings)
     first = prepare(asked)
-    plan = first.stylizer.plan
+    plan = first.stylizer.job.plan
     assert (plan.device, plan.uncached, plan.weighted) == ("cuda", "triton", scan)
     assert go_on(first, steps=1).stopped == "interrupted"
     second = prepare(asked, resume=Resume(True))
-    assert second.stylizer.plan.rasterizer == plan.rasterizer
+    assert second.stylizer.job.plan.rasterizer == plan.rasterizer
     result = go_on(second)
     assert (result.stopped, result.step, result.report_error) == ("finished", 4, None)
     assert result.bought is not None
@@ -96,10 +96,10 @@ def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: P
     """The first step of a view has one more wait, because it builds the tile intersections."""
     settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}
     stylizer = prepare(request_(tmp_path, scan=scan, size=(64, 48), **settings)).stylizer
-    assert stylizer.scale_count(0) == 3
-    assert stylizer.plan.weighted == scan
+    assert stylizer.job.scale_count(0) == 3
+    assert stylizer.job.plan.weighted == scan
     seen: set[int] = set()
-    for _ in range(stylizer.total):
+    for _ in range(stylizer.job.total_steps):
         counts.clear()
         record = stylizer.run_step()
         first = record.view not in seen
@@ -120,11 +120,11 @@ def in_regions(asked: StylizeRequest) -> StylizeRequest:
 @pytest.mark.slow
 def test_regions_wait_for_nothing_more(counts: Counts, tmp_path: Path) -> None:
     stylizer = prepare(in_regions(request_(tmp_path, size=(64, 48), steps_coarse=2, steps_sos=4))).stylizer
-    assert stylizer.plan.device == "cuda"
-    assert stylizer.regions is not None
-    kept, before = stylizer.regions.frozen[stylizer.plan.seen], stylizer.sh_dc.detach().cpu().clone()
+    assert stylizer.job.plan.device == "cuda"
+    assert stylizer.job.regions is not None
+    kept, before = stylizer.job.regions.frozen[stylizer.job.plan.seen], stylizer.sh_dc.detach().cpu().clone()
     seen: set[int] = set()
-    for _ in range(stylizer.total):
+    for _ in range(stylizer.job.total_steps):
         counts.clear()
         record = stylizer.run_step()
         first = record.view not in seen
@@ -142,7 +142,7 @@ def test_losses_of_regions_are_those_of_the_cpu(tmp_path: Path) -> None:
     expected = prepare(asked).stylizer
     with pretend_cuda():
         found = prepare(asked).stylizer
-        for _ in range(expected.total):
+        for _ in range(expected.job.total_steps):
             assert found.run_step().loss == pytest.approx(expected.run_step().loss, rel=2e-4)
 
 
@@ -158,7 +158,7 @@ def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> No
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
     weights = networks.comparing_pixels(networks.tiny_weights("vgg19"))
     stylizer = Stylizer.planned(scene, cameras(1, 64, 64), style(), settings, weights=weights)
-    assert stylizer.scale_count(0) == 3
+    assert stylizer.job.scale_count(0) == 3
     for _ in range(2):
         counts.clear()
         stylizer.run_step()
@@ -173,12 +173,12 @@ def test_losses_are_those_of_the_cpu(tmp_path: Path) -> None:
     expected = prepare(asked).stylizer
     with pretend_cuda():
         found = prepare(asked).stylizer
-        for _ in range(expected.total):
+        for _ in range(expected.job.total_steps):
             theirs, ours = expected.run_step(), found.run_step()
             assert ours.view == theirs.view
             assert ours.loss == pytest.approx(theirs.loss, rel=2e-4)
-    assert found.plan.device == "cuda"
-    assert expected.plan.device == "cpu"
+    assert found.job.plan.device == "cuda"
+    assert expected.job.plan.device == "cpu"
 
 
 def test_a_gradient_that_cannot_be_squared_changes_nothing(counts: Counts, tmp_path: Path) -> None:

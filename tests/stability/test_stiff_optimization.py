@@ -31,7 +31,7 @@ def test_hardly_seen_gaussians_move_as_fast_as_well_seen_ones() -> None:
     stylizer = optimization._stylizer(
         optimization._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5)), 3, learning_rate=0.05, bounded=False
     )
-    weights = stylizer.plan.survey.total_blend_weights[stylizer.plan.seen]
+    weights = stylizer.job.plan.survey.total_blend_weights[stylizer.job.plan.seen]
     before = stylizer.sh_dc.detach().clone()
     stylizer.run_step()
     change = (stylizer.sh_dc.detach() - before).abs().amax(1)

@@ -68,8 +68,8 @@ def test_planning_is_shown_and_a_resumed_job_follows_the_plan_of_the_first(
     assert len(planned) == 4, "nothing is looked at again"
     assert second.resumed is not None
     assert second.resumed.state.step == 3
-    assert second.stylizer.plan == second.resumed.plan
-    assert second.stylizer.plan.prediction == first.stylizer.plan.prediction
+    assert second.stylizer.job.plan == second.resumed.plan
+    assert second.stylizer.job.plan.prediction == first.stylizer.job.plan.prediction
     assert go_on(second).stopped == "finished"
     assert request_.out.read_bytes() == whole.out.read_bytes()
     assert not Path(request_.out).with_name("s.checkpoint.safetensors").exists()
@@ -84,9 +84,12 @@ def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: Stylize
     plan = replace(kept.plan, device="cuda", rasterizer="cuda")
     save_checkpoint(first.outputs.checkpoint, replace(kept, plan=plan), first.fingerprint)
     second = prepare(request_, resume=Resume(True))
-    assert (second.stylizer.plan.device, second.stylizer.plan.rasterizer) == ("cpu", first.stylizer.plan.rasterizer)
+    assert (second.stylizer.job.plan.device, second.stylizer.job.plan.rasterizer) == (
+        "cpu",
+        first.stylizer.job.plan.rasterizer,
+    )
     assert second.resumed is not None
-    assert second.stylizer.plan.survey is second.resumed.plan.survey
+    assert second.stylizer.job.plan.survey is second.resumed.plan.survey
     assert go_on(second).stopped == "finished"
 
 
@@ -125,7 +128,7 @@ def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_pat
 def test_planning_is_shown(request_: StylizeRequest) -> None:
     told: list[PlanningProgress] = []
     job = prepare(request_, show_planning=told.append)
-    views = len(job.stylizer.views)
+    views = len(job.stylizer.job.views)
     assert [progress.done for progress in told] == list(range(views + 1))
 
 
@@ -172,7 +175,7 @@ def test_a_rasterizer_that_does_not_work_here_is_planned_anew(request_: StylizeR
     again = prepare(request_, resume=Resume(True))
     assert again.resumed is not None
     assert again.resumed.plan.rasterizer == "cuda"
-    assert again.stylizer.plan.rasterizer == saved.plan.rasterizer
+    assert again.stylizer.job.plan.rasterizer == saved.plan.rasterizer
     assert go_on(again).stopped == "finished"
 
 

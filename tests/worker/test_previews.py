@@ -31,9 +31,11 @@ def test_the_first_preview_shows_the_colors_of_a_warm_start_before_any_step(
     assert written == [(0, tmp_path / "previews" / "step_0000000.jpg")], "and none before the hour is over"
     assert not missing
 
-    index = stylizer.evaluation_views[0]
-    wanted = warm_start(scene.sh_dc, stylizer.plan.survey.total_blend_weights, stylizer.style)[stylizer.plan.seen]
-    views = stylizer.views
+    index = stylizer.job.evaluation_views[0]
+    wanted = warm_start(scene.sh_dc, stylizer.job.plan.survey.total_blend_weights, stylizer.job.style)[
+        stylizer.job.plan.seen
+    ]
+    views = stylizer.job.views
     save_jpg(tmp_path / "wanted.jpg", views.rasterizer.render(views.colors(index, wanted), views.cameras[index]))
     found, expected = (np.asarray(Image.open(path)) for path in (written[0][1], tmp_path / "wanted.jpg"))
     np.testing.assert_array_equal(found, expected)

@@ -230,7 +230,7 @@ def _chroma(full: bool) -> CaseResult:
     sizes = torch.logspace(-6, 3, 60)[:, None]
     scene = replace(scene, sh_dc=scene.sh_dc * sizes)
     job = make(Situation(scene, texture(30, 26, 7), {"preserve_colors": "luminance", "steps_sos": 20 if full else 4}))
-    while job.step < job.total:
+    while job.step < job.job.total_steps:
         job.run_step()
     found = job.stylized().double()
     change = found - scene.sh_dc.double()

@@ -95,13 +95,13 @@ def _style() -> Tensor:
 
 
 def _last_picture(stylizer: Stylizer) -> Tensor:
-    return stylizer.views.render(0, stylizer.views.colors(0, stylizer.sh_dc.detach()))
+    return stylizer.job.views.render(0, stylizer.job.views.colors(0, stylizer.sh_dc.detach()))
 
 
 def _at_the_end(stylizer: Stylizer, note: str) -> CaseResult:
     if not bool(torch.isfinite(stylizer.sh_dc).all()):
         return CaseResult(math.inf, 0.0, "colors are not finite")
-    content = stylizer.views.content(0)
+    content = stylizer.job.views.content(0)
     result = compare_losses(_last_picture(stylizer), _style(), content)
     return CaseResult(result.error, result.bound, note)
 
@@ -117,7 +117,7 @@ def _weights(full: bool) -> CaseResult:
     faint = math.log(1.1 * ALPHA_MIN / (1 - 1.1 * ALPHA_MIN))
     scene = _walls((2.0, 5), (3.0, 1), (faint, 5), (2.0, 5), (1.0, 5), (faint, 8))
     stylizer = _stylizer(scene, 2000 if full else 200, learning_rate=0.05)
-    total = stylizer.plan.survey.total_blend_weights[stylizer.plan.seen]
+    total = stylizer.job.plan.survey.total_blend_weights[stylizer.job.plan.seen]
     run(stylizer)
     hardly, well = total < HARDLY_SEEN, total > 1
     if float(total.min()) < ALPHA_MIN * TRANSMITTANCE_MIN:
@@ -197,11 +197,13 @@ def _many_steps(full: bool) -> CaseResult:
     run(stylizer)
     if not bool(torch.isfinite(stylizer.sh_dc).all()):
         return CaseResult(math.inf, 0.0, "colors are not finite")
-    window = max(stylizer.total // 50, 1)
+    window = max(stylizer.job.total_steps // 50, 1)
     losses = torch.tensor([record.loss for record in stylizer.history], dtype=torch.float64)
     levels = losses.view(-1, window).mean(1)
     rise = float(levels[-1] / levels.min()) - 1
-    return CaseResult(rise, 0.05, f"{stylizer.total} steps; loss {float(levels[-1] / losses[0]):.2g} of the first")
+    return CaseResult(
+        rise, 0.05, f"{stylizer.job.total_steps} steps; loss {float(levels[-1] / losses[0]):.2g} of the first"
+    )
 
 
 def _resumed(full: bool) -> CaseResult:
@@ -211,7 +213,7 @@ def _resumed(full: bool) -> CaseResult:
         first.run_step()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.safetensors"
-        save_checkpoint(path, Checkpoint(first.state(), first.plan, 1, "run", versions()), "job")
+        save_checkpoint(path, Checkpoint(first.state(), first.job.plan, 1, "run", versions()), "job")
         second.load_state(load_checkpoint(path, "job").state)
     run(second)
     return CaseResult(float((whole.sh_dc - second.sh_dc).detach().abs().max()), 0.0, "the same bits")

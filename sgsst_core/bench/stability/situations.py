@@ -145,20 +145,21 @@ def strain(situation: Situation) -> CaseResult:
     """
     jobs = [make(situation) for _ in range(2)]
     begun = jobs[0].sh_dc.detach().clone()
-    before = mean_loss(jobs[0].evaluate(jobs[0].evaluation_views), jobs[0].loss.weights)
+    before = mean_loss(jobs[0].evaluate(jobs[0].job.evaluation_views), jobs[0].job.loss.weights)
     for job in jobs:
         run(job)
     job = jobs[0]
-    after = mean_loss(job.evaluate(job.evaluation_views), job.loss.weights)
+    after = mean_loss(job.evaluate(job.job.evaluation_views), job.job.loss.weights)
     colors, moved = job.stylized(), _moved(job, begun)
-    judged = job.plan.training_background == "background"  # other backgrounds change the loss of the steps
-    most = job.total * job.settings.learning_rate * LONGEST_STEP
+    judged = job.job.plan.training_background == "background"  # other backgrounds change the loss of the steps
+    most = job.job.total_steps * job.job.settings.learning_rate * LONGEST_STEP
     broken = [
         what
         for what, holds in {
             "colors are not finite": bool(torch.isfinite(colors).all()) and math.isfinite(moved),
             "the loss is not finite": math.isfinite(before) and math.isfinite(after),
-            f"colors moved by {moved:.3g} in {job.total} steps": moved <= most + 1e-5 * float(begun.abs().max()),
+            f"colors moved by {moved:.3g} in {job.job.total_steps} steps": moved
+            <= most + 1e-5 * float(begun.abs().max()),
             "another run has other bits": torch.equal(colors, jobs[1].stylized()),
             f"the loss rose from {before:.6g} to {after:.6g}": not (situation.falls and judged)
             or after <= max((1 + RISE) * before, NO_LOSS),
@@ -173,8 +174,8 @@ def strain(situation: Situation) -> CaseResult:
 def _moved(job: Stylizer, begun: Tensor) -> float:
     """Return the largest change of a coefficient, ignoring the clamping of initial colors to their bounds."""
     found = job.sh_dc.detach()
-    chroma_of = begun if job.settings.preserve_colors == "luminance" else None
-    within = constrained(begun, chroma_of, bounded=job.settings.bounded)
+    chroma_of = begun if job.job.settings.preserve_colors == "luminance" else None
+    within = constrained(begun, chroma_of, bounded=job.job.settings.bounded)
     return float(torch.minimum((found - begun).abs(), (found - within).abs()).max())
 
 
@@ -191,12 +192,12 @@ def reference_error(job: Stylizer) -> tuple[float, float, int]:
     Returns:
         Relative error, allowed error, and number of flipped ReLU and pool decisions.
     """
-    index = job.views.covered[0]
-    picture = job.views.render(index, job.views.colors(index, job.sh_dc.detach()))
-    content = job.views.content(index)
-    coverage = job.views.coverage(index)[0] if job.views.weighted else None
-    double = DecisionsOf(job.weights, job.network)
-    given, weight = (picture, content, coverage), job.settings.content_weight
+    index = job.job.views.covered[0]
+    picture = job.job.views.render(index, job.job.views.colors(index, job.sh_dc.detach()))
+    content = job.job.views.content(index)
+    coverage = job.job.views.coverage(index)[0] if job.job.views.weighted else None
+    double = DecisionsOf(job.job.weights, job.job.network)
+    given, weight = (picture, content, coverage), job.job.settings.content_weight
     found, exact = _evaluate_both(job, double, *given, weight)
     uncertain = _rounding_of_content(job, exact, content)
     if uncertain > _MOST_UNCERTAIN and _content_is_rounding(job, found, exact, content):
@@ -206,9 +207,9 @@ def reference_error(job: Stylizer) -> tuple[float, float, int]:
     assert exact.image_gradient is not None
     if not bool(torch.isfinite(found.image_gradient).all()):
         return math.inf, REFERENCE_BOUND, double.flips
-    rounding = nearest_weight(job.loss.style_loss, job.loss.network.unit) * _ROUNDING_OF_COSINES
+    rounding = nearest_weight(job.job.loss.style_loss, job.job.loss.network.unit) * _ROUNDING_OF_COSINES
     error = max(abs(found.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
-    if job.loss.style_loss == "sos":
+    if job.job.loss.style_loss == "sos":
         off = float((found.image_gradient.double() - exact.image_gradient).norm())
         error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
         uncertain = max(uncertain, _rounding_of_features(job, exact, given, weight))
@@ -223,7 +224,7 @@ def _rounding_of_features(
     The change is large if the style loss is a difference of nearly equal statistics, or if a standard deviation is
     hardly larger than the rounding of the features.
     """
-    rounded = _Rounded(job.weights, job.network)
+    rounded = _Rounded(job.job.weights, job.job.network)
     _, found = _evaluate_both(job, rounded, *given, content_weight)
     assert found.image_gradient is not None
     assert exact.image_gradient is not None
@@ -248,7 +249,7 @@ class _Rounded(DecisionsOf):
 
 def _feature_rounding(job: Stylizer, content: Tensor) -> float:
     """Return the rounding error of a difference of float32 content features."""
-    features = job.network.forward(content, keep=False).features[CONTENT_LAYER]
+    features = job.job.network.forward(content, keep=False).features[CONTENT_LAYER]
     return _FEATURE_ROUNDING * float(features.square().mean().sqrt()) if features.numel() else 0.0
 
 
@@ -258,7 +259,7 @@ def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> fl
     The magnitude of the feature differences d follows from E_c = lambda mean(d^2). If d has an error of delta, E_c has
     a relative error of 2 delta / d.
     """
-    weight = job.settings.content_weight
+    weight = job.job.settings.content_weight
     rounding = _feature_rounding(job, content) if weight else 0.0
     terms = [each["content"] for each in exact.terms.values() if each["content"] > 0]
     return max((2 * rounding * math.sqrt(weight / term) for term in terms), default=0.0)
@@ -269,7 +270,7 @@ def _content_is_rounding(job: Stylizer, found: SosResult, exact: SosResult, cont
 
     If the feature differences d have an error of delta, the term is lambda mean((d + delta)^2).
     """
-    most = 2 * job.settings.content_weight * _feature_rounding(job, content) ** 2
+    most = 2 * job.job.settings.content_weight * _feature_rounding(job, content) ** 2
     return all(terms["content"] <= 2 * exact.terms[scale]["content"] + most for scale, terms in found.terms.items())
 
 
@@ -283,7 +284,7 @@ def _evaluate_both(
 ) -> tuple[SosResult, SosResult]:
     """Return the loss of an image by the job's network, and in float64 with the same ReLU and pool decisions."""
     with double.listening():
-        found = _evaluate(job, job.network, picture, content, coverage, content_weight)
+        found = _evaluate(job, job.job.network, picture, content, coverage, content_weight)
     return found, _evaluate(job, double, picture, content, coverage, content_weight)
 
 
@@ -296,15 +297,15 @@ def _evaluate(
     content_weight: float,
 ) -> SosResult:
     """Return the job's loss of an image by a given network."""
-    settings = job.settings
+    settings = job.job.settings
     loss = SosLoss(
         network,
         content_weight=content_weight,
         style_loss=settings.style_loss,
         coarsest=settings.coarsest_side,
         style_scale=settings.style_scale,
-        scales=job.loss.weights,
+        scales=job.job.loss.weights,
     )
-    style = job.style.map(lambda own: own.to(network.dtype))
+    style = job.job.style.map(lambda own: own.to(network.dtype))
     targets = loss.targets.of_style(Style.of(style), (picture.shape[0], picture.shape[1]))
     return loss.evaluate(picture.to(network.dtype), targets, loss.targets.of_view(content.to(network.dtype), coverage))

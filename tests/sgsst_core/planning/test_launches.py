@@ -72,7 +72,7 @@ def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_w
         stylizer = Stylizer.planned(
             wall(10, 8), cameras(2, 48, 32), style(), settings, weights=tiny_weights, rasterizer="cpu"
         )
-        decision = next(line for line in stylizer.plan.decisions if line.item == "launches")
+        decision = next(line for line in stylizer.job.plan.decisions if line.item == "launches")
         measured = "measured per view" in decision.reason
         assert measured is (steps == LEAST_GRAPH_VISITS and not keep)
-        assert (stylizer.graphs is not None) is stylizer.plan.graphs
+        assert (stylizer.job.graphs is not None) is stylizer.job.plan.graphs

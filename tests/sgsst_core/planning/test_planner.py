@@ -67,21 +67,23 @@ def test_each_item_alone_changes_nothing(tiny_weights: BackboneWeights, item: It
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     gradients = [stylizer.gradient(0, [0])[0] for stylizer in (lean, other)]
     if item == "unseen":
-        gradients[1] = gradients[1][lean.plan.seen]
+        gradients[1] = gradients[1][lean.job.plan.seen]
     assert relative_error(gradients[0], gradients[1]) < 1e-4
-    assert lean.plan.cached_weights == "float32"
-    assert (other.plan.cached_weights == "none") == (item == "blend-weights")
+    assert lean.job.plan.cached_weights == "float32"
+    assert (other.job.plan.cached_weights == "none") == (item == "blend-weights")
 
 
 def test_blend_weights_are_cached_as_memory_and_visits_allow(tiny_weights: BackboneWeights) -> None:
     scene, views = wall(), cameras(3)
-    assert make(scene, views, tiny_weights, steps_sos=14).plan.cached_weights == "none"  # fewer than 5 visits per view
+    assert (
+        make(scene, views, tiny_weights, steps_sos=14).job.plan.cached_weights == "none"
+    )  # fewer than 5 visits per view
     lean = make(scene, views, tiny_weights, steps_sos=30)
-    assert lean.plan.cached_weights == "float32"
+    assert lean.job.plan.cached_weights == "float32"
     little = make(scene, views, tiny_weights, steps_sos=30, memory_limit=400_000)
-    assert little.plan.cached_weights == "half"
-    assert make(scene, views, tiny_weights, steps_sos=30, cached_weights="none").views.rasterizer.name == "cpu"
-    decision = next(d for d in little.plan.decisions if d.item == "blend weights")
+    assert little.job.plan.cached_weights == "half"
+    assert make(scene, views, tiny_weights, steps_sos=30, cached_weights="none").job.views.rasterizer.name == "cpu"
+    decision = next(d for d in little.job.plan.decisions if d.item == "blend weights")
     assert "half precision" in decision.decision
     assert "1/2048" in decision.error
 
@@ -91,7 +93,7 @@ def test_rendering_without_unseen_gaussians_is_bit_identical(tiny_weights: Backb
     lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
     assert len(lean.sh_dc) < len(full.sh_dc) == len(scene)
     for index in range(3):
-        images = [s.views.render(index, s.views.colors(index, s.sh_dc.detach())) for s in (lean, full)]
+        images = [s.job.views.render(index, s.job.views.colors(index, s.sh_dc.detach())) for s in (lean, full)]
         assert torch.equal(*images)
 
 
@@ -99,7 +101,7 @@ def test_decisions_name_what_is_left_out(tiny_weights: BackboneWeights) -> None:
     near = ball()
     scene = higher_bands_of_zeros(behind(replace(near, means=near.means + torch.tensor([0.0, 0, 4]))))
     views = [resized(camera, 320) for camera in cameras(2)]
-    plan = make(scene, views, tiny_weights, content_weight=0, steps_coarse=3).plan
+    plan = make(scene, views, tiny_weights, content_weight=0, steps_coarse=3).job.plan
     decisions = {decision.item: decision for decision in plan.decisions}
     assert set(decisions) >= {
         "unseen Gaussians",

@@ -98,8 +98,8 @@ def test_tf32_on_a_cpu_gives_the_float32_job(tiny_weights: BackboneWeights) -> N
         Stylizer.planned(ball(300), cameras(2), style(), make_settings(precision=name), weights=tiny_weights)
         for name in ("tf32", "float32")
     )
-    assert asked.plan.precision == asked.network.precision == "float32"
-    assert [decision.decision for decision in asked.plan.decisions if decision.item == "precision"] == [
+    assert asked.job.plan.precision == asked.job.network.precision == "float32"
+    assert [decision.decision for decision in asked.job.plan.decisions if decision.item == "precision"] == [
         "features in float32"
     ]
     assert asked.run_step().loss == plain.run_step().loss

@@ -23,6 +23,7 @@ from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
@@ -151,11 +152,12 @@ def test_job_reuses_objects_of_the_planning_context(tiny_weights: BackboneWeight
         plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)
         inputs = (plan, scene, cameras(2), style(), settings)
         used, fresh = (
-            Stylizer(*inputs, weights=tiny_weights, planning_context=context) for context in (planning_context, None)
+            Stylizer(prepare_job(*inputs, weights=tiny_weights, planning_context=context))
+            for context in (planning_context, None)
         )
         assert bool(plan.seen.all()) is reused
-        assert used.network is planning_context.network
-        rasterizer = used.views.rasterizer
+        assert used.job.network is planning_context.network
+        rasterizer = used.job.views.rasterizer
         own = rasterizer if isinstance(rasterizer, CpuRasterizer) else rasterizer.uncached  # type: ignore[attr-defined]
         assert (own is planning_context.rasterizer) is reused
         assert used.run_step().loss == fresh.run_step().loss
@@ -165,4 +167,4 @@ def test_job_reuses_objects_of_the_planning_context(tiny_weights: BackboneWeight
 def test_requested_rasterizer_is_measured_and_used(tiny_weights: BackboneWeights) -> None:
     settings = make_settings(cached_weights="none")
     stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights, rasterizer="reference")
-    assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == "reference"
+    assert stylizer.job.views.rasterizer.name == stylizer.job.plan.rasterizer == "reference"

@@ -13,6 +13,7 @@ from sgsst_core.planning.planner import make_plan
 from sgsst_core.quality.exact import Float32Reference, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToTf32
@@ -82,7 +83,9 @@ def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -
     rounded = RoundedToTf32(tiny_weights, planning_context.network.layers)
     errors = []
     for shop in (None, replace(planning_context, network=rounded)):
-        stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=tiny_weights, planning_context=shop)
+        stylizer = Stylizer(
+            prepare_job(plan, scene, cameras(2), style(), settings, weights=tiny_weights, planning_context=shop)
+        )
         assert approximations(stylizer) == ["TF32 convolutions"]
         errors.append(Float32Reference(stylizer).gradient_error())
     assert errors[0].relative_error < 1e-5
@@ -95,7 +98,7 @@ def test_bfloat16_has_an_error_between_rounding_and_nonsense(tiny_weights: Backb
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12)
     plan, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
     plan = replace(plan, precision="bfloat16")
-    stylizer = Stylizer(plan, scene, cameras(2), style(), settings, weights=tiny_weights)
+    stylizer = Stylizer(prepare_job(plan, scene, cameras(2), style(), settings, weights=tiny_weights))
     assert approximations(stylizer) == ["bfloat16 features"]
     error = Float32Reference(stylizer).gradient_error()
     assert 1e-3 < error.relative_error < 0.8

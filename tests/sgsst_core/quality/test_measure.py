@@ -33,7 +33,7 @@ def make(
 ) -> Stylizer:
     settings = make_settings(steps_sos=STEPS, steps_coarse=0, measure=measure, **values)
     stylizer = Stylizer.planned(wall(), cameras(5), style(), settings, weights=weights)
-    stylizer.plan = replace(stylizer.plan, prediction=prediction, measuring=level)
+    stylizer.job = replace(stylizer.job, plan=replace(stylizer.job.plan, prediction=prediction, measuring=level))
     return stylizer
 
 

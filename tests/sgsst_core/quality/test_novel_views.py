@@ -374,13 +374,13 @@ def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, v
     settings = make_settings(steps_coarse=0, steps_sos=10, learning_rate=0.2, learning_rate_end=0.1)
     stylizer = Stylizer.planned(scene, views, painting, settings, weights=vgg16_weights)
     measured = NovelViews(
-        stylizer.views.cameras,
-        stylizer.views.covered,
+        stylizer.job.views.cameras,
+        stylizer.job.views.covered,
         scene,
         make_rasterizer("cpu", scene),
-        stylizer.loss,
-        stylizer.style_targets,
-        weighted=stylizer.views.weighted,
+        stylizer.job.loss,
+        stylizer.job.style_targets,
+        weighted=stylizer.job.views.weighted,
         lpips=lpips,
     )
     assert len(measured.cameras) >= 6

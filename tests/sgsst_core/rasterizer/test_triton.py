@@ -209,7 +209,7 @@ def test_steps_of_a_job_agree_with_the_cpu(tiny_weights: BackboneWeights, one_th
     losses = {}
     for name in ("cpu", "triton"):
         stylizer = Stylizer.planned(wall(), views, style(), settings, weights=tiny_weights, rasterizer=name)
-        assert stylizer.views.rasterizer.name == stylizer.plan.rasterizer == name
+        assert stylizer.job.views.rasterizer.name == stylizer.job.plan.rasterizer == name
         losses[name] = [stylizer.run_step().loss for _ in range(3)]
     assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-4)
 

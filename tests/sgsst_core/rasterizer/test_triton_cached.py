@@ -26,6 +26,7 @@ from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, rotated_pose
@@ -245,9 +246,10 @@ def test_job_reuses_tile_intersections_of_its_plan(tiny_weights: BackboneWeights
         plan, planning_context = make_plan(scene, VIEWS[:1], settings, weights=tiny_weights, rasterizer=name)
         inputs = (plan, scene, VIEWS[:1], style(), settings)
         used, resumed = (
-            Stylizer(*inputs, weights=tiny_weights, planning_context=shop) for shop in (planning_context, None)
+            Stylizer(prepare_job(*inputs, weights=tiny_weights, planning_context=shop))
+            for shop in (planning_context, None)
         )
-        rasterizers: list[Any] = [stylizer.views.rasterizer for stylizer in (used, resumed)]
+        rasterizers: list[Any] = [stylizer.job.views.rasterizer for stylizer in (used, resumed)]
         assert rasterizers[0].uncached is planning_context.rasterizer
         for each in rasterizers:
             assert (each.name, each.precision, each.uncached.name) == ("cached", "half", name)

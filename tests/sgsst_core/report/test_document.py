@@ -39,9 +39,9 @@ def finished(tiny_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evalu
     }  # makes the losses of steps comparable with the start's
     settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3, **plain)
     stylizer = Stylizer.planned(ball(), views, style(), settings, weights=tiny_weights)
-    before = stylizer.evaluate(stylizer.evaluation_views)
+    before = stylizer.evaluate(stylizer.job.evaluation_views)
     run(stylizer)
-    return stylizer, before, stylizer.evaluate(stylizer.evaluation_views)
+    return stylizer, before, stylizer.evaluate(stylizer.job.evaluation_views)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def sources(tiny_weights: BackboneWeights) -> Sources:
 def test_evaluation_views_are_spread_over_those_that_see_anything(
     finished: tuple[Stylizer, Evaluation, Evaluation],
 ) -> None:
-    assert finished[0].evaluation_views == [0, 1, 4, 5]
+    assert finished[0].job.evaluation_views == [0, 1, 4, 5]
 
 
 def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:
@@ -70,7 +70,7 @@ def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluat
     assert report["position_weights"]["used"] is True
     assert 0.3 < report["position_weights"]["uncovered_share"] < 1
     assert len(report["backbone"]["sha256"]) == 64
-    assert report["settings"] == stylizer.settings.model_dump(mode="json")
+    assert report["settings"] == stylizer.job.settings.model_dump(mode="json")
     assert report["memory"]["peak_bytes"] > 50_000_000
     assert report["memory"]["device_peak_bytes"] is report["plan"]["measured"]["device_bytes"] is None
     parts = sum(report["seconds_by_part"].values())
@@ -94,7 +94,7 @@ def test_first_and_later_visits_are_told_apart(
     measured = build_report(stylizer, sources, "finished", before, after)["plan"]["measured"]
     assert (measured["seconds"], measured["first_visit"]) == (2.0, 2.5)
     assert measured["seconds_coarse"] is measured["first_visit_coarse"] is None
-    monkeypatch.setattr(stylizer, "settings", make_settings(views_per_step=2))
+    monkeypatch.setattr(stylizer, "job", replace(stylizer.job, settings=make_settings(views_per_step=2)))
     measured = build_report(stylizer, sources, "finished", before, after)["plan"]["measured"]
     assert (measured["seconds"], measured["first_visit"]) == (1.5, None)
 
@@ -110,7 +110,8 @@ def test_what_was_measured_and_its_share(
         {"step": 7, "novel_views": None, "approximation": None},  # from a version that did not record this
     ]
     monkeypatch.setattr(stylizer, "measured", entries)
-    monkeypatch.setattr(stylizer, "plan", replace(stylizer.plan, prediction=Prediction(1, 1, 1, job=450, measuring=50)))
+    plan = replace(stylizer.job.plan, prediction=Prediction(1, 1, 1, job=450, measuring=50))
+    monkeypatch.setattr(stylizer, "job", replace(stylizer.job, plan=plan))
     assert build_report(stylizer, sources, "finished", before, after)["measuring"] == {
         "share": 0.1,
         "allowed": 40.0,
@@ -146,17 +147,17 @@ def test_losses_in_the_report_are_those_of_the_steps(
 def test_what_the_time_bought(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
     """With two views per round, the mean of the last two losses counts."""
     stylizer = finished[0]
-    kept, seconds, covered = stylizer.history, stylizer.seconds, stylizer.views.covered
+    kept, seconds, covered = stylizer.history, stylizer.seconds, stylizer.job.views.covered
     losses = [8.0, 8.0, 4.0, 4.0, 0.48, 0.48, 0.48]
     stylizer.history = [
         StepRecord(i + 1, "sos", i % 2, 10.0 * (i + 1), loss, {0: LossTerms(gram=loss)}, {}, 0)
         for i, loss in enumerate(losses)
     ]
-    stylizer.seconds, stylizer.views.covered = 70.0, [0, 1]
+    stylizer.seconds, stylizer.job.views.covered = 70.0, [0, 1]
     try:
         found = bought(stylizer, {0: LossTerms(gram=8.0)})
     finally:
-        stylizer.history, stylizer.seconds, stylizer.views.covered = kept, seconds, covered
+        stylizer.history, stylizer.seconds, stylizer.job.views.covered = kept, seconds, covered
     assert found is not None
     assert found["relative"] == pytest.approx(0.06)
     assert [(entry["relative"], entry["step"]) for entry in found["reached"]] == [(0.5, 4), (0.2, 5), (0.1, 6)]
@@ -216,8 +217,8 @@ def test_contact_sheet_shows_style_original_and_stylized(
     for top in (18 + 12, 18 + 12 + 330 + 18 + 12):
         cell = torch.from_numpy(sheet[top : top + 330, left : left + 440]).permute(2, 0, 1)
         cells.append(torch.nn.functional.interpolate(cell[None], (48, 64), mode="area")[0].permute(1, 2, 0))
-    dcs = (stylizer.views.scene.sh_dc, stylizer.sh_dc.detach())
-    renders = [stylizer.views.render(0, stylizer.views.colors(0, dc)).clamp(0, 1) for dc in dcs]
+    dcs = (stylizer.job.views.scene.sh_dc, stylizer.sh_dc.detach())
+    renders = [stylizer.job.views.render(0, stylizer.job.views.colors(0, dc)).clamp(0, 1) for dc in dcs]
     distances = [[float((cell - render).abs().mean()) for render in renders] for cell in cells]
     assert max(distances[0][0], distances[1][1]) < 0.02
     assert min(distances[0][1], distances[1][0]) > 2 * max(distances[0][0], distances[1][1])

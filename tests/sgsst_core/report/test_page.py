@@ -517,10 +517,10 @@ def test_page_of_a_real_job(tiny_weights: BackboneWeights, tmp_path: Path, one_t
     stylizer = Stylizer.planned(
         ball(), cameras(3), style(), make_settings(steps_sos=4, learning_rate=0.3), weights=tiny_weights
     )
-    before = stylizer.evaluate(stylizer.evaluation_views)
+    before = stylizer.evaluate(stylizer.job.evaluation_views)
     stopped = run(stylizer)
     sources = Sources(tmp_path / "ball.ply", 0, (Path("style.png"),), Path("cameras.json"), None, tiny_weights)
-    after = stylizer.evaluate(stylizer.evaluation_views)
+    after = stylizer.evaluate(stylizer.job.evaluation_views)
     report = json.loads(json.dumps(build_report(stylizer, sources, stopped, before, after)))
     (tmp_path / "sheet.jpg").write_bytes(sample_sheet())
     write_page(tmp_path / "report.html", report, tmp_path / "sheet.jpg")

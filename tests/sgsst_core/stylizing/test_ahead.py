@@ -117,13 +117,13 @@ def test_a_step_reads_the_next_photo_and_waits_once(
     """In the first of two rounds, cached data of each view are computed."""
     photos = Photos(tmp_path)
     stylizer = make(tiny_weights, photos)
-    gradient = stylizer.views.gradient
+    gradient = stylizer.job.views.gradient
 
     def end_of_step(*arguments: Any) -> Tensor:
         photos.wait_for(stylizer.step + (1 if (stylizer.step + 1) % VIEWS == 0 else 2))
         return gradient(*arguments)
 
-    monkeypatch.setattr(stylizer.views, "gradient", end_of_step)
+    monkeypatch.setattr(stylizer.job.views, "gradient", end_of_step)
     for step in range(STEPS):
         counts.clear()
         stylizer.run_step()
@@ -132,7 +132,7 @@ def test_a_step_reads_the_next_photo_and_waits_once(
             large = {line: size for line, size in counts.copies.items() if size > SCALARS}
             assert list(large.values()) == [PHOTO_BYTES], large  # the photo, and nothing else
         assert len(stylizer.state().queue) == -(step + 1) % VIEWS  # the queue was read, not refilled
-    stylizer.views.end_look_ahead()
+    stylizer.job.views.end_look_ahead()
     assert photos.asked == drawn() == [record.view for record in stylizer.history]
     assert photos.here == drawn()[::VIEWS]  # only the first of a round is unknown in advance; the thread reads the rest
     assert not threads()
@@ -151,7 +151,7 @@ def test_losses_are_those_of_photos_read_when_they_are_needed(
     options: dict[str, Any] = {"steps_sos": steps, "views_per_step": views_per_step}
     photos, plain = Photos(tmp_path), Photos(tmp_path)
     stylizer, expected = make(tiny_weights, photos, **options), make(tiny_weights, plain, **options)
-    monkeypatch.setattr(expected.views, "look_ahead", lambda *_: None)
+    monkeypatch.setattr(expected.job.views, "look_ahead", lambda *_: None)
     assert run(stylizer) == run(expected) == "finished"
     assert [record.loss for record in stylizer.history] == [record.loss for record in expected.history]
     assert torch.equal(stylizer.stylized(), expected.stylized())

@@ -34,8 +34,8 @@ def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
 
 
 def cached_views(stylizer: Stylizer) -> list[bool]:
-    rasterizer: Any = stylizer.views.rasterizer
-    return [rasterizer.is_cached(camera) for camera in stylizer.views.cameras]
+    rasterizer: Any = stylizer.job.views.rasterizer
+    return [rasterizer.is_cached(camera) for camera in stylizer.job.views.cameras]
 
 
 def steps(stylizer: Stylizer, count: int) -> Stylizer:
@@ -50,7 +50,7 @@ def test_looks_in_between_change_no_bit(form: str, views_per_step: int, tiny_wei
     alone, watched = (job(tiny_weights, form, views_per_step=views_per_step) for _ in range(2))
     everything = list(range(len(VIEWS)))
     watched.evaluate(everything)
-    watched.gradient(4, watched.scales(4))
+    watched.gradient(4, watched.job.scales(4))
     steps(alone, STEPS)
     for _ in range(STEPS):
         watched.run_step()

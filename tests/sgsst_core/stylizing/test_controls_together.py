@@ -35,7 +35,7 @@ def job(weights: BackboneWeights, **values: object) -> Stylizer:
 
 
 def stylized(stylizer: Stylizer) -> torch.Tensor:
-    while stylizer.step < stylizer.total:
+    while stylizer.step < stylizer.job.total_steps:
         stylizer.run_step()
     return stylizer.stylized()
 
@@ -56,11 +56,11 @@ def test_what_is_kept_is_not_cut_and_parts_are_in_their_gaussians_region(tiny_we
 def test_all_at_once(tiny_weights: BackboneWeights, colors: str) -> None:
     values = {"refine": 2.0, "preserve_colors": colors, "scales": (1.0, 0.5), "warm_start": True}
     stylizer = job(tiny_weights, **values)
-    before = stylizer.scene.sh_dc.clone()
+    before = stylizer.job.scene.sh_dc.clone()
     found = stylized(stylizer)
     assert len(found) > len(large_wall())
-    assert stylizer.regions is not None
-    kept = stylizer.regions.frozen
+    assert stylizer.job.regions is not None
+    kept = stylizer.job.regions.frozen
     assert torch.equal(found[kept], before[kept])
     assert not torch.equal(found[~kept], before[~kept])
     assert bool(found.isfinite().all())

@@ -19,6 +19,7 @@ from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import Sources, build_report
 from sgsst_core.settings import PlannedBackground, make_settings
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
@@ -66,7 +67,7 @@ def make(
         uncached=rasterizer,
         graphs=graphs,
     )
-    return Stylizer(plan, scene, views, style(), settings, weights=weights)
+    return Stylizer(prepare_job(plan, scene, views, style(), settings, weights=weights))
 
 
 @pytest.mark.slow
@@ -78,7 +79,7 @@ def test_steps_with_graphs_are_the_same_to_the_bit(
     if not scan:  # once is enough for the network's Triton kernels, which are slow in the interpreter
         leave_out_kernels(monkeypatch)
     plain, graphs = (make(tiny_weights, graphs=graphs, scan=scan) for graphs in (False, True))
-    for _ in range(plain.total):
+    for _ in range(plain.job.total_steps):
         expected, stage = plain.run_step(), graphs.phase.stage
         counts.clear()
         found = graphs.run_step()
@@ -89,8 +90,8 @@ def test_steps_with_graphs_are_the_same_to_the_bit(
             assert {"network", "render", "raster_backward"} <= found.parts.keys()
             assert "vgg_forward" not in found.parts
     assert graphs.stylized().equal(plain.stylized())
-    assert graphs.graphs is not None
-    assert (graphs.graphs.captured, graphs.graphs.problem) == (2, None)
+    assert graphs.job.graphs is not None
+    assert (graphs.job.graphs.captured, graphs.job.graphs.problem) == (2, None)
 
 
 @pytest.mark.slow
@@ -105,7 +106,7 @@ def test_a_color_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
     )
     fixed = make(tiny_weights, graphs=True, **options)
     found: dict[str, list[tuple[int, int]]] = {"drawn": [], "fixed": []}
-    for _ in range(plain.total):
+    for _ in range(plain.job.total_steps):
         expected = plain.run_step()
         for name, stylizer in (("drawn", graphs), ("fixed", fixed)):
             counts.clear()
@@ -113,8 +114,8 @@ def test_a_color_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
             found[name].append((counts.waits.total(), counts.copies.total()))
             if name == "drawn":
                 assert (record.view, record.loss, record.terms) == (expected.view, expected.loss, expected.terms)
-    assert graphs.graphs is not None
-    assert (graphs.graphs.captured, graphs.graphs.problem) == (1, None)
+    assert graphs.job.graphs is not None
+    assert (graphs.job.graphs.captured, graphs.job.graphs.problem) == (1, None)
     assert found["drawn"][-1] == found["fixed"][-1]
     assert found["drawn"][-1][0] == 1
 
@@ -136,9 +137,9 @@ def test_several_views_a_step_and_a_resumed_run(
     assert others == [expected, expected]
     for stylizer in (graphs, resumed):
         assert stylizer.stylized().equal(plain.stylized())
-        assert stylizer.graphs is not None
-        assert stylizer.graphs.captured == (2 if stylizer is graphs else 1)
-        assert stylizer.graphs.problem is None
+        assert stylizer.job.graphs is not None
+        assert stylizer.job.graphs.captured == (2 if stylizer is graphs else 1)
+        assert stylizer.job.graphs.problem is None
     sources = Sources(Path("scene.ply"), 0, (Path("style.png"),), None, None, tiny_weights)
     report = build_report(graphs, sources, "finished", graphs.start(), graphs.evaluate([0]))
     assert report["graphs"] == {"captured": 2, "problem": None}

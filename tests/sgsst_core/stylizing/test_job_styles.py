@@ -137,10 +137,10 @@ def test_a_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("standard", style_rotation=90, preserve_colors="match", style_scale=2, coarsest_side=24)
     scene, style = wall(), picture()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
-    (used,) = stylizer.style.images
+    (used,) = stylizer.job.style.images
     assert used.shape == (60, 40, 3)
-    assert stylizer.loss.targets.style_scale == 2
-    weights = stylizer.plan.survey.total_blend_weights
+    assert stylizer.job.loss.targets.style_scale == 2
+    weights = stylizer.job.plan.survey.total_blend_weights
     (wanted,) = prepared_style(Style.of(style), settings, scene.sh_dc, weights).images
     assert torch.equal(used, wanted)
     stylizer.run_step()

@@ -21,6 +21,7 @@ from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.screen import on_screen_by_luminance
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.warm_start import warm_start
 from tests.small_scenes import cameras, style, wall
@@ -43,7 +44,9 @@ def in_bfloat16(weights: BackboneWeights) -> Stylizer:
     """Make a job in bfloat16 with a fixed plan, so that the precision does not depend on the processor."""
     scene, settings = wall(60, 40), settings_of()
     plan, _ = make_plan(scene, cameras(), settings, weights=weights)
-    return Stylizer(replace(plan, precision="bfloat16"), scene, cameras(), style(), settings, weights=weights)
+    return Stylizer(
+        prepare_job(replace(plan, precision="bfloat16"), scene, cameras(), style(), settings, weights=weights)
+    )
 
 
 def told(plan: Plan) -> bool:
@@ -54,16 +57,16 @@ def test_results_have_the_styles_distribution_and_steps_go_on_without_it(tiny_we
     stylizer = make(tiny_weights)
     run(stylizer)
     optimized = stylizer.sh_dc.detach().clone()
-    rows = stylizer.plan.optimized
+    rows = stylizer.job.plan.optimized
     assert rows.any()
     found = stylizer.stylized()
-    weights = stylizer.plan.survey.total_blend_weights[stylizer.plan.seen]
-    wanted = warm_start(optimized, weights, stylizer.style)
-    assert torch.equal(found[rows], wanted[rows[stylizer.plan.seen]])
+    weights = stylizer.job.plan.survey.total_blend_weights[stylizer.job.plan.seen]
+    wanted = warm_start(optimized, weights, stylizer.job.style)
+    assert torch.equal(found[rows], wanted[rows[stylizer.job.plan.seen]])
     assert float((wanted - optimized).abs().mean()) > 0.01
     assert torch.equal(stylizer.sh_dc, optimized)
-    assert torch.equal(stylizer.shown(), found[stylizer.plan.seen])
-    assert told(stylizer.plan)
+    assert torch.equal(stylizer.shown(), found[stylizer.job.plan.seen])
+    assert told(stylizer.job.plan)
 
 
 @pytest.mark.parametrize(
@@ -74,10 +77,10 @@ def test_other_results_are_what_steps_have_found(tiny_weights: BackboneWeights, 
     steps = values.pop("steps", None)
     stylizer = make(tiny_weights, **values)
     run(stylizer, Callbacks(stop=lambda: steps == stylizer.step))
-    rows = stylizer.plan.optimized
-    assert torch.equal(stylizer.stylized()[rows], stylizer.sh_dc.detach()[rows[stylizer.plan.seen]])
+    rows = stylizer.job.plan.optimized
+    assert torch.equal(stylizer.stylized()[rows], stylizer.sh_dc.detach()[rows[stylizer.job.plan.seen]])
     assert torch.equal(stylizer.shown(), stylizer.sh_dc)
-    assert told(stylizer.plan) == (steps == 0)
+    assert told(stylizer.job.plan) == (steps == 0)
 
 
 def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights) -> None:
@@ -86,7 +89,9 @@ def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights) ->
     for _ in range(3):
         first.run_step()
         first.stylized()  # as for a preview
-    again = Stylizer(first.plan, wall(60, 40), cameras(), style(), first.settings, weights=tiny_weights)
+    again = Stylizer(
+        prepare_job(first.job.plan, wall(60, 40), cameras(), style(), first.job.settings, weights=tiny_weights)
+    )
     again.load_state(first.state())
     run(again)
     assert torch.equal(again.stylized(), whole.stylized())
@@ -106,7 +111,7 @@ def test_each_region_has_the_colors_of_its_own_style_and_kept_ones_their_bits(ti
     found = stylizer.stylized()
     assert torch.equal(found[labels == 2].view(torch.int32), scene.sh_dc[labels == 2].view(torch.int32))
     for place, gray in enumerate((0.2, 0.7)):
-        own = 0.5 + SH_C0 * found[(labels == place) & stylizer.plan.optimized]
+        own = 0.5 + SH_C0 * found[(labels == place) & stylizer.job.plan.optimized]
         assert float((own - gray).abs().max()) < 1e-3
 
 
@@ -114,11 +119,11 @@ def test_each_region_has_the_colors_of_its_own_style_and_kept_ones_their_bits(ti
 def test_chroma_is_kept_where_luminance_alone_changes(tiny_weights: BackboneWeights, bounded: bool) -> None:
     stylizer = make(tiny_weights, preserve_colors="luminance", warm_start=True, bounded=bounded, unseen="freeze")
     run(stylizer)
-    rows, before = stylizer.plan.optimized, stylizer.scene.sh_dc
+    rows, before = stylizer.job.plan.optimized, stylizer.job.scene.sh_dc
     found = stylizer.stylized()
     change = (found - before)[rows].double()
     assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
-    assert not torch.equal(found[rows], stylizer.sh_dc.detach()[rows[stylizer.plan.seen]])
+    assert not torch.equal(found[rows], stylizer.sh_dc.detach()[rows[stylizer.job.plan.seen]])
     off = float((on_screen_by_luminance(found[rows]) - found[rows]).abs().max())
     assert off < 1e-6 if bounded else off > 0.1
 
@@ -128,7 +133,7 @@ def test_what_is_reported_is_what_is_written(tiny_weights: BackboneWeights, tmp_
     stylizer = in_bfloat16(tiny_weights)
     run(stylizer)
     measure = Measurements(stylizer)
-    written = Float32Reference(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
+    written = Float32Reference(stylizer).evaluate(stylizer.job.evaluation_views, stylizer.stylized())
     assert measure.approximated
     assert measure.evaluate()[0].total == pytest.approx(written[0].total, rel=1e-6)
     assert Float32Reference(stylizer).gradient_error().relative_error < 0.5
@@ -136,12 +141,12 @@ def test_what_is_reported_is_what_is_written(tiny_weights: BackboneWeights, tmp_
     exact = make(tiny_weights)
     run(exact)
     after = Measurements(exact).evaluate()[0].total
-    optimized = exact.evaluate(exact.evaluation_views)[0].total
+    optimized = exact.evaluate(exact.job.evaluation_views)[0].total
     with exact.with_colors(exact.stylized()):
-        assert exact.evaluate(exact.evaluation_views)[0].total == after != optimized
+        assert exact.evaluate(exact.job.evaluation_views)[0].total == after != optimized
     other = make(tiny_weights, warm_start=False)
     sheets = []
-    for colors in (exact.stylized(), exact.scene.sh_dc.index_put((exact.plan.seen,), exact.sh_dc.detach())):
+    for colors in (exact.stylized(), exact.job.scene.sh_dc.index_put((exact.job.plan.seen,), exact.sh_dc.detach())):
         other.set_colors(colors)
         write_contact_sheet(tmp_path / "other.jpg", other)
         sheets.append((tmp_path / "other.jpg").read_bytes())

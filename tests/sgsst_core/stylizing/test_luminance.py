@@ -68,14 +68,14 @@ def test_every_gaussian_keeps_its_chroma(
 ) -> None:
     scene = make_scene()
     stylizer = make(tiny_weights, scene, **values)
-    assert any(line.item == "colors" for line in stylizer.plan.decisions)
+    assert any(line.item == "colors" for line in stylizer.job.plan.decisions)
     before = stylizer.sh_dc.detach().clone()
     run(stylizer)
     found = stylizer.stylized()
     assert float((stylizer.sh_dc.detach() - before).abs().max()) > 0.1
     assert chroma_off(found, scene) < ROUNDING
-    if values.get("unseen") != "freeze" and not stylizer.plan.seen.all():
-        hidden = ~stylizer.plan.seen
+    if values.get("unseen") != "freeze" and not stylizer.job.plan.seen.all():
+        hidden = ~stylizer.job.plan.seen
         assert float((found - scene.sh_dc)[hidden].abs().max()) > 0
 
 
@@ -84,18 +84,18 @@ def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: Ba
     scene, view = wall(), cameras(1)[0]
     settings = make_settings(preserve_colors="luminance", coarsest_side=24, steps_coarse=0, clamp_aware_gradient=False)
     stylizer = Stylizer.planned(scene, [view], style(), settings, weights=tiny_weights)
-    found, _ = stylizer.gradient(0, range(stylizer.scale_count(0)))
+    found, _ = stylizer.gradient(0, range(stylizer.job.scale_count(0)))
 
     rasterizer = ReferenceRasterizer(scene)
     colors = (COLOR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
     image = rasterizer.render(colors, view)
     size = (view.height, view.width)
-    (painting,) = stylizer.style.images
+    (painting,) = stylizer.job.style.images
     used = resize_area(painting, style_size((painting.shape[0], painting.shape[1]), size))
-    _, pixels = sos_reference(stylizer.weights, image, used, image, coarsest=24)
+    _, pixels = sos_reference(stylizer.job.weights, image, used, image, coarsest=24)
     exact = rasterizer.color_gradient(pixels, view) * SH_C0 * (colors > 0)
-    assert stylizer.weights.gray
-    assert relative_error(found.sum(1).double(), exact.sum(1)[stylizer.plan.seen]) < 1e-4
+    assert stylizer.job.weights.gray
+    assert relative_error(found.sum(1).double(), exact.sum(1)[stylizer.job.plan.seen]) < 1e-4
 
 
 def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> None:
@@ -180,7 +180,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, tm
     for _ in range(3):
         first.run_step()
     path = tmp_path / "checkpoint.safetensors"
-    save_checkpoint(path, Checkpoint(first.state(), first.plan, 1, "run", versions()), "job")
+    save_checkpoint(path, Checkpoint(first.state(), first.job.plan, 1, "run", versions()), "job")
     second.load_state(load_checkpoint(path, "job").state)
     run(second)
     assert torch.equal(whole.stylized(), second.stylized())

@@ -39,10 +39,10 @@ def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data,
     training = Stylizer.planned(scene, chosen, style, settings, weights=vgg16_weights)
     novel_views = Stylizer.planned(scene, cameras[1::3], style, settings, weights=vgg16_weights)
 
-    before = [stylizer.evaluate(stylizer.views.covered) for stylizer in (training, novel_views)]
+    before = [stylizer.evaluate(stylizer.job.views.covered) for stylizer in (training, novel_views)]
     assert run(training) == "finished"
     novel_views.set_colors(training.stylized())
-    after = [stylizer.evaluate(stylizer.views.covered) for stylizer in (training, novel_views)]
+    after = [stylizer.evaluate(stylizer.job.views.covered) for stylizer in (training, novel_views)]
     for first, last, bound in zip(before, after, (0.5, 0.75), strict=True):
         assert set(first) == {0, 1}
         for scale, terms in first.items():

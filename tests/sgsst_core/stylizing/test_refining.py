@@ -141,14 +141,14 @@ def test_cameras_that_see_nothing_are_refused_by_the_plan(tiny_weights: Backbone
 def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> None:
     scene = large_wall()
     stylizer = Stylizer.planned(scene, cameras(), style(), settings(refine=3), weights=tiny_weights)
-    refinement = stylizer.plan.refinement
+    refinement = stylizer.job.plan.refinement
     assert refinement is not None
-    assert len(stylizer.scene) == refinement.gaussians > len(scene)
-    assert stylizer.plan.decisions[0].item == "refined Gaussians"
-    assert len(stylizer.plan.seen) == refinement.gaussians
+    assert len(stylizer.job.scene) == refinement.gaussians > len(scene)
+    assert stylizer.job.plan.decisions[0].item == "refined Gaussians"
+    assert len(stylizer.job.plan.seen) == refinement.gaussians
     run(stylizer)
     assert stylizer.stylized().shape == (refinement.gaussians, 3)
-    parents, change = parents_of(refinement.pieces), stylizer.stylized() - stylizer.scene.sh_dc
+    parents, change = parents_of(refinement.pieces), stylizer.stylized() - stylizer.job.scene.sh_dc
     parent = int((piece_counts(refinement.pieces) > 1).nonzero()[0])
     children = change[parents == parent]
     assert float(children.std(dim=0).max()) > 0.01, "children have colors of their own"

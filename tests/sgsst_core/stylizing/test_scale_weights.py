@@ -26,12 +26,12 @@ def make(weights: BackboneWeights, steps_coarse: int = 2, **values: Any) -> Styl
 
 
 def line(stylizer: Stylizer, item: str) -> str:
-    return next((each.decision for each in stylizer.plan.decisions if each.item == item), "")
+    return next((each.decision for each in stylizer.job.plan.decisions if each.item == item), "")
 
 
 def test_phase_1_takes_the_coarsest_scale_that_counts(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, scales=(1.0, 0.5))
-    assert stylizer.scale_count(0) == 3
+    assert stylizer.job.scale_count(0) == 3
     run(stylizer)
     assert [sorted(record.terms) for record in stylizer.history] == [[1], [1], [0, 1], [0, 1], [0, 1]]
     record = stylizer.history[-1]
@@ -43,9 +43,9 @@ def test_the_judged_loss_is_that_of_the_scales_that_count(tiny_weights: Backbone
     stylizer = make(tiny_weights, scales=(1.0, 0.0, 0.5), warm_start=False)
     found = stylizer.evaluate([0, 1])
     assert sorted(found) == [0, 2]
-    weights = stylizer.loss.weights
+    weights = stylizer.job.loss.weights
     assert mean_loss(found, weights) == pytest.approx((found[0].total + 0.5 * found[2].total) / 1.5)
-    reference = Float32Reference(stylizer).evaluate([0, 1], stylizer.scene.sh_dc)
+    reference = Float32Reference(stylizer).evaluate([0, 1], stylizer.job.scene.sh_dc)
     assert mean_loss(reference, weights) == pytest.approx(mean_loss(found, weights), rel=1e-5)
     run(stylizer)
     measure = Measurements(stylizer)
@@ -55,7 +55,7 @@ def test_the_judged_loss_is_that_of_the_scales_that_count(tiny_weights: Backbone
 
 def test_one_scale_leaves_phase_1_out(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, scales=(0.0, 1.0))
-    assert stylizer.plan.steps_coarse == 0
+    assert stylizer.job.plan.steps_coarse == 0
     assert "skipped" in line(stylizer, "phase 1")
     record = stylizer.run_step()
     assert list(record.terms) == [1]
@@ -70,7 +70,7 @@ def test_equal_weights_give_the_bits_of_none(tiny_weights: BackboneWeights) -> N
 
 def test_the_plan_counts_what_is_computed(tiny_weights: BackboneWeights) -> None:
     whole, coarse = make(tiny_weights, steps_coarse=0), make(tiny_weights, steps_coarse=0, scales=(0.0, 0.0, 1.0))
-    expected = [job.plan.prediction for job in (whole, coarse)]
+    expected = [job.job.plan.prediction for job in (whole, coarse)]
     assert expected[0] is not None
     assert expected[1] is not None
     assert expected[1].style < 0.2 * expected[0].style  # a sixteenth of the pixels, plus halos
@@ -83,8 +83,8 @@ def test_scales_that_the_views_have_not_are_refused_before_anything_is_looked_at
 
 def test_several_runs_repeat_and_the_loss_falls(tiny_weights: BackboneWeights) -> None:
     first, second = (make(tiny_weights, steps_sos=30, scales=(0.0, 1.0, 2.0), early_stop=False) for _ in range(2))
-    start = mean_loss(first.start(), first.loss.weights)
+    start = mean_loss(first.start(), first.job.loss.weights)
     run(first)
     run(second)
     assert torch.equal(first.stylized(), second.stylized())
-    assert mean_loss(first.evaluate(first.evaluation_views), first.loss.weights) < 0.5 * start
+    assert mean_loss(first.evaluate(first.job.evaluation_views), first.job.loss.weights) < 0.5 * start

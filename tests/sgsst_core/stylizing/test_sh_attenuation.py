@@ -29,7 +29,7 @@ def make(weights: BackboneWeights, scene: Scene, **values: Any) -> Stylizer:
 
 
 def line(stylizer: Stylizer) -> str:
-    (found,) = (each for each in stylizer.plan.decisions if each.item == "spherical harmonics")
+    (found,) = (each for each in stylizer.job.plan.decisions if each.item == "spherical harmonics")
     return f"{found.decision}: {found.reason}"
 
 
@@ -43,11 +43,11 @@ def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeigh
         run(each)
     assert torch.equal(stylizer.stylized(), other.stylized())
     assert [record.loss for record in stylizer.history] == [record.loss for record in other.history]
-    assert stylizer.scene.sh_degree == (0 if attenuation == 1 else 2)
-    assert stylizer.sh_degree == 2
-    exact = Float32Reference(stylizer).evaluate(stylizer.evaluation_views, stylizer.stylized())
-    assert exact.keys() == stylizer.evaluate(stylizer.evaluation_views).keys()
-    for scale, terms in stylizer.evaluate(stylizer.evaluation_views).items():
+    assert stylizer.job.scene.sh_degree == (0 if attenuation == 1 else 2)
+    assert stylizer.job.sh_degree == 2
+    exact = Float32Reference(stylizer).evaluate(stylizer.job.evaluation_views, stylizer.stylized())
+    assert exact.keys() == stylizer.evaluate(stylizer.job.evaluation_views).keys()
+    for scale, terms in stylizer.evaluate(stylizer.job.evaluation_views).items():
         assert exact[scale].total == pytest.approx(terms.total, rel=1e-6)
 
 
@@ -68,7 +68,8 @@ def test_the_picture_of_the_result_is_what_was_optimized(
     again = Stylizer.planned(result, cameras(), style(), make_settings(warm_start=False), weights=tiny_weights)
     for index in range(3):
         pictures = [
-            each.views.render(index, each.views.colors(index, each.sh_dc.detach())) for each in (stylizer, again)
+            each.job.views.render(index, each.job.views.colors(index, each.sh_dc.detach()))
+            for each in (stylizer, again)
         ]
         assert torch.equal(*pictures)
 
@@ -78,4 +79,4 @@ def test_the_plan_says_what_fades(tiny_weights: BackboneWeights) -> None:
     assert "multiplied by 0.75" in line(make(tiny_weights, wall(sh_degree=1), sh_attenuation=0.25))
     out = make(tiny_weights, wall(sh_degree=1), sh_attenuation=1)
     assert "attenuated to 0, in the result too; no view directions are computed" in line(out)
-    assert out.views.scene.sh_degree == 0
+    assert out.job.views.scene.sh_degree == 0

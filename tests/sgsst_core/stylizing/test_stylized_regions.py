@@ -22,7 +22,9 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.result_colors import transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.unseen import neighbors_change_by_region
 from tests.sgsst_core.pictures import relative_error
@@ -98,9 +100,9 @@ def test_kept_gaussians_stay_to_the_bit(tiny_weights: BackboneWeights, kept: str
     bits, before = stylizer.stylized().view(torch.int32), scene.sh_dc.view(torch.int32)
     assert torch.equal(bits[regions.frozen], before[regions.frozen])
     changed = (bits != before).any(dim=1)
-    assert bool(changed[stylizer.plan.optimized].all())
+    assert bool(changed[stylizer.job.plan.optimized].all())
     assert bool(changed[~regions.frozen].all()) == (values.get("unseen") != "freeze")
-    assert not bool((stylizer.plan.optimized & regions.frozen).any())
+    assert not bool((stylizer.job.plan.optimized & regions.frozen).any())
 
 
 def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> None:
@@ -136,7 +138,7 @@ def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
     for stylizer in (found, wanted):
         run(stylizer)
     assert torch.equal(found.stylized(), wanted.stylized())
-    (line,) = [each for each in found.plan.decisions if each.item == "region empty"]
+    (line,) = [each for each in found.job.plan.decisions if each.item == "region empty"]
     assert line.decision == "warning: ignored, because it has no Gaussians"
 
 
@@ -147,8 +149,8 @@ def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights
     regions = halves(scene, right=Region("right", style=Style.of(bright)))
     stylizer = make(tiny_weights, scene, regions, dark, steps_sos=60, content_weight=0.0, early_stop=False)
     run(stylizer)
-    labels, found = regions.labels[stylizer.plan.seen], stylizer.stylized()[stylizer.plan.seen]
-    far = scene.means[stylizer.plan.seen][:, 0].abs() > 0.5  # features at the border see both regions
+    labels, found = regions.labels[stylizer.job.plan.seen], stylizer.stylized()[stylizer.job.plan.seen]
+    far = scene.means[stylizer.job.plan.seen][:, 0].abs() > 0.5  # features at the border see both regions
     left, right = (float((0.5 + 0.28209479 * found[(labels == place) & far]).mean()) for place in (0, 1))
     assert left < 0.4 < 0.6 < right
 
@@ -158,11 +160,11 @@ def test_colors_of_a_warm_start_are_each_regions_own(tiny_weights: BackboneWeigh
     dark, bright = torch.full((40, 40, 3), 0.2), torch.full((40, 40, 3), 0.7)
     regions = halves(scene, right=Region("right", style=Style.of(bright)))
     stylizer = make(tiny_weights, scene, regions, dark, warm_start=True)
-    seen = stylizer.plan.optimized
-    colors = 0.5 + 0.28209479 * stylizer.transferred()
+    seen = stylizer.job.plan.optimized
+    colors = 0.5 + 0.28209479 * transferred_colors(stylizer.job)
     for place, gray in enumerate((0.2, 0.7)):
         torch.testing.assert_close(
-            colors[regions.labels[stylizer.plan.seen] == place].mean(), torch.tensor(gray), atol=1e-3, rtol=0
+            colors[regions.labels[stylizer.job.plan.seen] == place].mean(), torch.tensor(gray), atol=1e-3, rtol=0
         )
     assert bool(seen.any())
 
@@ -177,7 +179,7 @@ def test_the_names_and_order_of_disjoint_regions_do_not_matter(tiny_weights: Bac
     gradients = []
     for regions in (one, two):
         stylizer = make(tiny_weights, scene, regions)
-        gradients.append(stylizer.gradient(0, range(stylizer.scale_count(0)))[0])
+        gradients.append(stylizer.gradient(0, range(stylizer.job.scale_count(0)))[0])
     assert relative_error(gradients[1], gradients[0]) < 1e-6
 
 
@@ -204,9 +206,13 @@ def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights, tm
     run(whole)
     for _ in range(3):
         first.run_step()
-    save_checkpoint(tmp_path / "c", Checkpoint(first.state(), first.plan, 1, "r", versions()), "job")
+    save_checkpoint(tmp_path / "c", Checkpoint(first.state(), first.job.plan, 1, "r", versions()), "job")
     checkpoint = load_checkpoint(tmp_path / "c", "job")
-    again = Stylizer(checkpoint.plan, scene, cameras(), style(), first.settings, weights=tiny_weights, regions=regions)
+    again = Stylizer(
+        prepare_job(
+            checkpoint.plan, scene, cameras(), style(), first.job.settings, weights=tiny_weights, regions=regions
+        )
+    )
     again.load_state(checkpoint.state)
     run(again)
     assert torch.equal(again.stylized(), whole.stylized())
@@ -228,9 +234,9 @@ def test_the_reference_has_the_same_regions(tiny_weights: BackboneWeights) -> No
     scene = wall()
     stylizer = make(tiny_weights, scene, halves(scene), warm_start=False)
     reference = Float32Reference(stylizer)
-    scales = list(range(stylizer.scale_count(0)))
+    scales = list(range(stylizer.job.scale_count(0)))
     own, exact = stylizer.gradient(0, scales)[0], reference.gradient(0, scene.sh_dc, scales)[0]
-    assert relative_error(own, exact[stylizer.plan.seen]) < 1e-6
+    assert relative_error(own, exact[stylizer.job.plan.seen]) < 1e-6
 
 
 def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
@@ -245,9 +251,9 @@ def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
 def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     stylizer = make(tiny_weights, scene, halves(scene))
-    view = stylizer.views.target(0, [0])
-    targets = stylizer.style_targets(stylizer.views.cameras[0])
-    image = stylizer.views.render(0, stylizer.views.colors(0, stylizer.sh_dc.detach()))
+    view = stylizer.job.views.target(0, [0])
+    targets = stylizer.job.style_targets(stylizer.job.views.cameras[0])
+    image = stylizer.job.views.render(0, stylizer.job.views.colors(0, stylizer.sh_dc.detach()))
     bare = ViewTarget(view.content_image, view.content, view.coverage, view.division)
     with pytest.raises(ValueError, match="not prepared for the regions"):
-        stylizer.loss.evaluate(image, targets, bare, [0])
+        stylizer.job.loss.evaluate(image, targets, bare, [0])

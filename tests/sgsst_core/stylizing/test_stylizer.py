@@ -23,6 +23,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, Progress, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
@@ -77,7 +78,9 @@ def test_tile_intersections_of_the_survey_are_not_built_again(
     assert plan.cached_weights == cached_weights
     results = []
     for given in (planning_context, None):
-        stylizer = Stylizer(plan, scene, views, style(), settings, weights=tiny_weights, planning_context=given)
+        stylizer = Stylizer(
+            prepare_job(plan, scene, views, style(), settings, weights=tiny_weights, planning_context=given)
+        )
         run(stylizer)
         results.append(stylizer.stylized())
     surveyed, timed = [len(scene)] * 3, [len(scene)] * 3
@@ -93,7 +96,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, sc
     for _ in range(4):
         stopped.run_step()
     assert stopped.state().queue
-    kept = Checkpoint(stopped.state(), stopped.plan, 1, "run", versions())
+    kept = Checkpoint(stopped.state(), stopped.job.plan, 1, "run", versions())
     save_checkpoint(tmp_path / "c.safetensors", kept, "job")
     resumed = make(tiny_weights, scene, steps_sos=8)
     resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job").state)
@@ -124,8 +127,8 @@ def test_the_first_step_moves_every_seen_value_by_the_learning_rate(
     hidden = replace(scene, means=torch.cat([scene.means[:-10], scene.means[-10:] * torch.tensor([1.0, 1.0, -1.0])]))
     stylizer = make(tiny_weights, hidden, views=1, learning_rate=0.05, bounded=False, warm_start=False)
     stylizer.run_step()
-    assert not stylizer.plan.seen[-10:].any()
-    moved = (stylizer.sh_dc.detach() - hidden.sh_dc[stylizer.plan.seen]).abs()
+    assert not stylizer.job.plan.seen[-10:].any()
+    moved = (stylizer.sh_dc.detach() - hidden.sh_dc[stylizer.job.plan.seen]).abs()
     moved = moved[moved > 0]
     assert len(moved) > 0.3 * hidden.sh_dc.numel()
     torch.testing.assert_close(moved, torch.full_like(moved, 0.05), rtol=1e-3, atol=0)
@@ -143,7 +146,7 @@ def test_learning_rate_falls_exponentially_to_its_end(
         return update(gradient, learning_rate)
 
     monkeypatch.setattr(stylizer._optimizer, "update", noted)
-    while stylizer.step < stylizer.total:
+    while stylizer.step < stylizer.job.total_steps:
         stylizer.run_step()
     assert rates == pytest.approx([0.1, 0.1**1.5, 0.01, 0.1**2.5, 0.001])
 
@@ -215,14 +218,14 @@ def test_the_style_is_taken_for_no_views_price(
 ) -> None:
     """The style takes a thousand seconds of the first step, which must not recur in the predicted remaining time."""
     stylizer, seen = make(tiny_weights, scene), list[Progress]()
-    style_targets, clock, late = stylizer.loss.targets.of_style, time.perf_counter, [0.0]
+    style_targets, clock, late = stylizer.job.loss.targets.of_style, time.perf_counter, [0.0]
 
     def slowly(*arguments: Any) -> Any:
         late[0] += 1000.0
         return style_targets(*arguments)
 
     monkeypatch.setattr(time, "perf_counter", lambda: clock() + late[0])
-    monkeypatch.setattr(stylizer.loss.targets, "of_style", slowly)
+    monkeypatch.setattr(stylizer.job.loss.targets, "of_style", slowly)
     run(stylizer, Callbacks(progress=seen.append))
     assert seen[0].seconds > 1000
     assert all(now.seconds_left < 1000 for now in seen)
@@ -234,7 +237,7 @@ def test_a_result_is_made_once_for_the_same_colors(tiny_weights: BackboneWeights
     assert stylizer.stylized() is first
     kept = stylizer.sh_dc.clone()
     with stylizer.with_colors(scene.sh_dc + 1):
-        assert torch.equal(stylizer.stylized()[stylizer.plan.seen], scene.sh_dc[stylizer.plan.seen] + 1)
+        assert torch.equal(stylizer.stylized()[stylizer.job.plan.seen], scene.sh_dc[stylizer.job.plan.seen] + 1)
     assert stylizer.stylized() is first
     assert torch.equal(stylizer.sh_dc, kept)
     stylizer.run_step()
@@ -276,8 +279,8 @@ def test_phase_1_is_left_out_where_there_is_one_scale(
     tiny_weights: BackboneWeights, scene: Scene, preset: PresetName, phase_1: int
 ) -> None:
     stylizer = make(tiny_weights, scene, preset=preset)
-    assert stylizer.plan.steps_coarse == phase_1
-    assert stylizer.total == phase_1 + 5
+    assert stylizer.job.plan.steps_coarse == phase_1
+    assert stylizer.job.total_steps == phase_1 + 5
 
 
 def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(tiny_weights: BackboneWeights) -> None:
@@ -306,17 +309,17 @@ def test_position_weights_are_for_views_with_an_empty_background(
     tiny_weights: BackboneWeights, thing: Any, preset: PresetName, values: dict[str, Any], weighted: bool
 ) -> None:
     stylizer = make(tiny_weights, thing(), preset=preset, **values)
-    assert stylizer.views.weighted is weighted
-    uncovered = stylizer.plan.survey.uncovered_share
+    assert stylizer.job.views.weighted is weighted
+    uncovered = stylizer.job.plan.survey.uncovered_share
     assert uncovered > 0.3 if thing is ball else uncovered < 0.01
-    assert (stylizer.views.target(0, [0]).coverage is not None) is weighted
+    assert (stylizer.job.views.target(0, [0]).coverage is not None) is weighted
 
 
 def test_views_that_see_nothing_are_left_out(tiny_weights: BackboneWeights, scene: Scene) -> None:
     settings = make_settings(steps_sos=3)
     stylizer = Stylizer.planned(scene, [blind_camera(), *cameras(2)], style(), settings, weights=tiny_weights)
     run(stylizer)
-    assert stylizer.views.covered == [1, 2]
+    assert stylizer.job.views.covered == [1, 2]
     assert {record.view for record in stylizer.history} == {1, 2}
 
 
@@ -373,7 +376,7 @@ class ClockEvent:
 def test_a_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scene: Scene) -> None:
     """The seconds of all parts are known when the step has finished, as with a GPU's events."""
     clock, events = (make(tiny_weights, scene) for _ in range(2))
-    events.timer = events.loss.timer = Timer(event=ClockEvent)
+    events.job.loss.timer = Timer(event=ClockEvent)
     for _ in range(6):  # the last step is on all scales
         expected, found = clock.run_step(), events.run_step()
         assert found.parts.keys() == expected.parts.keys()

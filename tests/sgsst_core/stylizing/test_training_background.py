@@ -81,7 +81,10 @@ def test_another_color_behind_is_what_is_rendered_with_it(scale: int) -> None:
 
 
 def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Color | None) -> tuple[Any, Any]:
-    target, targets = stylizer.views.target(index, scales, behind), stylizer.style_targets(stylizer.views.cameras[0])
+    target, targets = (
+        stylizer.job.views.target(index, scales, behind),
+        stylizer.job.style_targets(stylizer.job.views.cameras[0]),
+    )
     return stylizer._gradient(index, targets, target, scales, behind)
 
 
@@ -110,10 +113,10 @@ def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeight
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings(training_background="random", steps_sos=2)
     stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
-    coverage = stylizer.views.coverage(0)[0][..., None]
+    coverage = stylizer.job.views.coverage(0)[0][..., None]
     content = coverage * photo + (1 - coverage) * torch.tensor(COLOR)
-    expected = stylizer.loss.targets.of_view(content, coverage[..., 0]).content[0]
-    found = stylizer.views.target(0, [0], COLOR).content[0]
+    expected = stylizer.job.loss.targets.of_view(content, coverage[..., 0]).content[0]
+    found = stylizer.job.views.target(0, [0], COLOR).content[0]
     for tile, features in expected.items():
         torch.testing.assert_close(found[tile], features, rtol=1e-4, atol=1e-2)
 
@@ -144,7 +147,7 @@ def test_runs_repeat_and_resume_to_the_bit(tiny_weights: BackboneWeights, tmp_pa
     stopped = make(tiny_weights, ball(), training_background=kind, seed=3)
     for _ in range(4):
         stopped.run_step()
-    save_checkpoint(tmp_path / "c", Checkpoint(stopped.state(), stopped.plan, 1, "run", versions()), "job")
+    save_checkpoint(tmp_path / "c", Checkpoint(stopped.state(), stopped.job.plan, 1, "run", versions()), "job")
     loaded = load_checkpoint(tmp_path / "c", "job")
     assert (loaded.plan.training_background, loaded.plan.warm_start) == (kind, True)
     resumed.load_state(loaded.state)
@@ -161,7 +164,7 @@ def test_a_covered_scene_is_stylized_as_if_nothing_could_be_drawn(tiny_weights: 
     for stylizer in (plain, automatic):
         run(stylizer)
     assert torch.equal(plain.sh_dc, automatic.sh_dc)
-    told = [[line.item for line in stylizer.plan.decisions] for stylizer in (plain, automatic)]
+    told = [[line.item for line in stylizer.job.plan.decisions] for stylizer in (plain, automatic)]
     assert told[0] == told[1]
     assert "training_background" not in told[0]
 
@@ -169,8 +172,8 @@ def test_a_covered_scene_is_stylized_as_if_nothing_could_be_drawn(tiny_weights: 
 def test_the_paper_is_the_papers_for_scans_too(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("paper", steps_coarse=1, steps_sos=1)
     stylizer = Stylizer.planned(ball(), cameras(2), style(), settings, weights=tiny_weights)
-    assert (stylizer.plan.training_background, stylizer.plan.warm_start) == ("background", False)
-    assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.plan.seen])
+    assert (stylizer.job.plan.training_background, stylizer.job.plan.warm_start) == ("background", False)
+    assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.job.plan.seen])
 
 
 def test_losses_with_different_colors_behind_do_not_end_a_run_early(
@@ -193,6 +196,6 @@ def test_losses_with_different_colors_behind_do_not_end_a_run_early(
     assert run(drawn) == "finished"
     target = make(tiny_weights, ball(), training_background="random", target_loss=0.9, warm_start=False, steps_sos=90)
     assert run(target) == "target-loss"
-    assert mean_loss(target.evaluate(target.evaluation_views)) <= 0.9 * mean_loss(target.start())
-    assert target.step % target.round_length == 0
+    assert mean_loss(target.evaluate(target.job.evaluation_views)) <= 0.9 * mean_loss(target.start())
+    assert target.step % target.job.round_length == 0
     assert target.seconds_by_part["measuring"] > 0

@@ -166,8 +166,8 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
         "colors": stylizer.stylized(),
         "losses": [record.loss for record in stylizer.history],
         "views": [record.view for record in stylizer.history],
-        "after": stylizer.evaluate(stylizer.evaluation_views),
-        "plan": [decision.item for decision in stylizer.plan.decisions],
+        "after": stylizer.evaluate(stylizer.job.evaluation_views),
+        "plan": [decision.item for decision in stylizer.job.plan.decisions],
     }
 
 
@@ -235,7 +235,7 @@ def one_view_a_step_by_hand(views: list[int]) -> Tensor:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40)
     stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
-    gradients = [stylizer.gradient(view, range(stylizer.scale_count(view)))[0] for view in views]
+    gradients = [stylizer.gradient(view, range(stylizer.job.scale_count(view)))[0] for view in views]
     return torch.stack(gradients).mean(dim=0)
 
 
@@ -244,7 +244,7 @@ def test_gradients_of_a_steps_views_are_averaged() -> None:
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40, views_per_step=3)
     stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
     order = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
-    views = [order._next_view() for _ in range(3)]
+    views = [order._order.next_view() for _ in range(3)]
     stylizer.run_step()
     assert stylizer.sh_dc.grad is not None
     assert relative_error(stylizer.sh_dc.grad, one_view_a_step_by_hand(views)) < 1e-6
@@ -255,7 +255,7 @@ def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[st
     stylizer = Stylizer.planned(
         wall(), cameras(2, 192, 144), style(), settings, weights=tiny_weights(), collectives=collectives
     )
-    forward = stylizer.network.forward
+    forward = stylizer.job.network.forward
 
     def slowly(rgb: Tensor, **options: Any) -> Any:
         started = time.perf_counter()
@@ -264,12 +264,12 @@ def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[st
         return result
 
     if collectives.rank == 1:
-        stylizer.network.forward = slowly  # type: ignore[method-assign]
+        stylizer.job.network.forward = slowly  # type: ignore[method-assign]
     before = stylizer.gradient(0, [0])[0]
     colors = stylizer.sh_dc.detach().clone()
     for _ in range(8):
         stylizer.run_step()
-    speeds = stylizer.loss.divider.speeds
+    speeds = stylizer.job.loss.divider.speeds
     with torch.no_grad():
         stylizer.sh_dc.copy_(colors)
     return {"speeds": speeds, "before": before, "after": stylizer.gradient(0, [0])[0]}

@@ -176,11 +176,11 @@ def leave_out(collectives: Collectives) -> str | int:
         )
     except RankLeftOut:
         return "left out"
-    decision = next(decision for decision in stylizer.plan.decisions if decision.item == "ranks")
+    decision = next(decision for decision in stylizer.job.plan.decisions if decision.item == "ranks")
     assert "only add communication" in decision.reason
     for _ in range(3):
         stylizer.run_step()
-    return stylizer.collectives.size
+    return stylizer.job.collectives.size
 
 
 def test_ranks_that_would_only_add_communication_are_left_out() -> None:

@@ -34,7 +34,7 @@ def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int],
         counts.clear()
         losses.append(stylizer.run_step().loss)
         waits.append(counts.waits.total())
-    return stylizer.stylized(), losses, waits, f"{stylizer.plan.device} {stylizer.plan.uncached}"
+    return stylizer.stylized(), losses, waits, f"{stylizer.job.plan.device} {stylizer.job.plan.uncached}"
 
 
 @pytest.mark.slow

@@ -152,11 +152,11 @@ def run_two_steps(collectives: Collectives) -> dict[str, Any]:
     settings = make_settings("standard", steps_coarse=0, steps_sos=4, coarsest_side=40, keep=("ranks", "unseen"))
     camera = cameras(1, WIDTH, HEIGHT)
     stylizer = Stylizer.planned(wall(), camera, style(), settings, weights=tiny_weights(), collectives=collectives)
-    scales = stylizer.scale_count(0)
+    scales = stylizer.job.scale_count(0)
     return {
         "steps": [stylizer.run_step().sent for _ in range(2)],
         "scales": scales,
-        "shown": stylizer.plan.survey.shown,
+        "shown": stylizer.job.plan.survey.shown,
     }
 
 

@@ -1,0 +1,349 @@
+"""Immutable context of a stylization: plan and settings of a job, and the objects that are prepared from its inputs."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from sgsst_core.budget import forget_device_peak, least_intersection_memory, memory_for
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.loss.graphs import LossGraphs
+from sgsst_core.loss.sos import SosLoss, make_loss
+from sgsst_core.loss.targets import StyleTargets
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel.division import Size
+from sgsst_core.planning.choices import ends_with_transfer
+from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
+from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.planner import make_plan
+from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.regions.definition import Regions
+from sgsst_core.scene.camera import Camera, fit_cameras, spread
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.ahead import PhotoLoader
+from sgsst_core.stylizing.job_styles import JobStyles
+from sgsst_core.stylizing.refining import refine, refined
+from sgsst_core.stylizing.schedule import Phase, planned_phases
+from sgsst_core.stylizing.team import Team
+from sgsst_core.stylizing.views import Views
+from sgsst_core.timing import Timer
+
+
+class StyleTargetCache:
+    """Targets of the job's styles by view size, computed when a view first needs them.
+
+    Args:
+        styles: Styles of the job, on the network's device.
+        loss: Loss that computes the targets.
+
+    Attributes:
+        seconds: Time in seconds spent on computing targets.
+    """
+
+    def __init__(self, styles: JobStyles, loss: SosLoss) -> None:
+        self.seconds = 0.0
+        self._styles = styles
+        self._loss = loss
+        self._targets: dict[Size, StyleTargets] = {}
+
+    def __call__(self, camera: Camera) -> StyleTargets:
+        """Return the targets for views of the camera's size."""
+        size = (camera.height, camera.width)
+        if size not in self._targets:
+            started = time.perf_counter()
+            self._targets[size] = self._styles.targets(self._loss, size)
+            self.seconds += time.perf_counter() - started
+        return self._targets[size]
+
+
+@dataclass(frozen=True)
+class StylizationJob:
+    """Context of a stylization, which steps only read; `prepare_job` creates it.
+
+    Attributes:
+        plan: Plan of the job.
+        settings: Settings of the job.
+        scene: Scene with the SH attenuation of the settings applied.
+        sh_degree: SH degree of the scene before the attenuation.
+        styles: Styles of the job, on the CPU.
+        weights: Weights of the feature network.
+        network: Feature network.
+        loss: SOS loss of one view.
+        graphs: Replacement for `loss` in steps; None if the plan uses no graphs.
+        views: Views of the Gaussians that the views show.
+        photos: Function that loads the content image of a camera; None for unstylized renders.
+        team: Ranks that take part.
+        memory_limit: Memory budget in bytes of all ranks on one machine together. It determines the partition, and
+            thereby rounding, so it is identical on all ranks.
+        memory: Memory budget in bytes of this rank.
+        style_targets: Targets of the styles by view size.
+    """
+
+    plan: Plan
+    settings: Settings
+    scene: Scene
+    sh_degree: int
+    styles: JobStyles
+    weights: BackboneWeights
+    network: FeatureNetwork
+    loss: SosLoss
+    graphs: LossGraphs | None
+    views: Views
+    photos: PhotoLoader | None
+    team: Team
+    memory_limit: int
+    memory: int
+    style_targets: StyleTargetCache
+
+    @property
+    def style(self) -> Style:
+        """Style of all Gaussians that are not in a region with its own style."""
+        return self.styles.own
+
+    @property
+    def regions(self) -> Regions | None:
+        """Regions with their own style, or frozen; None for one style everywhere."""
+        return self.styles.regions
+
+    @property
+    def collectives(self) -> Collectives:
+        """All ranks that take part."""
+        return self.team.everybody
+
+    @property
+    def group(self) -> Collectives:
+        """Ranks that process the same views as this one."""
+        return self.team.group
+
+    @property
+    def timer(self) -> Timer:
+        """Timer of the activities of a step."""
+        return self.loss.timer
+
+    @property
+    def schedule(self) -> list[Phase]:
+        """Phases of the job."""
+        return planned_phases(self.plan, self.settings)
+
+    @property
+    def total_steps(self) -> int:
+        """Number of steps of all phases."""
+        return sum(phase.steps for phase in self.schedule)
+
+    @property
+    def round_length(self) -> int:
+        """Number of steps in which every view is visited once."""
+        return math.ceil(len(self.views.covered) / self.settings.views_per_step)
+
+    @property
+    def evaluation_views(self) -> list[int]:
+        """Indices of the plan's `loss_views`, evenly spread over the views that see anything.
+
+        The contact sheet shows the same views.
+        """
+        return spread(self.views.covered, self.plan.loss_views)
+
+    @property
+    def stops_early(self) -> bool:
+        """Whether the run ends when its losses stop falling; this requires a constant background."""
+        return self.settings.early_stop and self.plan.training_background == "background"
+
+    @property
+    def transfers_last(self) -> bool:
+        """Whether the style's colors are transferred to results once more: see `ends_with_transfer`."""
+        return ends_with_transfer(self.settings, warm=self.plan.warm_start)
+
+    @property
+    def keeps_chroma(self) -> bool:
+        """Whether only luminance changes."""
+        return self.settings.preserve_colors == "luminance"
+
+    def scale_count(self, index: int) -> int:
+        """Return n_s of a view."""
+        camera = self.views.cameras[index]
+        return self.loss.tiling.scale_count((camera.height, camera.width))
+
+    def scales(self, index: int) -> list[int]:
+        """Return the scales of a view with a positive weight, finest first."""
+        camera = self.views.cameras[index]
+        return self.loss.tiling.scales((camera.height, camera.width))
+
+
+def plan_job(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor | Style,
+    settings: Settings,
+    *,
+    weights: BackboneWeights | None = None,
+    photos: PhotoLoader | None = None,
+    rasterizer: str | None = None,
+    collectives: Collectives = ALONE,
+    regions: Regions | None = None,
+) -> StylizationJob:
+    """Plan and prepare a job; see `make_plan` for `weights`, `rasterizer` and exceptions.
+
+    If the settings request refinement, the job contains the refined scene.
+    """
+    weights, style = weights or load_network_weights("auto"), Style.of(style)
+    refinement = refine(
+        scene,
+        cameras,
+        style,
+        settings,
+        weights=weights,
+        rasterizer=rasterizer,
+        collectives=collectives,
+        regions=regions,
+    )
+    scene, regions = refined(scene, refinement), regions and regions.refined(refinement)
+    plan, planning_context = make_plan(
+        scene,
+        cameras,
+        settings,
+        weights=weights,
+        rasterizer=rasterizer,
+        collectives=collectives,
+        style=style,
+        regions=regions,
+        refinement=refinement,
+    )
+    return prepare_job(
+        plan,
+        scene,
+        cameras,
+        style,
+        settings,
+        weights=weights,
+        photos=photos,
+        collectives=collectives,
+        planning_context=planning_context,
+        regions=regions,
+    )
+
+
+def prepare_job(
+    plan: Plan,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor | Style,
+    settings: Settings,
+    *,
+    weights: BackboneWeights,
+    photos: PhotoLoader | None = None,
+    collectives: Collectives = ALONE,
+    planning_context: PlanningContext | None = None,
+    regions: Regions | None = None,
+) -> StylizationJob:
+    """Prepare a planned job. Every rank calls this with the same arguments.
+
+    Args:
+        plan: Plan for this scene, these cameras and settings: from `make_plan`, or from an earlier run of the same job.
+        scene: Scene to stylize, refined if the plan says so.
+        cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
+        style: Image [H, W, 3] in 0..1, or a mixture of several images.
+        settings: Settings of the job.
+        weights: Weights of the feature network.
+        photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
+            for unstylized renders.
+        collectives: Ranks that stylize the scene together.
+        planning_context: Planning context of the plan; None to create its objects again.
+        regions: Regions for which the plan was made, each with its own style or frozen; None for one style everywhere.
+
+    Raises:
+        RankLeftOut: If the job continues without this rank.
+    """
+    weights = weights_for(weights, settings)
+    blend_weights = plan.survey.total_blend_weights
+    regions = regions and regions.resolved(blend_weights)
+    styles = JobStyles.prepared(Style.of(style), regions, settings, scene.sh_dc, blend_weights)
+    forget_device_peak(plan.device)
+    network = (
+        planning_context.network if planning_context else make_network(weights, settings, plan.precision, plan.device)
+    )
+    network.search = plan.search
+    team = Team(plan, settings, collectives)
+    memory_limit = settings.memory_limit or plan.memory_limit
+    memory = memory_limit // sharing_memory(team.everybody, plan.device)
+    loss = make_loss(
+        network, settings, memory_for("activations", memory), timer=Timer(plan.device), collectives=team.group
+    )
+    attenuated = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
+    rendered = attenuated if plan.seen.all() else attenuated.subset(plan.seen)
+    rendered = rendered if "sh" in settings.keep else rendered.without_zero_bands()
+    rasterizer = _make_rasterizer(plan, settings, rendered, memory, planning_context)
+    views = Views(
+        rendered,
+        fit_cameras(cameras, settings),
+        rasterizer,
+        loss,
+        covered=list(plan.covered),
+        weighted=plan.weighted,
+        photos=photos,
+        memory=memory_for("views", memory) - _least_intersection_bytes(plan, memory),
+        keep_content="content" not in settings.keep,
+        clamp_aware_gradient=settings.clamp_aware_gradient,
+        regions=plan.survey.regions if plan.weighted else None,
+        background=settings.background,
+        drawn=plan.training_background != "background",
+        maps=styles.maps(rasterizer.repeatable, plan.seen),
+        collectives=team.group,
+    )
+    return StylizationJob(
+        plan=plan,
+        settings=settings,
+        scene=attenuated,
+        sh_degree=scene.sh_degree,
+        styles=styles,
+        weights=weights,
+        network=network,
+        loss=loss,
+        graphs=LossGraphs(loss) if plan.graphs and team.group.size == 1 else None,
+        views=views,
+        photos=photos,
+        team=team,
+        memory_limit=memory_limit,
+        memory=memory,
+        style_targets=StyleTargetCache(styles.to(network.device), loss),
+    )
+
+
+def _make_rasterizer(
+    plan: Plan, settings: Settings, rendered: Scene, memory: int, planning_context: PlanningContext | None
+) -> Rasterizer:
+    """Return the plan's rasterizer of the rendered Gaussians."""
+    budget = memory_for("rasterizer", memory)
+    whole = planning_context.rasterizer if planning_context else None
+    if whole is None:
+        uncached = make_rasterizer(
+            plan.uncached, rendered, background=settings.background, near=settings.near, memory=budget
+        )
+    elif plan.seen.all():
+        uncached = whole
+    else:
+        uncached = whole.for_subset(rendered, plan.seen, budget)
+    if plan.cached_weights == "none":
+        return uncached
+    return CachedRasterizer(
+        rendered,
+        max_bytes=budget,
+        least_intersection_bytes=_least_intersection_bytes(plan, memory),
+        precision="half" if plan.cached_weights == "half" else "float32",
+        at_first_use=False,
+        uncached=uncached,
+    )
+
+
+def _least_intersection_bytes(plan: Plan, memory: int) -> int:
+    """Return the budget for tile intersections next to cached weights, which is taken from the memory for views."""
+    shared = plan.cached_weights != "none" and not RASTERIZERS[plan.uncached].on_gpu
+    return least_intersection_memory(memory) if shared else 0
