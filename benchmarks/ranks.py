@@ -127,8 +127,8 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
     peak = collectives.all_gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
     if alone is None:
         return {}
-    loss = alone.loss
-    camera = alone.views.cameras[0]
+    loss = alone.job.loss
+    camera = alone.job.views.cameras[0]
     pieces = pieces_of((camera.height, camera.width), loss.tiling, None)
     areas = [[tile.outer.pixels for tile in loss.divider.tiles(piece.size)] for piece in pieces]
     halo = loss.network.halo
@@ -144,7 +144,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "system_seconds_by_rank": [statistics.median(seconds) for seconds in kernel],
         "peak_gb_by_rank": peak,
         "bytes_sent": sent,
-        "shown": together.plan.survey.shown,
+        "shown": together.job.plan.survey.shown,
         "steps": steps,
         "pieces": [[piece.scale, *piece.size] for piece in pieces],
         "halo": halo,
