@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import inspect
+import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -46,7 +47,7 @@ def store(service: Service) -> Iterator[Store]:
 @pytest.fixture(autouse=True)
 def no_waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Remove the waits between retries; the number of retries stays the same."""
-    monkeypatch.setattr("api.client.events.FIRST_WAIT", 0.0)
+    monkeypatch.setattr("api.client.async_client.FIRST_WAIT", 0.0)
     with stamina.set_testing(True, attempts=TRIES):
         yield
 
@@ -83,51 +84,43 @@ class Awaited:
 both = pytest.mark.parametrize("connect", [Client, Awaited], ids=["Client", "AsyncClient"])
 
 
-# --- one source ----------------------------------------------------------------------------------------------------
-
-
-METHODS = {
-    "submit": "Job",
-    "plan": "dict[str, Any]",
-    "upload": "str",
-    "job": "Job",
-    "jobs": "Iterator[Job]",
-    "watch": "Iterator[Event]",
-    "wait": "Job",
-    "artifacts": "list[dict[str, Any]]",
-    "download": "Path",
-    "cancel": "Job",
-    "retry": "Job",
-    "delete": "None",
-}
+# --- one interface ----------------------------------------------------------------------------------------------------
 
 
 def public(kind: type) -> dict[str, Any]:
-    found = {name for name in dir(kind) if not name.startswith("_")}
-    return {name: getattr(kind, name) for name in found if callable(getattr(kind, name))}
+    names = {name for name in dir(kind) if not name.startswith("_")}
+    return {name: getattr(kind, name) for name in names if callable(getattr(kind, name))}
 
 
 def test_both_have_the_same_methods() -> None:
     blocking, awaiting = public(Client), public(AsyncClient)
     assert blocking.keys() == awaiting.keys()
-    assert blocking.keys() == {*METHODS, "close"}
+    for name, method in blocking.items():
+        assert method.__doc__, name
+        assert method.__doc__ == awaiting[name].__doc__
+        assert inspect.signature(method) == inspect.signature(awaiting[name])
+        assert inspect.isgeneratorfunction(method) == inspect.isasyncgenfunction(awaiting[name])
 
 
-@pytest.mark.parametrize("name", [*METHODS, "close"])
-def test_each_method_has_one_signature_and_one_docstring(name: str) -> None:
-    blocking, awaiting = getattr(Client, name), getattr(AsyncClient, name)
-    first, second = inspect.signature(blocking), inspect.signature(awaiting)
-    assert first.parameters == second.parameters
-    assert first.return_annotation == METHODS.get(name, "None")
-    assert blocking.__doc__
-    assert blocking.__doc__ == awaiting.__doc__
-    assert blocking.__name__ == awaiting.__name__ == name
-    if inspect.isgeneratorfunction(blocking):
-        assert inspect.isasyncgenfunction(awaiting)
-        assert f"Async{first.return_annotation}" == second.return_annotation
-    else:
-        assert inspect.iscoroutinefunction(awaiting)
-        assert first.return_annotation == second.return_annotation
+def test_iteration_may_stop_early(service: Service, files: dict[str, Path]) -> None:
+    with Client(service.url) as client:
+        created = [client.submit(files["scene"], files["style"], orbit=2).id for _ in range(2)]
+        for job in client.jobs():
+            assert job.id == created[-1]
+            break
+        assert next(iter(client.watch(created[0]))).kind == "status"
+        assert client.job(created[0]).id == created[0]
+
+
+def test_interrupted_call_is_canceled(service: Service, files: dict[str, Path]) -> None:
+    """Ctrl-C ends a wait for a job that does not end, and the client can be used further."""
+    with Client(service.url) as client:
+        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+        main = threading.main_thread().ident or 0
+        threading.Timer(1.0, signal.pthread_kill, (main, signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            client.wait(job_id)
+        assert client.cancel(job_id).finished
 
 
 # --- the same scenario through both --------------------------------------------------------------------------------
@@ -205,7 +198,7 @@ def finish(store: Store, service: Service, job_id: str, content: bytes, folder: 
 def test_all_jobs_are_listed_page_by_page(
     connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("api.client.client._PAGE", 2)
+    monkeypatch.setattr("api.client.async_client._PAGE", 2)
     with connect(service.url) as client:
         made = [client.submit(files["scene"], files["style"], orbit=2, seed=number).id for number in range(5)]
         assert [job.id for job in client.jobs()][:5] == made[::-1]
@@ -232,7 +225,7 @@ def test_a_plan_queues_nothing_and_bad_files_are_refused(
 
 
 @both
-def test_a_plan_tells_how_far_it_is(connect: Any, service: Service, files: dict[str, Path]) -> None:
+def test_plan_reports_progress(connect: Any, service: Service, files: dict[str, Path]) -> None:
     options = {"preset": "preview", "backbone": "vgg16", "resolution": 64, "cameras": files["cameras"]}
     told: list[tuple[int, int]] = []
     with connect(service.url) as client:
@@ -312,7 +305,7 @@ class Relay:
 
 
 @both
-def test_a_download_goes_on_where_it_broke_off(
+def test_a_download_resumes_after_a_lost_connection(
     connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
@@ -332,7 +325,7 @@ def test_a_download_goes_on_where_it_broke_off(
 
 
 @both
-def test_a_part_of_something_else_is_thrown_away(
+def test_foreign_partial_file_is_discarded(
     connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
@@ -357,7 +350,7 @@ def test_a_part_of_something_else_is_thrown_away(
 
 
 @both
-def test_events_go_on_where_they_broke_off(
+def test_events_resume_after_a_lost_connection(
     connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
@@ -373,7 +366,7 @@ def test_events_go_on_where_they_broke_off(
 
 
 @both
-def test_uploads_go_on_where_they_broke_off(
+def test_uploads_resume_after_a_lost_connection(
     connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The response to a part is lost. The client sends the part again; the service refuses it as already received."""
@@ -388,7 +381,7 @@ def test_uploads_go_on_where_they_broke_off(
 
 
 @both
-def test_who_never_answers_is_asked_so_often(connect: Any, service: Service, tmp_path: Path) -> None:
+def test_silent_service_is_retried_a_limited_number_of_times(connect: Any, service: Service, tmp_path: Path) -> None:
     with Relay(int(service.environment["SGSST_PORT"]), [1] * 100) as relay, connect(relay.url) as client:
         for count, ask in enumerate(
             (

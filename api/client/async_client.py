@@ -1,0 +1,209 @@
+"""Asynchronous client of the service. `api.client.client` has the same methods for programs without an event loop."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import anyio
+import httpx
+from httpx_sse import aconnect_sse
+
+from api.client import uploads
+from api.client.answers import Event, Job, checked, unreachable
+from api.client.downloads import Download, Progress
+from api.client.transport import TRIES, Transport
+
+#: Jobs per page of a list.
+_PAGE = 200
+#: Seconds of silence after which a stream is considered dead; the service sends something every 15 s.
+_SILENCE_SECONDS = 60.0
+#: Seconds to wait before reconnecting to a stream. The wait doubles with each further connection without an event.
+FIRST_WAIT = 1.0
+
+
+def no_progress(done: int, total: int) -> None:
+    """Ignore progress."""
+
+
+class AsyncClient:
+    """Client of the service over HTTP.
+
+    Args:
+        url: Address of the service. None uses the environment variable SGSST_URL, or port 8000 of this machine if the
+            variable is not set.
+        key: API key; None uses the environment variable SGSST_KEY.
+
+    Attributes:
+        url: Address of the service.
+    """
+
+    def __init__(self, url: str | None = None, key: str | None = None) -> None:
+        self._transport = Transport(url, key)
+        self.url = self._transport.url
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *ignored: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._transport.http.aclose()
+
+    async def submit(
+        self,
+        /,
+        scene: str | Path,
+        style: str | Path | Sequence[str | Path],
+        *,
+        cameras: str | Path | None = None,
+        photos: str | Path | None = None,
+        webhook: str | None = None,
+        progress: Progress = no_progress,
+        **parameters: Any,
+    ) -> Job:
+        """Queue a job. Large files are uploaded in parts, and resume after a lost connection.
+
+        Args:
+            scene: Scene file.
+            style: Style image, or several that are mixed with the weights of the parameter `style_weights`.
+            cameras: Camera file or folder, as for `sgsst stylize --cameras`; None requires the parameter `orbit`.
+            photos: Folder of photos for the content term; None for unstylized renders.
+            webhook: URL that is called when the job has ended; None for none.
+            progress: Callback that receives the uploaded bytes and the total bytes of all large files.
+            parameters: Fields of `JobParameters`; those that are None are not sent.
+
+        Raises:
+            RequestError: If an input cannot be used; the message says which and why.
+        """
+        files = Path(scene), _paths(style), _path(cameras), _path(photos)
+        created = await uploads.create_job(self._transport, files, parameters, webhook=webhook, progress=progress)
+        return Job.of(created)
+
+    async def plan(
+        self,
+        /,
+        scene: str | Path,
+        style: str | Path | Sequence[str | Path],
+        *,
+        cameras: str | Path | None = None,
+        photos: str | Path | None = None,
+        progress: Progress = no_progress,
+        planning: Progress = no_progress,
+        **parameters: Any,
+    ) -> dict[str, Any]:
+        """Plan a job without queueing it, and return the plan. The other arguments are the same as for `submit`.
+
+        Args:
+            planning: Callback that receives the number of surveyed views and the number of all views.
+        """
+        files = Path(scene), _paths(style), _path(cameras), _path(photos)
+        return await uploads.plan_job(self._transport, files, parameters, progress=progress, planning=planning)
+
+    async def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> str:
+        """Upload a file in parts, and return the upload's id. Any number of jobs may use the upload."""
+        path = Path(path)
+        return await uploads.upload(self._transport, path, name or path.name, progress)
+
+    async def job(self, job_id: str) -> Job:
+        """Return the current state of a job."""
+        return Job.of((await self._transport.call("GET", f"/v1/jobs/{job_id}")).json())
+
+    async def jobs(self, *, status: Sequence[str] = (), limit: int | None = None) -> AsyncIterator[Job]:
+        """Yield the jobs of this key, newest first."""
+        left = limit
+        params: dict[str, Any] = {"status": list(status)}
+        while left is None or left > 0:
+            params["limit"] = min(left or _PAGE, _PAGE)
+            page = (await self._transport.call("GET", "/v1/jobs", params=params)).json()
+            for data in page["jobs"]:
+                yield Job.of(data)
+            params["cursor"] = page["next_cursor"]
+            left = None if left is None else left - len(page["jobs"])
+            if params["cursor"] is None:
+                return
+
+    async def watch(self, job_id: str, after: int = 0) -> AsyncIterator[Event]:
+        """Yield the events of a job as they happen, until it has ended. No event is lost when a connection breaks."""
+        failures = 0
+        timeout = httpx.Timeout(30.0, read=_SILENCE_SECONDS)
+        while True:
+            headers = {"Last-Event-ID": str(after)} if after else {}
+            path = f"/v1/jobs/{job_id}/events"
+            try:
+                async with aconnect_sse(self._transport.http, "GET", path, headers=headers, timeout=timeout) as source:
+                    if source.response.status_code != httpx.codes.OK:  # 204: no events will follow
+                        await source.response.aread()
+                        checked(source.response)
+                        return
+                    async for sent in source.aiter_sse():
+                        if sent.data:  # messages without data only keep the connection alive
+                            event = Event.of(sent)
+                            after, failures = event.id, 0
+                            yield event
+            except httpx.TransportError as error:
+                # stamina cannot do this: each event resets the count of failures
+                failures += 1
+                if failures >= TRIES:
+                    raise unreachable(self.url, error) from None
+                await anyio.sleep(FIRST_WAIT * 2.0 ** (failures - 1))
+                continue
+            if (await self.job(job_id)).finished:
+                return
+
+    async def wait(self, job_id: str) -> Job:
+        """Wait until a job has ended, and return its final state."""
+        async for _ in self.watch(job_id):
+            pass
+        return await self.job(job_id)
+
+    async def artifacts(self, job_id: str) -> list[dict[str, Any]]:
+        """Return the files that a job has made so far."""
+        response = await self._transport.call("GET", f"/v1/jobs/{job_id}/artifacts")
+        artifacts: list[dict[str, Any]] = response.json()["artifacts"]
+        return artifacts
+
+    async def download(
+        self,
+        job_id: str,
+        target: str | Path,
+        name: str = "stylized.ply",
+        progress: Progress = no_progress,
+        form: str | None = None,
+    ) -> Path:
+        """Download a file of a job, and check its SHA-256. If part of it was downloaded before, resume from there.
+
+        Args:
+            form: Format of stylized.ply, such as "spz"; None for PLY. The service converts the file on the
+                first request.
+
+        Raises:
+            RequestError: If the file does not exist, or does not exist yet.
+        """
+        target = Path(target)
+        query = f"?format={form}" if form else ""
+        await self._transport.fetch(Download(f"/v1/jobs/{job_id}/artifacts/{name}{query}", target, progress))
+        return target
+
+    async def cancel(self, job_id: str) -> Job:
+        """Cancel a job."""
+        return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/cancel")).json())
+
+    async def retry(self, job_id: str) -> Job:
+        """Queue a failed or canceled job again."""
+        return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/retry")).json())
+
+    async def delete(self, job_id: str) -> None:
+        """Delete a job that has ended, with its results."""
+        await self._transport.call("DELETE", f"/v1/jobs/{job_id}")
+
+
+def _paths(value: str | Path | Sequence[str | Path]) -> list[Path]:
+    return [Path(value)] if isinstance(value, str | Path) else [Path(each) for each in value]
+
+
+def _path(value: str | Path | None) -> Path | None:
+    return None if value is None else Path(value)
