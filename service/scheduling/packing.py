@@ -4,7 +4,7 @@ Jobs do not share GPUs. A job that does not specify `workers` gets a portion of 
 job waits, one if many do, but never more than its size justifies (`service.scheduling.job_size`). The job's plan then
 decides from measured times how many of them make the job faster, and the others are released
 (`service.scheduling.running`). A job also waits if the running jobs leave too little of the machine's memory for its
-scene. On a Ray cluster, Ray tracks the memory per machine (`worker.ranks.placement`).
+scene. On a Ray cluster, Ray tracks the memory per machine (`worker.ranks.cluster`).
 
 Without GPUs, slots stand for fractions of the CPU and of the memory. There is one slot unless the operator sets
 `parallel_jobs`, because a single job uses all cores well. A job that needs more memory than one slot has takes several

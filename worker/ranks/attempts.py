@@ -16,14 +16,20 @@ from typing import TYPE_CHECKING
 from sgsst_core.errors import RanksFailedError
 from worker.options import RunOptions
 from worker.ranks.cluster import Cluster
-from worker.ranks.ending import end_rank, end_ranks
 from worker.ranks.failure_policy import FailedAttempt, Failure, GiveUp, RaiseError, decide, first_line
 from worker.ranks.host_memory import scene_bytes
 from worker.ranks.listener import Listener, Relay
-from worker.ranks.polling import look_for_losses, poll_ranks
 from worker.ranks.rank import RankProcess, RankTask
-from worker.ranks.rank_group import AttemptFailedError, RankGroup, RankHandle
-from worker.ranks.starting import start_ranks
+from worker.ranks.rank_group import (
+    AttemptFailedError,
+    RankGroup,
+    RankHandle,
+    end_rank,
+    end_ranks,
+    look_for_losses,
+    poll_ranks,
+    start_ranks,
+)
 
 if TYPE_CHECKING:
     from worker.execute import Result

@@ -8,9 +8,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from worker.ranks.cluster import Cluster
+from worker.ranks.cluster import Cluster, NoRoomError, _bundle, reserve
 from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
-from worker.ranks.placement import NoRoomError, _bundle, reserve
 
 GB = 1_000_000_000
 
