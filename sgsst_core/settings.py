@@ -291,6 +291,11 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
 
     Raises:
         SettingsError: If the preset is unknown, or a value is out of range.
+
+    Example:
+        >>> settings = make_settings("preview", steps_sos=10)
+        >>> settings.steps_sos, settings.max_resolution
+        (10, 640)
     """
     if preset not in _PRESETS:
         raise SettingsError(f"There is no preset {preset!r}. Choose one of {', '.join(_PRESETS)}.")

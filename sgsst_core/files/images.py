@@ -53,6 +53,11 @@ def load_image(path: Path) -> Tensor:
     Raises:
         ImageError: If the file is missing, not an image or truncated, or has more than MAX_PIXELS pixels or (JPEG)
             MAX_JPEG_SCANS scans. Both limits are checked before decoding.
+
+    Example:
+        >>> image = load_image(Path("style.png"))
+        >>> image.dtype, image.shape[2]
+        (torch.float32, 3)
     """
     with _opened(path) as image:
         if image.format in ("JPEG", "MPO"):

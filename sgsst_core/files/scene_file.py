@@ -119,6 +119,11 @@ def read_scene(
     Raises:
         SceneError: If the file cannot be read, is truncated, is not a 3DGS scene, has a wrong header, no Gaussians or
             invalid values, or has changed while it was read.
+
+    Example:
+        >>> source = read_scene(Path("scene.ply"))
+        >>> tuple(source.scene.means.shape)
+        (616, 3)
     """
     header = read_scene_header(path)
     if isinstance(header, SpzHeader):

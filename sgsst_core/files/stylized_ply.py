@@ -48,6 +48,12 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
         SceneError: If the source file has changed since it was read, or cannot store attenuated coefficients.
         OutputError: If the target cannot be written.
         ValueError: If sh_dc has the wrong shape or non-finite values.
+
+    Example:
+        >>> source = read_scene(Path("scene.ply"))
+        >>> write_stylized(source, Path("gray.ply"), torch.zeros_like(source.scene.sh_dc))
+        >>> bool(read_scene(Path("gray.ply")).scene.sh_dc.any())
+        False
     """
     if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
         raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")

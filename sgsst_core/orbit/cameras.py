@@ -78,6 +78,11 @@ def orbit(
     Raises:
         SettingsError: If count or size are below 1, `up` is zero or not finite, or elevation or radius are out of
             range.
+
+    Example:
+        >>> cameras = orbit(read_scene(Path("scene.ply")).scene, 8, width=320, height=240)
+        >>> len(cameras), cameras[0].width
+        (8, 320)
     """
     axis = _checked(count, up, elevations, radius, (width, height))
     subject = scene if isinstance(scene, Subject) else find_subject(scene)

@@ -30,6 +30,11 @@ class Camera:
         world_to_camera: [4, 4] float64 rigid transform.
         resolution: Longer side in pixels of the 4:3 view with the same number of pixels, for cameras whose aspect ratio
             was fitted to the content. None if resolutions refer to the camera's own longer side.
+
+    Example:
+        >>> camera = Camera("front", 640, 480, 500.0, 500.0, 320.0, 240.0, torch.eye(4, dtype=torch.float64))
+        >>> camera.side, camera.center.tolist()
+        (640, [0.0, 0.0, 0.0])
     """
 
     name: str

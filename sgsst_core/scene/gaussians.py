@@ -27,6 +27,11 @@ class Scene:
         opacities: [N], logits (as in files).
         sh_dc: [N, 3], degree-0 coefficients, which stylization optimizes.
         sh_rest: [N, K, 3] with K = 0, 3, 8 or 15 for SH degree 0 to 3.
+
+    Example:
+        >>> scene = read_scene(Path("scene.ply")).scene
+        >>> len(scene), scene.sh_degree, tuple(scene.sh_dc.shape)
+        (616, 0, (616, 3))
     """
 
     means: Tensor  # [N, 3]

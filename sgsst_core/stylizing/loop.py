@@ -79,6 +79,15 @@ class Callbacks:
         preview_seconds: Seconds between previews.
         measure: Called with the stylizer after each step for which it is due; its time does not count toward
             `Stylizer.seconds`.
+
+    Example:
+        >>> steps = []
+        >>> callbacks = Callbacks(progress=lambda progress: steps.append(progress.step))
+        >>> scene, cameras = read_scene(Path("scene.ply")).scene, read_cameras(Path("cameras.json"))
+        >>> settings = make_settings("preview", steps_sos=2)
+        >>> colors = stylize(scene, cameras, load_image(Path("style.png")), settings, callbacks=callbacks)
+        >>> steps
+        [1, 2]
     """
 
     progress: Callable[[Progress], None] | None = None
@@ -91,7 +100,15 @@ class Callbacks:
 
 
 def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
-    """Iterate to the end of the schedule, unless a limit in the settings or `callbacks.stop` ends the run earlier."""
+    """Iterate to the end of the schedule, unless a limit in the settings or `callbacks.stop` ends the run earlier.
+
+    Example:
+        >>> scene, cameras = read_scene(Path("scene.ply")).scene, read_cameras(Path("cameras.json"))
+        >>> settings = make_settings("preview", steps_sos=2)
+        >>> stylizer = Stylizer.planned(scene, cameras, load_image(Path("style.png")), settings)
+        >>> run(stylizer)
+        'finished'
+    """
     try:
         return _iterate(stylizer, callbacks or Callbacks())
     finally:
@@ -242,6 +259,12 @@ def stylize(
     Returns:
         New sh_dc [N, 3], float32 on the CPU; everything else of the scene is unchanged. For a refined scene, N is the
             number of its Gaussians; use `Stylizer.planned` to get that scene.
+
+    Example:
+        >>> scene, cameras = read_scene(Path("scene.ply")).scene, read_cameras(Path("cameras.json"))
+        >>> settings = make_settings("preview", steps_sos=2, seed=1)
+        >>> stylize(scene, cameras, load_image(Path("style.png")), settings).shape
+        torch.Size([616, 3])
     """
     stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, photos=photos)
     run(stylizer, callbacks)

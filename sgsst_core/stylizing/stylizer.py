@@ -107,6 +107,13 @@ class Stylizer:
         """Plan a job and create its stylizer; see `plan_job`.
 
         If the settings request refinement, the job contains the refined scene.
+
+        Example:
+            >>> scene, cameras = read_scene(Path("scene.ply")).scene, read_cameras(Path("cameras.json"))
+            >>> settings = make_settings("preview", steps_sos=2)
+            >>> stylizer = Stylizer.planned(scene, cameras, load_image(Path("style.png")), settings)
+            >>> stylizer.job.total_steps
+            2
         """
         job = plan_job(
             scene,
