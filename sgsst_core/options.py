@@ -7,6 +7,7 @@ pydantic cannot express are added by `Annotated[..., Option(...)]`.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, get_args, get_origin
 
@@ -59,6 +60,8 @@ class Option:
         default: Description of the default if its value is None or not self-explanatory; empty to display the value.
         name: Name shown to users; empty for the field's own.
         instead: Name of the option that sets this field, which is then not an option itself; empty if it is an option.
+        parse: Parser of command-line text, for values that are more than a number or a word.
+        syntax: Command-line syntax that `parse` accepts; replaces the final period of the help text.
     """
 
     unit: str = ""
@@ -67,6 +70,8 @@ class Option:
     default: str = ""
     name: str = ""
     instead: str = ""
+    parse: Callable[[str], object] | None = None
+    syntax: str = ""
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """Add unit and default to JSON schemas, and thereby to the OpenAPI document."""

@@ -19,6 +19,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
+from sgsst_core.option_parsers import STRENGTHS, parse_bytes, parse_color, parse_strength, parse_weights
 from sgsst_core.options import Declared, Option, renamed_hint
 
 PresetName = Literal["preview", "standard", "paper"]
@@ -34,8 +35,6 @@ TrainingBackground = Literal["auto", "background", "random", "palette"]
 #: Values of `Settings.keep`: computations that can be skipped without changing the result.
 Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
 EVERYTHING: tuple[Item, ...] = get_args(Item)
-#: Content weight of each named style strength, chosen on the trade-off curve of style and content (docs/quality.md).
-STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 1e4, "strong": 1.0}
 #: Prefix of the description of a default that depends on the preset.
 BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
@@ -47,7 +46,7 @@ MAX_RESOLUTION = 16384
 #: Maximum number of steps, and maximum weight. Larger values are assumed to be typos.
 _MAX_STEPS, _MAX_WEIGHT = 10_000_000, 1e12
 
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 Near = Annotated[
     float,
     Option(unit="scene units"),
@@ -112,7 +111,12 @@ class Settings(BaseModel):
     content_weight: Annotated[
         float,
         _StrengthWords(),
-        Option(unit="factor or strength", metavar="W"),
+        Option(
+            unit="factor or strength",
+            metavar="W",
+            parse=parse_strength,
+            syntax=" (" + ", ".join(f"{word} {weight:g}" for word, weight in STRENGTHS.items()) + ").",
+        ),
     ] = Field(
         1.0,
         ge=0,
@@ -140,9 +144,16 @@ class Settings(BaseModel):
         description="Precision of the feature network; tf32: for convolutions only, on NVIDIA GPUs.",
     )
     max_resolution: Resolution = None
-    background: Annotated[tuple[Share, Share, Share], Option(unit="RGB, 0 to 1", default="black")] = Field(
-        (0.0, 0.0, 0.0), description="Background color behind the Gaussians."
-    )
+    background: Annotated[
+        tuple[Fraction, Fraction, Fraction],
+        Option(
+            unit="RGB, 0 to 1",
+            metavar="COLOR",
+            default="black",
+            parse=parse_color,
+            syntax=": black, white, or R,G,B from 0 to 255.",
+        ),
+    ] = Field((0.0, 0.0, 0.0), description="Background color behind the Gaussians.")
     training_background: TrainingBackground = Field(
         "auto",
         description="Background during steps; background: the background color; random: a random color each time; "
@@ -163,14 +174,20 @@ class Settings(BaseModel):
         description="Preserve the scene's colors; match: recolor the style image like the scene first, so that only "
         "its strokes are transferred; luminance: change only the luminance of colors.",
     )
-    sh_attenuation: Annotated[Share, Option(unit="fraction", metavar="S")] = Field(
+    sh_attenuation: Annotated[Fraction, Option(unit="fraction", metavar="S")] = Field(
         0.0,
         description="Attenuate view-dependent color by S, in the result too; 0 leaves spherical harmonics unchanged, "
         "1 removes all above degree 0.",
     )
     scales: Annotated[
         tuple[ScaleWeight, ...],
-        Option(unit="scale weights", metavar="W,W,...", default="all equal"),
+        Option(
+            unit="scale weights",
+            metavar="W,W,...",
+            default="all equal",
+            parse=parse_weights,
+            syntax=". 1,0,0.5 uses the first and the third.",
+        ),
         AfterValidator(_some_weight),
     ] = Field(
         (),
@@ -189,9 +206,16 @@ class Settings(BaseModel):
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
         None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."
     )
-    memory_limit: Annotated[int | None, Option(unit="bytes", default="40 % of memory, at most")] = Field(
-        None, gt=0, le=2**50, description="Memory budget of the plan."
-    )
+    memory_limit: Annotated[
+        int | None,
+        Option(
+            unit="bytes",
+            metavar="SIZE",
+            default="40 % of memory, at most",
+            parse=parse_bytes,
+            syntax=", such as 8GB.",
+        ),
+    ] = Field(None, gt=0, le=2**50, description="Memory budget of the plan.")
     unseen: Literal["neighbors", "freeze"] = Field(
         "neighbors",
         description="Colors of Gaussians that no view sees; neighbors: change like their neighbors' colors; freeze: "
@@ -238,15 +262,15 @@ class Settings(BaseModel):
     keep: Annotated[tuple[Item, ...], Option(instead="compute_everything")] = Field(
         (), description="Items to compute although the scene does not need them; the result is the same."
     )
-    measure: Annotated[Share, Option(unit="fraction of the steps' time", metavar="S")] = Field(
+    measure: Annotated[Fraction, Option(unit="fraction of the steps' time", metavar="S")] = Field(
         0.1,
         description="Measure novel views, which lie between the cameras, for S of the steps' predicted time, or 30 s "
         "if that is more; 0 measures none.",
     )
 
-    def learning_rate_at(self, share: float) -> float:
-        """Return Adam's learning rate after a fraction `share` (0..1) of all steps."""
-        return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** share)
+    def learning_rate_at(self, fraction: float) -> float:
+        """Return Adam's learning rate after a fraction (0..1) of all steps."""
+        return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** fraction)
 
 
 #: `paper` is the published schedule. The other presets reach the same loss sooner, with larger, decaying steps. Such

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 import typer
 from pydantic import BaseModel, ValidationError
 
-from api.cli.values import FORMS
 from sgsst_core.errors import SettingsError
 from sgsst_core.options import Declared, declared
 from sgsst_core.settings import BY_PRESET
@@ -28,14 +27,16 @@ def with_options(
     """Return a decorator that replaces one argument of a command by options, one per field of a model.
 
     The decorated function receives an instance of the model. Only options given on the command line are set in it.
+    typer reads options from a signature alone, so the decorator makes one; written by hand, each option would be
+    repeated in every command that offers it.
 
     Args:
         argument: Name of the function's argument that receives the model.
         only: Names of the options to offer; None for all.
         without: Names of options to leave out.
     """
-    chosen = (declared(model).keys() if only is None else set(only)) - set(without)
-    offered = {name: option for name, option in declared(model).items() if name in chosen}
+    names = (declared(model).keys() if only is None else set(only)) - set(without)
+    offered = {name: option for name, option in declared(model).items() if name in names}
 
     def decorate(function: Command) -> Command:
         def command(**arguments: Any) -> None:
@@ -44,8 +45,8 @@ def with_options(
 
         parameters: list[inspect.Parameter] = []
         for parameter in inspect.signature(function, eval_str=True).parameters.values():
-            made = [_parameter(each) for each in offered.values()] if parameter.name == argument else [parameter]
-            parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in made]
+            expanded = [_parameter(each) for each in offered.values()] if parameter.name == argument else [parameter]
+            parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in expanded]
         command.__name__, command.__doc__ = function.__name__, function.__doc__
         command.__annotations__ = {each.name: each.annotation for each in parameters}
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -69,38 +70,51 @@ def metavar(option: Declared) -> str:
         return ""
     if get_origin(kind) is Literal:
         return f"<{'|'.join(get_args(kind))}>"
-    form = FORMS.get(option.option.unit)
-    return form.metavar if form else option.option.metavar or f"<{kind.__name__}>"
+    return option.option.metavar or f"<{kind.__name__}>"
 
 
 def help_text(option: Declared) -> str:
     """Return the help of an option: its meaning, its default and its valid values."""
-    form = FORMS.get(option.option.unit)
-    parts = [option.help.removesuffix(".") + form.hint if form else option.help]
+    syntax = option.option.syntax
+    parts = [option.help.removesuffix(".") + syntax if syntax else option.help]
     default = option.text(option.info.default)
     if not (is_switch(option) and option.info.default is False):
         parts.append(f"[{default}]" if default.startswith(BY_PRESET) else f"[default: {default}]")
-    if option.bounds and form is None:
+    if option.bounds and not option.option.parse:
         parts.append(f"[{option.bounds}]")
     return "  ".join(parts)
 
 
 def _parameter(option: Declared) -> inspect.Parameter:
     """Return an option as a function parameter. typer validates words and switches, the model all other values."""
-    form = FORMS.get(option.option.unit)
     kind: Any = kind_of(option) if is_switch(option) or get_origin(kind_of(option)) is Literal else str
-    shown: dict[str, Any] = {} if is_switch(option) else {"metavar": metavar(option)}
-    made = typer.Option(flags(option), help=help_text(option), parser=form.parse if form else None, **shown)
+    placeholder: dict[str, Any] = {} if is_switch(option) else {"metavar": metavar(option)}
+    declaration = typer.Option(flags(option), help=help_text(option), parser=_parser(option), **placeholder)
     return inspect.Parameter(
-        option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, made]
+        option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, declaration]
     )
+
+
+def _parser(option: Declared) -> Callable[[str], object] | None:
+    """Return the parser of an option for typer, which would drop the message of a ValueError."""
+    parse = option.option.parse
+    if parse is None:
+        return None
+
+    def parse_or_refuse(text: str) -> object:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from error
+
+    return parse_or_refuse
 
 
 def kind_of(option: Declared) -> Any:
     """Return the type of an option's values, without None and bounds. For a union, return its first type."""
-    found = option.info.annotation
-    kinds = [kind for kind in get_args(found) if kind is not type(None)]
-    first = kinds[0] if type(None) in get_args(found) else found
+    annotation = option.info.annotation
+    kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
+    first = kinds[0] if type(None) in get_args(annotation) else annotation
     return get_args(first)[0] if get_origin(first) is Annotated else first
 
 

@@ -34,7 +34,7 @@ def test_a_learning_rate_given_by_hand_is_constant_unless_its_end_is_given() -> 
 
 def test_learning_rate_is_exponential_in_the_share_of_steps() -> None:
     settings = make_settings(learning_rate=0.1, learning_rate_end=0.001)
-    assert [settings.learning_rate_at(share) for share in (0, 0.5, 1)] == pytest.approx([0.1, 0.01, 0.001])
+    assert [settings.learning_rate_at(fraction) for fraction in (0, 0.5, 1)] == pytest.approx([0.1, 0.01, 0.001])
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from api.cli.main import app, main
 from api.cli.options import flags, help_text, kind_of
 from api.cli.options_table import reference
-from api.cli.values import parse_strength
 from service.parameters import JobParameters, stored_parameters
 from sgsst_core.errors import SettingsError
+from sgsst_core.option_parsers import parse_strength
 from sgsst_core.options import REMOVED, RENAMED, Declared, declared
 from sgsst_core.settings import EVERYTHING, Settings, checked, make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
@@ -161,7 +161,7 @@ def test_a_content_weight_is_a_number_or_a_strength(text: str, weight: float) ->
 
 
 def test_another_word_than_a_strength_is_refused() -> None:
-    with pytest.raises(typer.BadParameter, match="light, balanced, strong"):
+    with pytest.raises(ValueError, match="light, balanced, strong"):
         parse_strength("weak")
 
 

@@ -1,34 +1,17 @@
-"""Parsers of command-line values that are more than a number or a word."""
+"""Parsers of command-line values that are more than a number or a word, for `Option.parse`.
+
+Each raises a ValueError with a message for the user. JSON has its own syntax for these values.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
 
-import typer
-
-from sgsst_core.settings import STRENGTHS
-
+#: Content weight of each named style strength, chosen on the trade-off curve of style and content (docs/quality.md).
+STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 1e4, "strong": 1.0}
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
-_STRENGTHS = "(" + ", ".join(f"{word} {weight:g}" for word, weight in STRENGTHS.items()) + ")."
 _COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-
-
-@dataclass(frozen=True)
-class Form:
-    """Command-line syntax of values with a certain unit.
-
-    Attributes:
-        parse: Parser of the text.
-        metavar: Placeholder of the value in the help.
-        hint: Text that is appended to the option's help.
-    """
-
-    parse: Callable[[str], object]
-    metavar: str
-    hint: str
 
 
 def parse_color(text: str) -> tuple[float, float, float]:
@@ -40,7 +23,7 @@ def parse_color(text: str) -> tuple[float, float, float]:
     except ValueError:
         red = math.nan
     if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
-        raise typer.BadParameter(
+        raise ValueError(
             f"{text!r} is not a color. Give black, white or three numbers from 0 to 255, such as 40,40,48."
         )
     return red, green, blue
@@ -50,7 +33,7 @@ def parse_bytes(text: str) -> int:
     """Return bytes from "8GB", "512 MB", "6GiB" or a plain number."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?I?)B?", text.strip().upper())
     if not match or match[2] not in _UNITS or not (size := int(float(match[1]) * _UNITS[match[2]])):
-        raise typer.BadParameter(f"{text!r} is not an amount of memory. Give one such as 8GB or 512MB.")
+        raise ValueError(f"{text!r} is not an amount of memory. Give one such as 8GB or 512MB.")
     return size
 
 
@@ -61,8 +44,7 @@ def parse_strength(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        words = ", ".join(STRENGTHS)
-        raise typer.BadParameter(f"{text!r} is not a weight. Give a number or one of {words}.") from None
+        raise ValueError(f"{text!r} is not a weight. Give a number or one of {', '.join(STRENGTHS)}.") from None
 
 
 def parse_weights(text: str) -> tuple[float, ...]:
@@ -70,15 +52,6 @@ def parse_weights(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise typer.BadParameter(
+        raise ValueError(
             f"{text!r} is not a list of weights. Give numbers separated by commas, such as 1,0.5,0,1."
         ) from None
-
-
-#: Units whose values have a different syntax on the command line than in JSON.
-FORMS = {
-    "RGB, 0 to 1": Form(parse_color, "COLOR", ": black, white, or R,G,B from 0 to 255."),
-    "factor or strength": Form(parse_strength, "W", f" {_STRENGTHS}"),
-    "scale weights": Form(parse_weights, "W,W,...", ". 1,0,0.5 uses the first and the third."),
-    "bytes": Form(parse_bytes, "SIZE", ", such as 8GB."),
-}
