@@ -181,6 +181,7 @@ def _settings(rng: random.Random) -> dict[str, Any]:
         "position_weights": ["on", "off"],
         "clamp_aware_gradient": [False],
         "unseen": ["freeze"],
+        "ignored": [_size(rng, 1e-6, 1.0)],  # so that each number still draws the same job
         "views_per_step": [2, 3],
         "cached_weights": ["float32", "half", "none"],
         "memory_limit": [1 << 20, 1 << 24],
@@ -189,6 +190,7 @@ def _settings(rng: random.Random) -> dict[str, Any]:
     for name, choices in chances.items():
         if rng.random() < 0.25:
             values[name] = rng.choice(choices)
+    values.pop("ignored", None)
     return values
 
 
