@@ -20,7 +20,7 @@ from fastapi import FastAPI, Request, Response
 
 from api.http.sending import names_etag
 from service.errors import NotFoundError
-from service.store.states import CANCELABLE, RETRYABLE, TITLES, UNFINISHED
+from service.store.states import ACTIONS, TITLES, UNFINISHED
 from sgsst_core.files.formats import FORMATS
 
 FOLDER = Path(__file__).parents[1] / "static"
@@ -104,10 +104,11 @@ def _filled_modules() -> dict[str, tuple[bytes, object]]:
     formats = [
         {"suffix": each.suffix, "title": each.title, "shown": each.shown, "magic": list(each.magic)} for each in FORMATS
     ]
-    statuses = {"titles": TITLES, "unfinished": UNFINISHED, "cancelable": CANCELABLE, "retryable": RETRYABLE}
+    actions = [{"name": name, "title": name.capitalize(), "statuses": statuses} for name, statuses in ACTIONS.items()]
+    states = {"titles": TITLES, "unfinished": UNFINISHED, "actions": actions}
     return {
         "scene_formats.js": (b'"{{scene_formats}}"', formats),
-        "statuses.js": (b'"{{job_states}}"', statuses),
+        "statuses.js": (b'"{{job_states}}"', states),
     }
 
 

@@ -5,7 +5,7 @@ import { LossChart } from "./chart.js";
 import { announce, h, icon, put } from "./dom.js";
 import { decisions } from "./plan.js";
 import { ResultStage } from "./result_stage.js";
-import { CANCELABLE, RETRYABLE, titles, UNFINISHED } from "./statuses.js";
+import { actionsOf, titles, UNFINISHED } from "./statuses.js";
 import { size, time, words } from "./words.js";
 
 const say = words.job;
@@ -176,8 +176,7 @@ export class JobView {
     if (this.shownFor === job.status) return;
     this.shownFor = job.status;
     put(this.actions,
-      CANCELABLE.has(job.status) ? button(say.cancel, () => ask("POST", `/v1/jobs/${this.id}/cancel`)) : null,
-      RETRYABLE.has(job.status) ? button(say.retry, () => ask("POST", `/v1/jobs/${this.id}/retry`), "primary") : null,
+      actionsOf(job.status).map(({ name, title }) => button(title, () => ask("POST", `/v1/jobs/${this.id}/${name}`), UNFINISHED.has(job.status) ? "quiet" : "primary")),
       UNFINISHED.has(job.status) ? null : deleteButton(say.remove, async () => {
         await ask("DELETE", `/v1/jobs/${this.id}`);
         location.hash = "#/jobs";

@@ -1,9 +1,15 @@
 // @ts-check
 /** Statuses of jobs, and what users can do with a job in each. The server fills in its table of states. */
 
-/** @type {{ titles: Record<string, string>, unfinished: string[], cancelable: string[], retryable: string[] }} */
+/** @type {{ titles: Record<string, string>, unfinished: string[], actions: { name: string, title: string, statuses: string[] }[] }} */
 const states = /** @type {any} */ ("{{job_states}}");
 
 /** Text to display for each status. */
 export const titles = states.titles;
-export const UNFINISHED = new Set(states.unfinished), CANCELABLE = new Set(states.cancelable), RETRYABLE = new Set(states.retryable);
+export const UNFINISHED = new Set(states.unfinished);
+
+/**
+ * Return the actions that a status allows: `POST /v1/jobs/{id}/{name}`, with the text of the button.
+ * @param {string} status
+ */
+export const actionsOf = (status) => states.actions.filter((action) => action.statuses.includes(status));

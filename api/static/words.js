@@ -111,7 +111,7 @@ export const words = {
       reading: "Reading the files", planning: "Analyzing views", starting: "Starting workers", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality",
     }),
     unnamed: "Unnamed job", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`,
-    left: (/** @type {number} */ s) => (s < 1 ? "almost done" : `about ${seconds(s)} left`), progress: "Progress", cancel: "Cancel", retry: "Retry", remove: "Delete", removeSure: "Delete this job and its results?", keep: "Cancel",
+    left: (/** @type {number} */ s) => (s < 1 ? "almost done" : `about ${seconds(s)} left`), progress: "Progress", remove: "Delete", removeSure: "Delete this job and its results?", keep: "Cancel",
     lost: "Connection lost. Reconnecting…", back: "Reconnected.", loss: "Loss", noLoss: "The chart appears once painting starts.", preview: "Latest preview", noPreview: "The first preview will appear shortly.",
     made: (/** @type {string} */ at) => `Created ${at}`, took: (/** @type {number} */ s) => `took ${seconds(s)}`, attempt: (/** @type {number} */ n) => `attempt ${n}`, expires: (/** @type {string} */ at) => `kept until ${at}`,
     threeD: "3D", sheet: "Before and after", report: "Report", files: "Downloads", settings: "Settings", inputs: "Inputs", openReport: "Open the report", noFiles: "Nothing yet.", noScene: "This scene can't be shown here.", view3d: "Result", compare: "Compare with another job", compareWith: "Another job of this scene", noOther: "No other finished job of this scene.",

@@ -17,7 +17,7 @@ from service.store.history import Point, points
 from service.store.inputs import hand_over
 from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job, lock_owner
-from service.store.states import ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
+from service.store.states import ACTIONS, ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
 from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 
 _JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
@@ -199,10 +199,11 @@ class Jobs:
             job = _job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.CANCEL):
                 raise ConflictError(f"The job has {job.status} and cannot be canceled.", job_status=job.status)
-            if job.status == JobStatus.QUEUED:
-                end(session, job, Transition.CANCEL, now, self._retention)
-            elif next_status(job.status, Transition.CANCEL) != job.status:
-                move(session, job, Transition.CANCEL, now)
+            if job.status in ACTIONS[Transition.CANCEL]:
+                if next_status(job.status, Transition.CANCEL) in ENDED:
+                    end(session, job, Transition.CANCEL, now, self._retention)
+                else:
+                    move(session, job, Transition.CANCEL, now)
         return job
 
     def retry(self, job_id: str, owner: str | None, *, limit: int, quotas: Quotas = NO_QUOTAS) -> JobRow:

@@ -87,10 +87,12 @@ TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
     Transition.EXPIRE: dict.fromkeys(FINISHED, _S.EXPIRED),
 }
 
-
-#: Statuses whose jobs a user can cancel, and retry.
-CANCELABLE = tuple(status for status, target in TRANSITIONS[Transition.CANCEL].items() if target is not status)
-RETRYABLE = tuple(TRANSITIONS[Transition.RETRY])
+#: Transitions that users request with `POST /v1/jobs/{id}/{transition}`, and the statuses that each one changes. The
+#: page has a button for each.
+ACTIONS: Mapping[Transition, tuple[JobStatus, ...]] = {
+    action: tuple(status for status, target in TRANSITIONS[action].items() if target is not status)
+    for action in (Transition.CANCEL, Transition.RETRY)
+}
 
 
 class TransitionError(Exception):

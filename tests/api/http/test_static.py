@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
-from service.store.states import JobStatus
+from service.store.states import ACTIONS, TITLES, UNFINISHED
 from sgsst_core.files.formats import FORMATS
 from tests.api.service import Service
 
@@ -80,10 +80,11 @@ def test_page_knows_the_states_of_jobs(client: httpx.Client, files: StaticFiles)
     states = re.search(r"states = .*\((\{.*\})\);", module)
     assert states
     assert json.loads(states[1]) == {
-        "titles": {status: "Done" if status == "succeeded" else status.capitalize() for status in JobStatus},
-        "unfinished": ["queued", "starting", "running", "canceling"],
-        "cancelable": ["queued", "starting", "running"],
-        "retryable": ["failed", "canceled"],
+        "titles": dict(TITLES),
+        "unfinished": list(UNFINISHED),
+        "actions": [
+            {"name": name, "title": name.capitalize(), "statuses": list(statuses)} for name, statuses in ACTIONS.items()
+        ],
     }
 
 

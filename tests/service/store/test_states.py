@@ -7,9 +7,11 @@ from itertools import product
 import pytest
 
 from service.store.states import (
+    ACTIONS,
     ACTIVE,
     ENDED,
     FINISHED,
+    TITLES,
     TRANSITIONS,
     UNFINISHED,
     JobStatus,
@@ -70,6 +72,18 @@ def test_a_job_that_is_being_canceled_can_only_end() -> None:
     """Such a job never returns to the queue and never fails, because its user has given it up."""
     ways = {way[JobStatus.CANCELING] for way in TRANSITIONS.values() if JobStatus.CANCELING in way}
     assert ways == {JobStatus.CANCELING, JobStatus.CANCELED, JobStatus.SUCCEEDED}
+
+
+def test_actions_are_offered_where_they_change_the_status() -> None:
+    assert ACTIONS == {
+        Transition.CANCEL: (JobStatus.QUEUED, JobStatus.STARTING, JobStatus.RUNNING),
+        Transition.RETRY: (JobStatus.FAILED, JobStatus.CANCELED),
+    }
+
+
+def test_every_state_has_a_title() -> None:
+    assert list(TITLES) == list(JobStatus)
+    assert (TITLES[JobStatus.SUCCEEDED], TITLES[JobStatus.CANCELING]) == ("Done", "Canceling")
 
 
 def test_names_are_stored_as_text() -> None:
