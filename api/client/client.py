@@ -71,6 +71,7 @@ class Client:
         self._stack = ExitStack()
         self._portal = self._stack.enter_context(start_blocking_portal())
         self._client = AsyncClient(url, key)
+        self._stack.callback(self._stop)
         self._stack.callback(self._portal.call, self._client.close)
         self.url = self._client.url
 
@@ -83,6 +84,10 @@ class Client:
     def close(self) -> None:
         """Close all connections."""
         self._stack.close()
+
+    def _stop(self) -> None:
+        """Stop the portal. An interrupt while a call started can have left its coroutine running; it is canceled."""
+        self._portal.call(self._portal.stop, True)
 
     def _run(self, function: Callable[[], Awaitable[T]]) -> T:
         """Run a coroutine function in the portal's thread. If this thread is interrupted, the coroutine is canceled."""

@@ -126,6 +126,13 @@ def test_interrupted_call_is_canceled(service: Service, files: dict[str, Path]) 
 # --- the same scenario through both --------------------------------------------------------------------------------
 
 
+def test_close_cancels_what_an_interrupt_left_running() -> None:
+    client = Client("http://127.0.0.1:9")
+    left = client._portal.start_task_soon(asyncio.sleep, 1000)
+    client.close()
+    assert left.cancelled()
+
+
 @both
 def test_a_job_from_its_upload_to_its_removal(
     connect: Any,
