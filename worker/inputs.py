@@ -8,29 +8,31 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 from torch import Tensor
 
+from sgsst_core.decision import Decision
 from sgsst_core.errors import SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
-from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.images import check_photos, load_image, load_photo
+from sgsst_core.files.images import load_image
+from sgsst_core.files.photos import Photo, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.loss.scale_weights import check_scales
-from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
+from sgsst_core.orbit.choice import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import nothing_seen, sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.regions.definition import Regions
-from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job_styles import check_style_size
+from worker.capture import Capture, read_capture, with_axes
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 from worker.selecting import select_regions
@@ -49,7 +51,8 @@ class Inputs:
         scene_file: Scene, and which rows of its file were dropped.
         cameras: Cameras at the sizes at which the scene is stylized.
         orbit: Orbit that generated the cameras; None if they come from a file.
-        photos: Path of each camera's photo for the content term; None if it uses unstylized renders.
+        photos: Photo of each camera for the content term; None if it uses unstylized renders.
+        decisions: Lines about cameras and photos for the plan.
         regions: Regions of the scene; None if the job has none.
         fingerprint: Hash of all inputs and settings; equal for equal jobs.
     """
@@ -59,7 +62,8 @@ class Inputs:
     scene_file: SceneFile
     cameras: list[Camera]
     orbit: Orbit | None
-    photos: list[Path] | None
+    photos: list[Photo] | None
+    decisions: tuple[Decision, ...]
     regions: Regions | None
     fingerprint: str
 
@@ -76,7 +80,8 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     Raises:
         InvalidInputError: If an input cannot be used. Every rank raises the same error.
     """
-    source, settings, images = request.source, request.settings, request.images
+    settings, images = request.settings, request.images
+    source, about_axes = collectives.broadcast(lambda: with_axes(request.source))
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_styles(request.styles))
     scene_file, reader = read_shared_scene(
@@ -87,17 +92,20 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
         spz_axes=source.spz_axes,
     )
     together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
-    found, made = _cameras_on_all_ranks(source, scene_file.scene, collectives)
-    cameras = fit_cameras(found, settings)
-    together(collectives, lambda: check_scales(settings.scales, cameras, settings.coarsest_side))
-    together(collectives, lambda: check_style_size(style, cameras, settings.style_scale))
-    photos = together(collectives, lambda: check_photos(images, cameras)) if images else None
+    capture = _capture_on_all_ranks(source, scene_file.scene, collectives).fitted(settings)
+    together(collectives, lambda: check_scales(settings.scales, capture.cameras, settings.coarsest_side))
+    together(collectives, lambda: check_style_size(style, capture.cameras, settings.style_scale))
+    found = together(collectives, lambda: capture.with_photos(images))
+    capture = collectives.broadcast(lambda: found.checked(scene_file.scene, source.near))
+    cameras, photos = capture.cameras, capture.photos
     regions = read_regions(request, scene_file, cameras, collectives)
-    stamps = collectives.broadcast(lambda: repr([_stamp(path) for path in photos]) if photos else "")
+    stamps = collectives.broadcast(lambda: repr([_stamp(photo) for photo in photos]) if photos else "")
     own = None
     if reader:
         own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps, regions)
-    return Inputs(weights, style, scene_file, cameras, made, photos, regions, _same_fingerprint(own, collectives))
+    decisions = (*about_axes, *capture.decisions)
+    same = _same_fingerprint(own, collectives)
+    return Inputs(weights, style, scene_file, cameras, capture.orbit, photos, decisions, regions, same)
 
 
 def read_regions(
@@ -136,56 +144,28 @@ def load_styles(files: Sequence[StyleFile]) -> Style:
     return Style(tuple(load_image(file.path) for file in files), weights, names)
 
 
-def _cameras_on_all_ranks(
-    source: SceneRequest, scene: Scene, collectives: Collectives
-) -> tuple[list[Camera], Orbit | None]:
-    """Return the result of `read_cameras_of`, the same on every rank.
+def _capture_on_all_ranks(source: SceneRequest, scene: Scene, collectives: Collectives) -> Capture:
+    """Return the result of `read_capture`, the same on every rank.
 
     Every rank reads a camera file itself. Only rank 0 computes an orbit, since processors may round differently.
     """
     if source.cameras is None:
-        return collectives.broadcast(lambda: read_cameras_of(source, scene))
-    return together(collectives, lambda: read_cameras_of(source, scene))
+        return collectives.broadcast(lambda: read_capture(source, scene))
+    return together(collectives, lambda: read_capture(source, scene))
 
 
-def read_scene_and_cameras(source: SceneRequest) -> tuple[SceneFile, list[Camera], Orbit | None]:
-    """Read a scene and its requested cameras; see `read_cameras_of`.
+def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> tuple[SceneFile, Capture]:
+    """Read a scene, its requested cameras and their photos, and check that they belong together.
 
     Raises:
         SceneError: If the scene cannot be used.
         CameraError: If the cameras cannot be used.
+        ImageError: If the photos cannot be used.
     """
+    source, about_axes = with_axes(source)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes)
-    return file, *read_cameras_of(source, file.scene)
-
-
-def read_cameras_of(source: SceneRequest, scene: Scene) -> tuple[list[Camera], Orbit | None]:
-    """Return the requested cameras at the requested resolution, and their orbit (None if they come from a file).
-
-    Raises:
-        CameraError: If the cameras cannot be used.
-    """
-    made = None
-    if source.cameras is not None:
-        cameras = read_cameras(source.cameras)
-    else:
-        made = make_orbit(scene, _orbit_request(source))
-        cameras = made.cameras
-    if source.views is not None:
-        cameras = spread(cameras, source.views)
-    if source.resolution is not None:
-        cameras = [resized(camera, source.resolution) for camera in cameras]
-    return cameras, made
-
-
-def _orbit_request(source: SceneRequest) -> OrbitRequest:
-    """Convert the orbit options of a request."""
-    up = None
-    if source.up != "auto":
-        x, y, z = (float(name == source.up[-1]) * (-1.0 if source.up.startswith("-") else 1.0) for name in "xyz")
-        up = (x, y, z)
-    count = None if source.orbit in (None, "auto") else int(source.orbit)
-    return OrbitRequest(count, up, source.elevation, source.radius, source.near)
+    capture = read_capture(source, file.scene).with_photos(images).checked(file.scene, source.near)
+    return file, replace(capture, decisions=(*about_axes, *capture.decisions))
 
 
 def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:
@@ -257,6 +237,7 @@ def _same_fingerprint(own: str | None, collectives: Collectives) -> str:
     return found[0][0]
 
 
-def _stamp(path: Path) -> tuple[str, int, int]:
-    status = path.stat()
-    return path.name, status.st_size, status.st_mtime_ns
+def _stamp(photo: Photo) -> tuple[object, ...]:
+    status = photo.path.stat()
+    stamp = (photo.path.name, status.st_size, status.st_mtime_ns)
+    return (*stamp, "oriented") if photo.oriented else stamp

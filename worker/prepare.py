@@ -107,6 +107,7 @@ def prepare(
             show=show_planning,
             timer=timer,
             orbit=inputs.orbit,
+            about_inputs=inputs.decisions,
             style=inputs.style,
             regions=regions,
             refinement=refinement,

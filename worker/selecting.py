@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import ImageError, SceneError
-from sgsst_core.files.images import find_masks, load_photo
+from sgsst_core.files.photos import Photo, find_masks, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_property
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions, check_regions
@@ -116,8 +116,8 @@ def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], nea
     Raises:
         ImageError: If there are no masks, or if a mask cannot be used.
     """
-    found = [(camera, path) for camera, path in zip(cameras, find_masks(folder, cameras), strict=True) if path]
-    masks = [partial(_load_mask, path, camera) for camera, path in found]
+    found = [(camera, mask) for camera, mask in zip(cameras, find_masks(folder, cameras), strict=True) if mask]
+    masks = [partial(_load_mask, mask, camera) for camera, mask in found]
     rasterizer = make_rasterizer("cpu", file.scene, near=near)
     inside, total = count_votes(rasterizer, [camera for camera, _ in found], masks, len(file.scene))
     if not bool((total > 0).any()):
@@ -125,6 +125,6 @@ def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], nea
     return decide_by_votes(file.scene.means, inside, total)
 
 
-def _load_mask(path: Path, camera: Camera) -> Tensor:
+def _load_mask(mask: Photo, camera: Camera) -> Tensor:
     """Load a mask, [H, W] in 0..1; white is inside."""
-    return load_photo(path, camera).mean(dim=2)
+    return load_photo(mask, camera).mean(dim=2)

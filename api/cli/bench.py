@@ -24,7 +24,7 @@ from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.report.machine import machine
 from sgsst_core.scene.camera import Camera
-from worker.inputs import read_scene_and_cameras
+from worker.inputs import read_scene_and_capture
 from worker.request import SceneRequest, check_choice, check_folder
 
 Found = TypeVar("Found")
@@ -76,9 +76,9 @@ class _Inputs:
         check_folder(request.out)
         weights = load_network_weights(request.backbone)
         style = load_image(request.style)
-        file, cameras, _ = read_scene_and_cameras(request.source)
+        file, capture = read_scene_and_capture(request.source)
         ensure_writable_folder(request.out)
-        return _Inputs(file, cameras, style, weights, variants)
+        return _Inputs(file, capture.cameras, style, weights, variants)
 
     def run(self, measure: Callable[..., Found], request: VariantsRequest, progress: Any) -> Found:
         """Call `measure` with the arguments of `error_time`, and return its result."""

@@ -69,6 +69,9 @@ CamerasOption = Annotated[
         help="cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender)."
     ),
 ]
+ImagesOption = Annotated[
+    Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
+]
 StyleOption = Annotated[Path, typer.Option(help="Style image.", show_default=False)]
 StylesOption = Annotated[
     list[str],
@@ -105,9 +108,7 @@ def stylize(
         ),
     ],
     cameras: CamerasOption = None,
-    images: Annotated[
-        Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
-    ] = None,
+    images: ImagesOption = None,
     region: RegionOption = None,
     region_style: RegionStyleOption = None,
     region_weight: RegionWeightOption = None,
@@ -284,6 +285,7 @@ def plan(
     style: StylesOption,
     out: Annotated[Path, typer.Option(help="JSON file to write the plan to.")] = Path("plan.json"),
     cameras: CamerasOption = None,
+    images: ImagesOption = None,
     sheet: Annotated[Path | None, typer.Option(help="JPEG file to write with images of the views.")] = None,
     region: RegionOption = None,
     region_style: RegionStyleOption = None,
@@ -301,7 +303,7 @@ def plan(
     regions = region_requests(
         region_options(region or (), region_style or (), region_weight or (), region_freeze or ())
     )
-    request = StylizeRequest(source, parse_styles(style), None, out, options.backbone, False, settings, regions)
+    request = StylizeRequest(source, parse_styles(style), images, out, options.backbone, False, settings, regions)
     with job_bar(error_console) as bar:
         made = make_plan(request, bar.show_planning, sheet)
     table = Table(Column("item", no_wrap=True), "decision and reason", Column("saves", no_wrap=True), show_lines=True)

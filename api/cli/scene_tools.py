@@ -26,7 +26,7 @@ from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.refining import refine, refined
-from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_cameras
+from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
 from worker.request import SceneRequest, StylizeRequest, check_choice, check_folder
 
 # --- plan ----------------------------------------------------------------------------------------------------------
@@ -44,7 +44,7 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
         InvalidInputError: If an input cannot be used; the first one is reported.
     """
     source, settings, out = request.source, request.settings, request.out
-    check_choice(source)
+    check_choice(source, request.images)
     if out.is_dir() or out.suffix.lower() != ".json":  # a mistyped path must not overwrite a scene or its cameras
         raise OutputError(f"{out}: not the name of a JSON file. Give one, such as plan.json.")
     if source.cameras and out.exists() and source.cameras.exists() and out.samefile(source.cameras):
@@ -54,7 +54,8 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
         if sheet.is_dir() or sheet.suffix.lower() not in (".jpg", ".jpeg"):
             raise OutputError(f"{sheet}: not the name of a JPEG file. Give one, such as views.jpg.")
         check_folder(sheet.parent)
-    file, cameras, orbit = read_scene_and_cameras(source)
+    file, capture = read_scene_and_capture(source, request.images)
+    cameras = capture.cameras
     check_sh_attenuation(file, settings.sh_attenuation)
     weights = load_network_weights(request.backbone)
     style = load_styles(request.styles)  # also reports an unusable style before any work is done
@@ -70,7 +71,8 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
         weights=weights,
         measured=True,
         show=show_planning,
-        orbit=orbit,
+        orbit=capture.orbit,
+        about_inputs=capture.decisions,
         style=style,
         regions=regions and regions.refined(refinement),
         refinement=refinement,
@@ -91,8 +93,12 @@ def look_for_extremes(source: SceneRequest, style: Path | None) -> list[Finding]
     """
     check_choice(source)
     image = load_image(style) if style else None
-    file, cameras, _ = read_scene_and_cameras(source.model_copy(update={"drop_invalid": True}))
-    return findings_of(file, cameras, image, near=source.near)
+    file, capture = read_scene_and_capture(source.model_copy(update={"drop_invalid": True}))
+    count = len(capture.cameras)
+    about = [
+        Finding("views", f"{line.item}: {line.decision}", count, count, "", line.reason) for line in capture.decisions
+    ]
+    return [*about, *findings_of(file, capture.cameras, image, near=source.near)]
 
 
 # --- render --------------------------------------------------------------------------------------------------------
@@ -111,8 +117,8 @@ def render_views(
     """
     check_choice(source)
     check_folder(out)
-    file, cameras, _ = read_scene_and_cameras(source)
-    scene = file.scene
+    file, capture = read_scene_and_capture(source)
+    scene, cameras = file.scene, capture.cameras
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
     check_something_seen(cameras, rasterizer)
     ensure_writable_folder(out)

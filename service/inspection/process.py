@@ -18,8 +18,8 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -36,24 +36,24 @@ from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, Weight
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.cache_folder import cache_folder
 from sgsst_core.files.formats import format_of_name, read_scene_header
-from sgsst_core.files.images import check_photos, image_size, load_image
+from sgsst_core.files.images import image_size, load_image
 from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.loss.scale_weights import check_scales
-from sgsst_core.orbit.choice import Orbit
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import PlanningProgress, ShowPlanning
 from sgsst_core.quality.packed import measure_packed
 from sgsst_core.regions.definition import Regions
 from sgsst_core.report.document import plan_json
-from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job_styles import check_style_size
 from sgsst_core.stylizing.refining import refine, refined
-from worker.inputs import check_something_in_view, load_styles, read_cameras_of, read_regions
+from worker.capture import Capture, read_capture, with_axes
+from worker.inputs import check_something_in_view, load_styles, read_regions
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
 
@@ -76,12 +76,11 @@ class _Inputs:
     """Inputs of a job in memory.
 
     Attributes:
-        orbit: Orbit of the cameras; None if they were read from files.
+        capture: Cameras and photos.
     """
 
     scene: Scene
-    cameras: list[Camera]
-    orbit: Orbit | None
+    capture: Capture
     style: Style
     regions: Regions | None
 
@@ -115,6 +114,11 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
                 f"The scene has {declared:,} Gaussians{_refinement_note(settings)}. "
                 f"At most {limits['gaussians']:,} are allowed.",
             )
+    with _errors_of("cameras"):
+        if source.cameras is not None:
+            _check_frames_have_sizes(source.cameras)
+    with _errors_of("scene"):
+        source, about_axes = with_axes(source)
         file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes)
         check_sh_attenuation(file, settings.sh_attenuation)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
@@ -126,33 +130,39 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         found["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
     with _errors_of("cameras"):
         check_choice(source)
-        if source.cameras is not None:
-            _check_frames_have_sizes(source.cameras)
-        unfitted, orbit = read_cameras_of(source, file.scene)
-        cameras = fit_cameras(unfitted, settings)
+        capture = read_capture(source, file.scene).fitted(settings)
+        cameras = capture.cameras
         if len(cameras) > limits["views"]:
             raise RefusedError(
                 "too-many-views", f"There are {len(cameras):,} views. At most {limits['views']:,} are allowed."
             )
-        pixels = sum(camera.width * camera.height for camera in cameras)
+        pixels = _pixels(cameras)
         if pixels > limits["pixels"]:
             raise RefusedError(
                 "too-many-pixels", f"All views have {pixels:,} pixels. At most {limits['pixels']:,} are allowed."
             )
         check_scales(settings.scales, cameras, settings.coarsest_side)
         check_something_in_view(file.scene, cameras, source.near)
-        found |= {"views": len(cameras), "pixels": pixels}
     with _errors_of("style"):
         check_style_size(style, cameras, settings.style_scale)
-    with _errors_of("regions"):
-        regions = read_regions(job, file, cameras)
     with _errors_of("photos"):
-        paths = check_photos(staged.photos, cameras) if staged.photos else []
-        for path in paths:
-            _check_pixel_count(path, limits)
-            load_image(path)
-        found["photos"] = len(paths)
-    return found, _Inputs(file.scene, cameras, orbit, style, regions)
+        capture = capture.with_photos(staged.photos)
+        for photo in capture.photos or []:
+            _check_pixel_count(photo.path, limits)
+            load_image(photo.path)
+        found["photos"] = len(capture.photos or [])
+    with _errors_of("cameras"):
+        capture = capture.checked(file.scene, source.near)
+        found |= {"views": len(capture.cameras), "pixels": _pixels(capture.cameras)}
+    with _errors_of("regions"):
+        regions = read_regions(job, file, capture.cameras)
+    capture = replace(capture, decisions=(*about_axes, *capture.decisions))
+    return found, _Inputs(file.scene, capture, style, regions)
+
+
+def _pixels(cameras: Sequence[Camera]) -> int:
+    """Return the number of pixels of all views."""
+    return sum(camera.width * camera.height for camera in cameras)
 
 
 def _refinement_note(settings: Settings) -> str:
@@ -165,16 +175,17 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
     found, read = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
-    settings, regions = request.settings, read.regions
-    refinement = refine(read.scene, read.cameras, read.style, settings, weights=weights, regions=regions, show=show)
+    settings, regions, cameras = request.settings, read.regions, read.capture.cameras
+    refinement = refine(read.scene, cameras, read.style, settings, weights=weights, regions=regions, show=show)
     job_plan, _ = make_plan(
         refined(read.scene, refinement),
-        read.cameras,
+        cameras,
         settings,
         weights=weights,
         measured=True,
         show=show,
-        orbit=read.orbit,
+        orbit=read.capture.orbit,
+        about_inputs=read.capture.decisions,
         style=read.style,
         regions=regions and regions.refined(refinement),
         refinement=refinement,
@@ -204,7 +215,7 @@ def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]
     assert format is not None
     with Path(name).open("wb") as output:
         encode_scene(output, scene, format, Path(name))
-    cameras = fit_cameras(read_cameras_of(source, scene)[0], settings)
+    cameras = read_capture(source, scene).fitted(settings).cameras
     return measure_packed(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
 
 

@@ -1,7 +1,8 @@
 """Readers of camera files: INRIA `cameras.json`, COLMAP sparse models, nerfstudio and Blender `transforms.json`.
 
 All formats are converted to `Camera`: a pinhole camera with a world-to-camera pose, axes x right, y down, z forward,
-and pixel centers at half-integers. This is COLMAP's convention; the JSON formats share it for the principal point.
+and pixel centers at half-integers. This is COLMAP's convention; the JSON formats share it for the principal point. A
+camera with lens distortion is the pinhole with the same focal lengths and principal point, and has a `Lens`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,9 +19,10 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import CameraError, ImageError
-from sgsst_core.files.colmap_model import UNDISTORT, read_model
+from sgsst_core.files.colmap_model import ColmapCamera, read_model
 from sgsst_core.files.images import image_size
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.lens import Lens, fisheye_lens, other_lens, radial_lens
 
 #: Largest entry of R R^T - I that is attributed to rounding in the file. Such a matrix R is replaced by the nearest
 #: rotation.
@@ -30,9 +33,22 @@ QUATERNION_TOLERANCE = 0.01
 _FORMATS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
 #: Change of camera axes from OpenGL (x right, y up, z backward) to those of `Camera`.
 _OPENGL = np.diag([1.0, -1.0, -1.0])
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-#: Camera models of transforms.json that are pinholes if all their distortion coefficients are 0.
-_PINHOLE_NAMES = (None, "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+#: Distortion coefficients of transforms.json: those of a fisheye, and the others in OpenCV's order.
+_FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
+_RADIAL_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+#: Camera models of transforms.json whose coefficients are those of `_RADIAL_KEYS`; all can be 0.
+_RADIAL_NAMES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_FISHEYE_NAMES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+#: Camera models without a focal length.
+_NO_PINHOLES = ("EQUIRECTANGULAR", "SPHERICAL", "ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
+#: COLMAP's camera models with a single focal length; the others have two.
+_ONE_FOCAL = (
+    *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE"),
+    "SIMPLE_DIVISION",
+)
+#: COLMAP's camera models by formula. Coefficients follow the intrinsics, in OpenCV's order.
+_COLMAP_RADIAL = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_COLMAP_FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 
 
 def read_cameras(path: Path) -> list[Camera]:
@@ -47,8 +63,8 @@ def read_cameras(path: Path) -> list[Camera]:
     unchanged, which is correct for scenes trained in the coordinate frame of the camera file.
 
     Raises:
-        CameraError: If the file is missing, its format is unknown, it holds no cameras, a camera has distortion, or a
-            value is invalid. The message names the file and the camera.
+        CameraError: If the file is missing, its format is unknown, it holds no cameras, a camera cannot be a pinhole,
+            or a value is invalid. The message names the file and the camera.
 
     Example:
         >>> cameras = read_cameras(Path("cameras.json"))
@@ -107,7 +123,8 @@ def _inria_camera(where: str, entry: Mapping[str, Any]) -> Camera:
     pose[:3, 3] = _array(where, entry, "position", (3,))
     width, height = _size(where, entry, "width", "height")
     fx, fy = (_number(where, entry, key) for key in ("fx", "fy"))
-    return _camera(where, name, (width, height), (fx, fy, width / 2, height / 2), _inverse(where, pose))
+    cx, cy = (_number(where, entry, key) if key in entry else side / 2 for key, side in (("cx", width), ("cy", height)))
+    return _camera(where, name, (width, height), (fx, fy, cx, cy), _inverse(where, pose))
 
 
 def _read_transforms(path: Path, content: Mapping[str, Any]) -> list[Camera]:
@@ -117,24 +134,50 @@ def _read_transforms(path: Path, content: Mapping[str, Any]) -> list[Camera]:
         name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
         where = f"{where} ({name!r})"
         values = {**content, **frame}  # values of the frame take precedence
-        _refuse_distortion(where, values)
         size = _transforms_size(where, path.parent / name, values)
         pose = np.eye(4)
         matrix = _array(where, values, "transform_matrix", (4, 4), (3, 4))
         pose[:3] = matrix[:3]
         pose = frame_change(pose)
         pose[:3, :3] = pose[:3, :3] @ _OPENGL
-        return _camera(where, name, size, _transforms_intrinsics(where, values, size), _inverse(where, pose))
+        model = _transforms_model(where, values)
+        pinhole = _transforms_intrinsics(where, values, size)
+        camera = _camera(where, name, size, pinhole, _inverse(where, pose))
+        return _with_lens(camera, _transforms_lens(where, model, values, size, pinhole))
 
     return _convert_entries(path, content["frames"], convert)
 
 
-def _refuse_distortion(where: str, values: Mapping[str, Any]) -> None:
-    model = values.get("camera_model")
-    nonzero = [key for key in _DISTORTION if values.get(key) and _number(where, values, key) != 0]
-    if model not in _PINHOLE_NAMES or values.get("is_fisheye") or nonzero:
-        what = f"distortion {', '.join(nonzero)}" if nonzero else f"camera model {model or 'fisheye'}"
-        raise CameraError(f"{where}: has {what}, but only pinhole cameras are handled. {UNDISTORT}.")
+def _transforms_model(where: str, values: Mapping[str, Any]) -> str:
+    """Return the name of the camera model; empty if the file gives none."""
+    model = str(values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "")).upper()
+    if model in _NO_PINHOLES or model.startswith("VR180"):
+        raise CameraError(
+            f"{where}: has camera model {model[:40]}, which has no pinhole part. Split the panoramas into perspective "
+            "images first, for example with `ns-process-data images --camera-type equirectangular`."
+        )
+    return model
+
+
+def _transforms_lens(
+    where: str,
+    model: str,
+    values: Mapping[str, Any],
+    size: tuple[int, int],
+    pinhole: tuple[float, float, float, float],
+) -> Lens:
+    def coefficients(keys: tuple[str, ...]) -> tuple[float, ...]:
+        return tuple(_number(where, values, key) if values.get(key) is not None else 0.0 for key in keys)
+
+    if model in _FISHEYE_NAMES:
+        return fisheye_lens(model, coefficients(_FISHEYE_KEYS), size, pinhole)
+    if model in _RADIAL_NAMES:
+        return radial_lens(model or "OPENCV", coefficients(_RADIAL_KEYS), size, pinhole)
+    return other_lens(model[:40], size, pinhole)
+
+
+def _with_lens(camera: Camera, lens: Lens) -> Camera:
+    return replace(camera, lens=lens) if lens.distorts else camera
 
 
 def _transforms_size(where: str, image: Path, values: Mapping[str, Any]) -> tuple[int, int]:
@@ -213,16 +256,36 @@ def _read_colmap(folder: Path) -> list[Camera]:
         lens = lenses.get(image.camera)
         if lens is None:
             raise CameraError(f"{where}: has camera {image.camera}, which the model lacks. Export the model again.")
-        if lens.model not in ("SIMPLE_PINHOLE", "PINHOLE"):
-            raise CameraError(f"{where}: has camera model {lens.model}, which is distorted. {UNDISTORT}.")
-        fx, fy, cx, cy = lens.parameters if lens.model == "PINHOLE" else (lens.parameters[0], *lens.parameters)
         matrix = np.eye(4)
         matrix[:3, :3] = _rotation_matrix(where, image.rotation)
         matrix[:3, 3] = image.translation
-        cameras.append(_camera(where, image.name, (lens.width, lens.height), (fx, fy, cx, cy), matrix))
+        of_photos = _colmap_lens(where, lens)
+        pinhole = (of_photos.fx, of_photos.fy, of_photos.cx, of_photos.cy)
+        cameras.append(_with_lens(_camera(where, image.name, (lens.width, lens.height), pinhole, matrix), of_photos))
     if not cameras:
         raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.")
     return sorted(cameras, key=lambda camera: camera.name)
+
+
+def _colmap_lens(where: str, camera: ColmapCamera) -> Lens:
+    if camera.model == "EQUIRECTANGULAR":
+        raise CameraError(
+            f"{where}: has camera model EQUIRECTANGULAR, which has no pinhole part. Use the cameras of perspective "
+            "images: COLMAP's example `panorama_sfm.py` makes both from panoramas."
+        )
+    if camera.model in _ONE_FOCAL:
+        fx, cx, cy, *rest = camera.parameters
+        pinhole = (fx, fx, cx, cy)
+    else:
+        pinhole, rest = camera.parameters[:4], list(camera.parameters[4:])  # type: ignore[assignment]
+    size = (camera.width, camera.height)
+    if not np.isfinite(rest).all():
+        raise CameraError(f"{where}: its camera holds NaN or infinite values. Export the cameras again.")
+    if camera.model in _COLMAP_RADIAL:
+        return radial_lens(camera.model, tuple(rest), size, pinhole)
+    if camera.model in _COLMAP_FISHEYE:
+        return fisheye_lens(camera.model, tuple(rest), size, pinhole)
+    return other_lens(camera.model, size, pinhole)
 
 
 def _rotation_matrix(where: str, quaternion: tuple[float, float, float, float]) -> NDArray[Any]:

@@ -18,10 +18,7 @@ from sgsst_core.errors import CameraError
 
 T = TypeVar("T")
 
-UNDISTORT = (
-    "Undistort the photos with `colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path OUT` "
-    "and give OUT/sparse"
-)
+_CONVERT = "Convert it with `colmap image_undistorter`, and give the OUT/sparse that it writes"
 _EXPORT_AGAIN = "Export the model again."
 
 #: COLMAP's camera models by number: name and number of parameters.
@@ -105,7 +102,7 @@ def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
     except OSError as error:
         raise CameraError(f"{path}: cannot be read: {error.strerror}. Copy the model again.") from error
     except KeyError as error:
-        raise CameraError(f"{path}: has an unknown COLMAP camera model, number {error}. {UNDISTORT}.") from error
+        raise CameraError(f"{path}: has an unknown COLMAP camera model, number {error}. {_CONVERT}.") from error
     except (struct.error, EOFError, ValueError) as error:
         raise CameraError(f"{path}: is truncated or corrupt. Copy the model again.") from error
     return by_id

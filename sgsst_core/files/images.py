@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from sgsst_core.errors import ImageError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.scene.camera import Camera
 
 #: Maximum number of pixels: Pillow's limit against decompression bombs, which is twice its warning threshold. These 179
 #: megapixels exceed the largest camera sensors, and take 2 GB as float32.
@@ -28,24 +27,21 @@ FORMATS = ("JPEG", "PNG", "GIF", "BMP", "WEBP", "TIFF", "AVIF")
 #: Maximum number of scans of a progressive JPEG. A scan of a few bytes makes the decoder process all pixels again.
 #: Encoders write about 10.
 MAX_JPEG_SCANS = 100
-#: Maximum relative difference between the aspect ratios of a photo and its camera. A larger difference indicates a
-#: wrong or cropped photo.
-ASPECT_TOLERANCE = 0.01
-
 _JPEG_QUALITY = 95
 _EXIF_ORIENTATION = 0x0112
+#: EXIF orientations that swap width and height.
+_SWAPPING = (5, 6, 7, 8)
 _JPEG_MARKER = re.compile(rb"\xff([\x01-\xfe])")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 #: Markers without a segment: TEM, restarts and the start of the image.
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
-_NAMES_IN_MESSAGE = 10
 
 
-def load_image(path: Path) -> Tensor:
+def load_image(path: Path, *, oriented: bool = True) -> Tensor:
     """Read an image in one of `FORMATS`, or the first frame of an animated one.
 
-    The EXIF orientation is applied, and transparent images are composited on white. Palettes, gray, 16 bits and CMYK
-    are converted to RGB.
+    The EXIF orientation is applied (unless `oriented` is False), and transparent images are composited on white.
+    Palettes, gray, 16 bits and CMYK are converted to RGB.
 
     Returns:
         Image [H, W, 3] float32 in 0..1, sRGB values as stored (no linearization, no color profile).
@@ -63,98 +59,32 @@ def load_image(path: Path) -> Tensor:
         if image.format in ("JPEG", "MPO"):
             _check_scans(path)
         image.load()
-        return torch.from_numpy(_to_rgb(path, ImageOps.exif_transpose(image)))
+        return torch.from_numpy(_to_rgb(path, ImageOps.exif_transpose(image) if oriented else image))
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return width and height of an image with EXIF orientation applied, from its header alone.
 
+    See `stored_size` for the size without it.
+
+    Raises:
+        ImageError: If the file is missing or not an image, or has more than MAX_PIXELS pixels.
+    """
+    (width, height), orientation = stored_size(path)
+    return (height, width) if orientation in _SWAPPING else (width, height)
+
+
+def stored_size(path: Path) -> tuple[tuple[int, int], int]:
+    """Return width and height of an image as stored, and its EXIF orientation (1 to 8; 1 if it has none).
+
     Raises:
         ImageError: If the file is missing or not an image, or has more than MAX_PIXELS pixels.
     """
     with _opened(path) as image:
-        width, height = image.size
         # the EXIF data of a PNG may follow its pixels, and Pillow would decode all of them to find it
         known = "exif" in image.info or image.format != "PNG"
-        swapped = known and image.getexif().get(_EXIF_ORIENTATION, 1) in (5, 6, 7, 8)  # these swap width and height
-        return (height, width) if swapped else (width, height)
-
-
-def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """Find and check the photo of each camera. Only headers are read, so that errors occur before long work starts.
-
-    A camera's name matches a file with or without its extension. Leading folders of the name are dropped until a file
-    matches: "images/cam0/0001.png" matches FOLDER/images/cam0/0001.png, else FOLDER/cam0/0001.jpg, else
-    FOLDER/0001.jpg.
-
-    Returns:
-        Paths of the photos in the order of the cameras, for `load_photo`.
-
-    Raises:
-        ImageError: If a photo cannot be read or its aspect differs from its camera's, or if photos are missing or
-            ambiguous. The message names the views.
-    """
-    if not folder.is_dir():
-        raise ImageError(f"{folder}: is not a folder of photos. Give the folder that the cameras' names refer to.")
-    index = _index_photos(folder)
-    matches = [_matching(index, folder, camera.name) for camera in cameras]
-    for what, wrong in (("no photo", lambda n: n == 0), ("more than one photo", lambda n: n > 1)):
-        names = [camera.name for camera, found in zip(cameras, matches, strict=True) if wrong(len(found))]
-        if names:
-            shown = ", ".join(names[:_NAMES_IN_MESSAGE]) + (", ..." if len(names) > _NAMES_IN_MESSAGE else "")
-            raise ImageError(
-                f"{folder}: holds {what} for {len(names)} of {len(cameras)} views: {shown}. Photos are found by the "
-                "cameras' names, with or without extension: give the folder that holds exactly these."
-            )
-    paths = [found[0] for found in matches]
-    for path, camera in zip(paths, cameras, strict=True):
-        _check_aspect(path, image_size(path), camera)
-    return paths
-
-
-def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Path | None]:
-    """Find the masks of cameras by name, as `check_photos` finds photos. Only headers are read.
-
-    Returns:
-        Path of each camera's mask; None for a camera without one.
-
-    Raises:
-        ImageError: If no camera has a mask, a camera has several, or the aspect of a mask differs from its camera's.
-    """
-    if not folder.is_dir():
-        raise ImageError(f"{folder}: is not a folder of masks. Give the folder that the cameras' names refer to.")
-    index = _index_photos(folder)
-    found: list[Path | None] = []
-    for camera in cameras:
-        paths = _matching(index, folder, camera.name)
-        if len(paths) > 1:
-            raise ImageError(f"{folder}: holds more than one mask for view {camera.name}. Leave one.")
-        found += paths or [None]
-        if paths:
-            _check_aspect(paths[0], image_size(paths[0]), camera)
-    if not any(found):
-        raise ImageError(
-            f"{folder}: holds no mask for any of {len(cameras)} views. Masks are found by the cameras' names, with or "
-            f"without extension, such as {cameras[0].name}."
-        )
-    return found
-
-
-def load_photo(path: Path, camera: Camera) -> Tensor:
-    """Read a photo and resize it to its camera's size (antialiased bicubic): [height, width, 3] float32 in 0..1.
-
-    Raises:
-        ImageError: If the photo cannot be read (see `load_image`), or its aspect differs from the camera's.
-    """
-    photo = load_image(path)
-    _check_aspect(path, (photo.shape[1], photo.shape[0]), camera)
-    if photo.shape[:2] == (camera.height, camera.width):
-        return photo
-    planes = photo.permute(2, 0, 1)[None]
-    small = torch.nn.functional.interpolate(
-        planes, (camera.height, camera.width), mode="bicubic", antialias=True, align_corners=False
-    )
-    return small[0].permute(1, 2, 0).clamp(0, 1).contiguous()  # bicubic interpolation overshoots at edges
+        orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if known else 1
+        return image.size, orientation if orientation in range(1, 9) else 1
 
 
 def save_png(path: Path, image: Tensor) -> None:
@@ -240,44 +170,6 @@ def _full_scale(mode: str, largest: float) -> float:
         return 65535.0
     ranges = (1.0, 255.0, 65535.0) if mode == "F" else (65535.0,)
     return next((full for full in ranges if largest <= full), max(largest, 1.0))
-
-
-def _index_photos(folder: Path) -> dict[tuple[str, ...], list[Path]]:
-    """Index all image files below a folder by every trailing part of their relative path, without extension."""
-    extensions = Image.registered_extensions()
-    index: dict[tuple[str, ...], list[Path]] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in extensions and not path.name.startswith(".") and path.is_file():
-            parts = path.relative_to(folder).with_suffix("").parts
-            for start in range(len(parts)):
-                index.setdefault(parts[start:], []).append(path)
-    return index
-
-
-def _matching(index: dict[tuple[str, ...], list[Path]], folder: Path, name: str) -> list[Path]:
-    """Return the photos that match a camera's name best.
-
-    The longest matching path wins, then files outside deeper subfolders, then files with the exact extension.
-    """
-    wanted = PurePosixPath(name.replace("\\", "/"))
-    known = wanted.suffix.lower() in Image.registered_extensions()
-    parts = tuple(part for part in (wanted.with_suffix("") if known else wanted).parts if part not in ("..", "/"))
-    for start in range(len(parts)):
-        found = index.get(parts[start:], [])
-        if found:
-            direct = [path for path in found if path.parent == folder.joinpath(*parts[start:-1])] or found
-            return [path for path in direct if path.suffix == wanted.suffix] or direct
-    return []
-
-
-def _check_aspect(path: Path, size: tuple[int, int], camera: Camera) -> None:
-    # a camera's size is rounded to whole pixels, which changes the aspect ratio of a small camera
-    allowed = ASPECT_TOLERANCE + 0.5 / min(camera.width, camera.height)
-    if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > allowed:
-        raise ImageError(
-            f"{path}: is {size[0]} x {size[1]}, but its camera {camera.name!r} {camera.width} x {camera.height}, "
-            "another aspect ratio. Give the photos that the cameras were computed from, neither cropped nor rotated."
-        )
 
 
 def _save(path: Path, image: Tensor, **options: Any) -> None:

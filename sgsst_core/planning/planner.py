@@ -43,6 +43,7 @@ def make_plan(
     show: ShowPlanning | None = None,
     timer: Timer | None = None,
     orbit: Orbit | None = None,
+    about_inputs: Sequence[Decision] = (),
     style: Style | None = None,
     regions: Regions | None = None,
     refinement: Refinement | None = None,
@@ -61,6 +62,7 @@ def make_plan(
         show: Callback for the progress of the survey.
         timer: Timer that records the survey as "survey", and everything else as "planning".
         orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
+        about_inputs: Lines about cameras and photos that start the plan.
         style: Style mixture, for the plan to report its images; None for one image.
         regions: Regions of the scene; None if there are none.
         refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
@@ -100,6 +102,7 @@ def make_plan(
         # Timings differ between ranks, so one rank decides for all.
         plan = collectives.broadcast(decide_here)
         request_lines = [
+            *about_inputs,
             *([refine_decision(refinement, settings)] if refinement is not None else []),
             *(orbit_decisions(orbit, fitted, survey.uncovered) if orbit is not None else []),
             *(_about_regions(regions, resolved, plan, fitted) if regions is not None and resolved is not None else []),

@@ -14,6 +14,7 @@ from torch import Tensor
 from sgsst_core.errors import CameraError, SettingsError
 
 if TYPE_CHECKING:
+    from sgsst_core.scene.lens import Lens
     from sgsst_core.settings import Settings
 
 V = TypeVar("V")
@@ -30,6 +31,7 @@ class Camera:
         world_to_camera: [4, 4] float64 rigid transform.
         resolution: Longer side in pixels of the 4:3 view with the same number of pixels, for cameras whose aspect ratio
             was fitted to the content. None if resolutions refer to the camera's own longer side.
+        lens: Lens that took the camera's photos; None if they are those of a pinhole. Renders never have distortion.
 
     Example:
         >>> camera = Camera("front", 640, 480, 500.0, 500.0, 320.0, 240.0, torch.eye(4, dtype=torch.float64))
@@ -46,6 +48,7 @@ class Camera:
     cy: float
     world_to_camera: Tensor  # [4, 4] float64
     resolution: int | None = None
+    lens: Lens | None = None
 
     @property
     def side(self) -> int:

@@ -167,6 +167,7 @@ def fingerprint(
     for camera in cameras:
         pose = camera.world_to_camera.numpy().tobytes()
         digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)
+        digest.update(repr(camera.lens).encode() if camera.lens else b"")
     digest.update(settings.model_dump_json(exclude=_FREE_SETTINGS).encode())
     if settings.feature_scale == "even":  # later versions may choose other factors, but a run must stay with one loss
         digest.update(repr((EVEN_SCALE, EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE)).encode())

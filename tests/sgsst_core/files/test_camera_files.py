@@ -8,6 +8,7 @@ import os
 import shutil
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,8 @@ def colmap(folder: Path, cameras: list[Camera], *, text: bool, model: str = "PIN
     number, values = {
         "SIMPLE_PINHOLE": (0, [500.0, WIDTH / 2, HEIGHT / 2]),
         "PINHOLE": (1, [500.0, 500.0, WIDTH / 2, HEIGHT / 2]),
-        "OPENCV": (4, [500.0, 500.0, WIDTH / 2, HEIGHT / 2, 0.1, 0, 0, 0]),
+        "SIMPLE_RADIAL": (2, [500.0, WIDTH / 2, HEIGHT / 2, 0.0]),
+        "OPENCV": (4, [500.0, 500.0, WIDTH / 2, HEIGHT / 2, 0.0, 0.0, 0.0, 0.0]),
     }[model]
     poses = []
     for view in cameras:
@@ -118,6 +120,12 @@ def test_inria(tmp_path: Path) -> None:
     assert_same(read_cameras(tmp_path), cameras)
 
 
+def test_principal_points_of_cameras_json(tmp_path: Path) -> None:
+    entries = [entry | {"cx": 300.0, "cy": 250.5} for entry in inria(views())]
+    expected = [replace(view, cx=300.0, cy=250.5) for view in views()]
+    assert_same(read_cameras(save(tmp_path / "cameras.json", entries)), expected)
+
+
 def test_nerfstudio(tmp_path: Path) -> None:
     cameras = list(reversed(views()))
     path = save(tmp_path / "transforms.json", nerfstudio(cameras))
@@ -133,6 +141,31 @@ def test_nerfstudio_with_a_lens_for_each_frame(tmp_path: Path) -> None:
     assert (first.fx, first.fy, first.cx, first.cy, first.width, first.height) == (500, 500, 320, 240, 640, 480)
     assert (second.fx, second.fy, second.cx, second.cy, second.width, second.height) == (300, 310, 99, 101, 200, 200)
     assert torch.allclose(second.world_to_camera, views(2)[1].world_to_camera)
+
+
+def test_nerfstudio_lenses_of_the_file_and_of_frames(tmp_path: Path) -> None:
+    content = nerfstudio(views(4)) | {"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": None, "k3": 0.01}
+    content["frames"][1] |= {"camera_model": "OPENCV_FISHEYE", "k4": 0.002}
+    content["frames"][2] |= {"camera_model": "PINHOLE", "k1": 0, "k2": 0, "k3": 0, "p1": 0}
+    content["frames"][3] |= {"camera_model": "FISHEYE624"}
+    found = read_cameras(save(tmp_path / "t.json", content))
+    assert_same(found, views(4), lambda name: f"images/{name}")
+    first, fisheye, pinhole, other = (view.lens for view in found)
+    assert first
+    assert fisheye
+    assert other
+    assert (first.kind, first.coefficients) == ("radial", (0.1, -0.02, 0.003, 0, 0.01, 0, 0, 0))
+    assert (fisheye.kind, fisheye.coefficients) == ("fisheye", (0.1, -0.02, 0.01, 0.002))
+    assert pinhole is None
+    assert (other.kind, other.model) == (None, "FISHEYE624")
+
+
+def test_fisheyes_of_instant_ngp(tmp_path: Path) -> None:
+    content = nerfstudio(views(1)) | {"is_fisheye": True}
+    del content["camera_model"]
+    (view,) = read_cameras(save(tmp_path / "t.json", content))
+    assert view.lens
+    assert view.lens.kind == "fisheye"
 
 
 @pytest.mark.parametrize("suffix", ["", ".png", ".jpg"])
@@ -191,9 +224,46 @@ def test_colmap(tmp_path: Path, text: bool, place: str, model: str) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_distorted_colmap_models_name_the_remedy(tmp_path: Path, text: bool) -> None:
-    folder = colmap(tmp_path / "model", views(), text=text, model="OPENCV")
-    with pytest.raises(CameraError, match=r"image 'img_\d\.png': has camera model OPENCV.*colmap image_undistorter"):
+@pytest.mark.parametrize("number", [number for number in colmap_model._MODELS if number != 17])
+def test_distorted_colmap_cameras_are_pinholes_with_a_lens(tmp_path: Path, text: bool, number: int) -> None:
+    """All coefficients after the intrinsics are 0.01, as pycolmap writes them."""
+    reference = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(number), 500.0, WIDTH, HEIGHT)
+    extra = list(reference.extra_params_idxs())
+    reference.params = [0.01 if index in extra else value for index, value in enumerate(reference.params)]
+    name, folder = colmap_model._MODELS[number][0], colmap(tmp_path / "model", views(), text=text)
+    values = reference.params.tolist()
+    if text:
+        (folder / "cameras.txt").write_text(f"1 {name} {WIDTH} {HEIGHT} {' '.join(map(repr, values))}\n")
+    else:
+        packed = struct.pack(f"<QIiQQ{len(values)}d", 1, 1, number, WIDTH, HEIGHT, *values)
+        (folder / "cameras.bin").write_bytes(packed)
+    found = read_cameras(folder)
+    assert_same(found, views())
+    lenses = {view.lens for view in found}
+    if name in ("SIMPLE_PINHOLE", "PINHOLE"):
+        assert lenses == {None}
+        return
+    (lens,) = lenses
+    assert lens is not None
+    assert (lens.model, lens.width, lens.height) == (name, WIDTH, HEIGHT)
+    if lens.kind:
+        u, v = lens.positions(torch.tensor(0.3, dtype=torch.float64), torch.tensor(-0.2, dtype=torch.float64))
+        expected = reference.img_from_cam(np.array([0.3, -0.2, 1.0]))
+        assert (float(u) * WIDTH, float(v) * HEIGHT) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV"])
+def test_colmap_cameras_with_coefficients_of_0_are_pinholes(tmp_path: Path, text: bool, model: str) -> None:
+    folder = colmap(tmp_path / "model", views(), text=text, model=model)
+    assert_same(read_cameras(folder), views())
+    assert {view.lens for view in read_cameras(folder)} == {None}
+
+
+def test_panoramas_are_refused(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "model", views(), text=True)
+    (folder / "cameras.txt").write_text("1 EQUIRECTANGULAR 640 320 640 320\n")
+    with pytest.raises(CameraError, match=r"EQUIRECTANGULAR, which has no pinhole part.*panorama_sfm"):
         read_cameras(folder)
 
 
@@ -380,10 +450,10 @@ def test_wrong_values_of_inria_cameras_are_named(tmp_path: Path, key: str, value
         ("transform_matrix", None, "has no 'transform_matrix'"),
         ("transform_matrix", np.eye(3).tolist(), r"shape \(3, 3\), not \(4, 4\) or \(3, 4\)"),
         ("transform_matrix", (3 * np.eye(4)).tolist(), "is 8 off a rotation"),
-        ("k1", 0.03, "distortion k1, .*image_undistorter"),
+        ("k1", NAN, "'k1' is nan, not a finite number"),
         ("p2", "0.1", "'p2' is 0.1"),
-        ("camera_model", "OPENCV_FISHEYE", "camera model OPENCV_FISHEYE, .*image_undistorter"),
-        ("is_fisheye", True, "image_undistorter"),
+        ("camera_model", "EQUIRECTANGULAR", "EQUIRECTANGULAR, which has no pinhole part.*ns-process-data"),
+        ("camera_model", "VR180_L", "VR180_L, which has no pinhole part"),
         ("w", -1, "width is -1"),
         ("cx", NAN, "'cx' is nan"),
     ],

@@ -15,29 +15,21 @@ import torch
 from PIL import Image
 
 from sgsst_core.errors import ImageError, OutputError
-from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import (
     FORMATS,
     MAX_JPEG_SCANS,
     MAX_PIXELS,
-    check_photos,
     image_size,
     load_image,
-    load_photo,
     save_jpg,
     save_png,
 )
-from sgsst_core.scene.camera import Camera, resized
 
 
 def gradient(height: int = 6, width: int = 9) -> np.ndarray:
     """Return an image [height, width, 3] uint8 with all pixels different."""
     values = np.arange(height * width)
     return np.stack([values * 3 % 256, values * 5 % 256, 255 - values], axis=1).reshape(height, width, 3).astype("u1")
-
-
-def camera(name: str, width: int = 90, height: int = 60) -> Camera:
-    return Camera(name, width, height, 100.0, 100.0, width / 2, height / 2, torch.eye(4, dtype=torch.float64))
 
 
 def save(path: Path, image: Image.Image, **options: Any) -> Path:
@@ -223,79 +215,6 @@ def test_what_is_no_image_is_refused(tmp_path: Path) -> None:
         load_image(path / "below.jpg")
 
 
-@pytest.mark.parametrize(
-    ("file", "name"),
-    [
-        ("0001.jpg", "0001.jpg"),
-        ("0001.jpg", "0001"),
-        ("0001.JPG", "0001"),
-        ("0001.png", "0001.jpg"),
-        ("0001.jpg", "images/0001.jpg"),
-        ("0001.jpg", "../images/0001"),
-        ("0001.jpg", "images\\0001.jpg"),
-        ("sub/0001.jpg", "0001.jpg"),
-        ("frame.0001.jpg", "frame.0001"),
-        ("frame.0001.jpg", "frame.0001.jpg"),
-    ],
-)
-def test_photos_are_found_by_name(tmp_path: Path, file: str, name: str) -> None:
-    save(tmp_path / "other.jpg", Image.new("RGB", (90, 60)))
-    path = save(tmp_path / file, Image.new("RGB", (180, 120)))
-    assert check_photos(tmp_path, [camera(name)]) == [path]
-
-
-def test_photos_of_a_rig_are_told_apart_by_folder_and_by_extension(tmp_path: Path) -> None:
-    for name in ("cam0/a.png", "cam1/a.png", "cam1/a.jpg", "b.png", "old/b.png"):
-        save(tmp_path / name, Image.new("RGB", (90, 60)))
-    names = ["cam1/a.png", "images/cam0/a", "cam1/a.jpg", "b.png"]
-    found = check_photos(tmp_path, [camera(name) for name in names])
-    assert [str(path.relative_to(tmp_path)) for path in found] == ["cam1/a.png", "cam0/a.png", "cam1/a.jpg", "b.png"]
-    with pytest.raises(ImageError, match="more than one photo for 2 of 3 views: a, cam1/a"):
-        check_photos(tmp_path, [camera("a"), camera("b"), camera("cam1/a")])
-
-
-def test_missing_photos_are_named(tmp_path: Path) -> None:
-    save(tmp_path / "v03.png", Image.new("RGB", (90, 60)))
-    cameras = [camera(f"v{i:02d}") for i in range(15)]
-    with pytest.raises(ImageError, match=r"no photo for 14 of 15 views: v00, v01, v02, v04, .*v10, \.\.\."):
-        check_photos(tmp_path, cameras)
-    with pytest.raises(ImageError, match=r"1 of 2 views: v00\. Photos"):
-        check_photos(tmp_path, [cameras[0], cameras[3]])
-    with pytest.raises(ImageError, match="not a folder"):
-        check_photos(tmp_path / "v03.png", cameras)
-
-
-def test_photos_of_another_aspect_are_refused_early_and_late(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.png", Image.new("RGB", (93, 60)))
-    for check in (lambda: check_photos(tmp_path, [camera("a")]), lambda: load_photo(path, camera("a"))):
-        with pytest.raises(ImageError, match="is 93 x 60, but its camera 'a' 90 x 60, another aspect"):
-            check()
-    # The rounded sides of a small camera do not count as another aspect ratio.
-    save(tmp_path / "b.png", Image.new("RGB", (990, 742)))
-    check_photos(tmp_path, [resized(camera("b", 990, 742), 22)])
-
-
-def test_broken_photos_are_noticed_early(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").write_bytes(b"no photo")
-    with pytest.raises(ImageError, match=r"a\.jpg: is not an image"):
-        check_photos(tmp_path, [camera("a")])
-
-
-def test_photos_come_at_their_cameras_size_without_aliasing(tmp_path: Path) -> None:
-    stripes = np.zeros((120, 180, 3), dtype="u1")
-    stripes[:, ::2] = 255
-    path = save(tmp_path / "a.png", Image.fromarray(stripes))
-    small = load_photo(path, camera("a", 45, 30))
-    assert small.shape == (30, 45, 3)
-    assert float((small - 0.5).abs()[:, 2:-2].max()) < 0.02  # point sampling would give 0 or 1
-    same = load_photo(path, camera("a", 180, 120))
-    assert torch.equal(same, torch.from_numpy(stripes).float() / 255)
-    large = load_photo(path, camera("a", 360, 240))
-    assert large.shape == (240, 360, 3)
-    assert float(large.min()) >= 0
-    assert float(large.max()) <= 1
-
-
 def test_png_is_clamped_rounded_and_exact(tmp_path: Path) -> None:
     image = torch.from_numpy(gradient()).float() / 255
     save_png(tmp_path / "a.png", image)
@@ -321,15 +240,6 @@ def test_what_is_no_picture_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         save_jpg(tmp_path / "missing" / "a.jpg", torch.zeros(2, 2, 3))
     assert os.listdir(tmp_path) == []
-
-
-def test_real_photos_belong_to_their_cameras(shared_data: Path) -> None:
-    photos = shared_data / "photos" / "snowmiku_plush"
-    cameras = read_cameras(photos / "cameras.json")
-    paths = check_photos(photos / "images", cameras)
-    assert [path.stem for path in paths] == [view.name for view in cameras]
-    small = load_photo(paths[5], resized(cameras[5], 256))
-    assert small.shape == (192, 256, 3)
 
 
 def test_real_paintings_are_read(shared_data: Path) -> None:

@@ -16,7 +16,8 @@ if torch.cuda.is_available():
 
 from sgsst_core.errors import ImageError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.images import load_photo, save_png
+from sgsst_core.files.images import save_png
+from sgsst_core.files.photos import Photo, load_photo
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.ahead import PhotosAhead
 from sgsst_core.stylizing.loop import run
@@ -73,7 +74,7 @@ class Photos:
 
     def read(self, index: int) -> Tensor:
         """Read a photo without recording it."""
-        return load_photo(self._paths[index], self._cameras[index])
+        return load_photo(Photo(self._paths[index], (0, 0)), self._cameras[index])
 
     def wait_for(self, count: int) -> None:
         """Wait until `count` photos have been read in total."""

@@ -1,0 +1,186 @@
+"""Photos and masks of cameras: found by name, checked by their headers, and read as their pinhole cameras see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from sgsst_core.errors import ImageError
+from sgsst_core.files.images import load_image, stored_size
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.lens import undistort
+
+#: Maximum relative difference between the aspect ratios of a photo and its camera. A larger difference indicates a
+#: wrong or cropped photo.
+ASPECT_TOLERANCE = 0.01
+#: Largest fraction of the cameras that may lack a photo.
+MOST_MISSING = 0.5
+
+_NAMES_IN_MESSAGE = 10
+
+
+@dataclass(frozen=True)
+class Photo:
+    """Photo of a camera.
+
+    Attributes:
+        path: Path of the file.
+        size: Width and height in pixels, in the orientation that is used.
+        oriented: Whether the EXIF orientation is applied. COLMAP ignores it, so it is used only if the photo does not
+            fit its camera otherwise.
+        ambiguous: Whether the photo would fit its camera in both orientations.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    oriented: bool = False
+    ambiguous: bool = False
+
+
+def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
+    """Find and check the photo of each camera. Only headers are read, so that errors occur before long work starts.
+
+    A camera's name matches a file with or without its extension. Leading folders of the name are dropped until a file
+    matches: "images/cam0/0001.png" matches FOLDER/images/cam0/0001.png, else FOLDER/cam0/0001.jpg, else
+    FOLDER/0001.jpg.
+
+    Returns:
+        Photos in the order of the cameras, for `load_photo`; None for a camera without one.
+
+    Raises:
+        ImageError: If a photo cannot be read or its aspect differs from its camera's, if more than half of the photos
+            are missing, or if one is ambiguous. The message names the views.
+    """
+    if not folder.is_dir():
+        raise ImageError(f"{folder}: is not a folder of photos. Give the folder that the cameras' names refer to.")
+    index = _index_photos(folder)
+    matches = [_matching(index, folder, camera.name) for camera in cameras]
+    missing = [camera.name for camera, found in zip(cameras, matches, strict=True) if not found]
+    several = [camera.name for camera, found in zip(cameras, matches, strict=True) if len(found) > 1]
+    for what, names, most in (("no photo", missing, MOST_MISSING * len(cameras)), ("more than one photo", several, 0)):
+        if len(names) > most:
+            raise ImageError(
+                f"{folder}: holds {what} for {len(names)} of {len(cameras)} views: {some_names(names)}. Photos are "
+                "found by the cameras' names, with or without extension: give the folder that holds exactly these."
+            )
+    return [_fitting(found[0], camera) if found else None for camera, found in zip(cameras, matches, strict=True)]
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Return the first names of a list, separated by commas."""
+    return ", ".join(names[:_NAMES_IN_MESSAGE]) + (", ..." if len(names) > _NAMES_IN_MESSAGE else "")
+
+
+def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
+    """Find the masks of cameras by name, as `check_photos` finds photos. Only headers are read.
+
+    Returns:
+        Mask of each camera; None for a camera without one.
+
+    Raises:
+        ImageError: If no camera has a mask, a camera has several, or the aspect of a mask differs from its camera's.
+    """
+    if not folder.is_dir():
+        raise ImageError(f"{folder}: is not a folder of masks. Give the folder that the cameras' names refer to.")
+    index = _index_photos(folder)
+    found: list[Photo | None] = []
+    for camera in cameras:
+        paths = _matching(index, folder, camera.name)
+        if len(paths) > 1:
+            raise ImageError(f"{folder}: holds more than one mask for view {camera.name}. Leave one.")
+        found.append(_fitting(paths[0], camera) if paths else None)
+    if not any(found):
+        raise ImageError(
+            f"{folder}: holds no mask for any of {len(cameras)} views. Masks are found by the cameras' names, with or "
+            f"without extension, such as {cameras[0].name}."
+        )
+    return found
+
+
+def load_photo(photo: Photo, camera: Camera) -> Tensor:
+    """Read a photo as its pinhole camera sees it: [height, width, 3] float32 in 0..1.
+
+    If the camera has a lens, its distortion is removed (`undistort`). Otherwise the photo is resized to the camera's
+    size (antialiased bicubic).
+
+    Raises:
+        ImageError: If the photo cannot be read (see `load_image`), or its aspect differs from the camera's.
+    """
+    pixels = load_image(photo.path, oriented=photo.oriented)
+    if not fits((pixels.shape[1], pixels.shape[0]), camera):
+        raise _misfit(photo.path, (pixels.shape[1], pixels.shape[0]), camera)
+    if camera.lens is not None:
+        return undistort(pixels, camera)
+    if pixels.shape[:2] == (camera.height, camera.width):
+        return pixels
+    planes = pixels.permute(2, 0, 1)[None]
+    small = torch.nn.functional.interpolate(
+        planes, (camera.height, camera.width), mode="bicubic", antialias=True, align_corners=False
+    )
+    return small[0].permute(1, 2, 0).clamp(0, 1).contiguous()  # bicubic interpolation overshoots at edges
+
+
+def fits(size: tuple[int, int], camera: Camera) -> bool:
+    """Return whether an image of this width and height has the aspect ratio of a camera's photos."""
+    width, height = photo_size(camera)
+    # a camera's size is rounded to whole pixels, which changes the aspect ratio of a small camera
+    allowed = ASPECT_TOLERANCE + 0.5 / min(width, height)
+    return abs(size[0] * height / (size[1] * width) - 1) <= allowed
+
+
+def photo_size(camera: Camera) -> tuple[int, int]:
+    """Return width and height of a camera's photos: its own, or those of its lens."""
+    frame = camera.lens or camera
+    return frame.width, frame.height
+
+
+def _fitting(path: Path, camera: Camera) -> Photo:
+    """Return the photo in the orientation that fits the camera."""
+    stored, orientation = stored_size(path)
+    turned = (stored[1], stored[0]) if orientation >= 5 else stored
+    if fits(stored, camera):
+        return Photo(path, stored, ambiguous=orientation != 1 and fits(turned, camera))
+    if not fits(turned, camera):
+        raise _misfit(path, stored, camera)
+    return Photo(path, turned, oriented=True)
+
+
+def _misfit(path: Path, size: tuple[int, int], camera: Camera) -> ImageError:
+    width, height = photo_size(camera)
+    return ImageError(
+        f"{path}: is {size[0]} x {size[1]}, but its camera {camera.name!r} {width} x {height}, another aspect ratio. "
+        "Give the photos that the cameras were computed from, neither cropped nor rotated."
+    )
+
+
+def _index_photos(folder: Path) -> dict[tuple[str, ...], list[Path]]:
+    """Index all image files below a folder by every trailing part of their relative path, without extension."""
+    extensions = Image.registered_extensions()
+    index: dict[tuple[str, ...], list[Path]] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in extensions and not path.name.startswith(".") and path.is_file():
+            parts = path.relative_to(folder).with_suffix("").parts
+            for start in range(len(parts)):
+                index.setdefault(parts[start:], []).append(path)
+    return index
+
+
+def _matching(index: dict[tuple[str, ...], list[Path]], folder: Path, name: str) -> list[Path]:
+    """Return the photos that match a camera's name best.
+
+    The longest matching path wins, then files outside deeper subfolders, then files with the exact extension.
+    """
+    wanted = PurePosixPath(name.replace("\\", "/"))
+    known = wanted.suffix.lower() in Image.registered_extensions()
+    parts = tuple(part for part in (wanted.with_suffix("") if known else wanted).parts if part not in ("..", "/"))
+    for start in range(len(parts)):
+        found = index.get(parts[start:], [])
+        if found:
+            direct = [path for path in found if path.parent == folder.joinpath(*parts[start:-1])] or found
+            return [path for path in direct if path.suffix == wanted.suffix] or direct
+    return []

@@ -1,0 +1,171 @@
+"""Checks whether scene, cameras and photos belong together, before long work starts.
+
+Cameras in another coordinate frame than the scene see little of it, and photos of another frame or crop differ from its
+renders. The thresholds separate real captures from rotated, scaled and cropped ones (`benchmarks/results/README.md`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import mean, median
+
+import torch
+from torch import Tensor
+
+from sgsst_core.decision import Decision
+from sgsst_core.errors import CameraError
+from sgsst_core.files.photos import Photo, load_photo
+from sgsst_core.planning.survey import nothing_seen
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera, resized, spread
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+
+#: A typical view of a capture shows more of the Gaussians than this, or few uncovered pixels.
+_LITTLE_SHOWN, _MUCH_UNCOVERED = 0.25, 0.1
+#: Cameras that together see less than half of the scene are refused if a typical view is nearly empty.
+_NEARLY_NOTHING, _MOSTLY_UNCOVERED, _HALF = 0.01, 0.4, 0.5
+#: PSNR in dB below which photos are reported. Right photos reach 26 in every view; cropped by 10 %, they have 20.
+_UNLIKE_PSNR = 21.0
+#: Gaussians, cameras and pixels that are looked at.
+_GAUSSIANS, _CAMERAS, _VIEWS, _SIDE, _PHOTO_SIDE = 20_000, 200, 8, 128, 256
+#: Added to squared errors, so that equal images have a finite PSNR.
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Fractions of a scene's Gaussians whose centers are in the frames of cameras.
+
+    Attributes:
+        typical: Fraction in one frame, median over the cameras.
+        together: Fraction in at least one frame.
+    """
+
+    typical: float
+    together: float
+
+
+def shown_by(means: Tensor, cameras: Sequence[Camera], near: float) -> Shown:
+    """Return how much of a scene cameras show, from samples of both.
+
+    Args:
+        means: Centers of the Gaussians, [N, 3].
+        cameras: At least one camera.
+        near: Distance of the near plane in world units.
+    """
+    points = means[:: max(1, len(means) // _GAUSSIANS)].double()
+    together = torch.zeros(len(points), dtype=torch.bool)
+    fractions = []
+    for camera in spread(cameras, _CAMERAS):
+        x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
+        across, down = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
+        together |= inside
+        fractions.append(float(inside.double().mean()))
+    return Shown(median(fractions), float(together.double().mean()))
+
+
+def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Decision]:
+    """Return a warning if cameras seem to be in another coordinate frame than the scene.
+
+    Views are rendered only if they show few Gaussians.
+
+    Raises:
+        CameraError: If they see nearly nothing of it.
+    """
+    shown = shown_by(scene.means, cameras, near)
+    if shown.typical >= _LITTLE_SHOWN:
+        return []
+    rasterizer = make_rasterizer("cpu", scene, near=near)
+    views = [resized(camera, _SIDE) for camera in spread(cameras, _VIEWS)]
+    uncovered = mean(float(1 - rasterizer.coverage(view).mean(dtype=torch.float64)) for view in views)
+    if uncovered == 1:
+        raise nothing_seen(len(cameras))
+    if uncovered <= _MUCH_UNCOVERED:
+        return []
+    text = f"a typical view has {shown.typical:.1%} of the Gaussians in its frame and {uncovered:.0%} uncovered pixels"
+    advice = (
+        "use the cameras of the scene's own training run and world; a scene exported by nerfstudio needs its "
+        "dataparser_transforms.json beside transforms.json"
+    )
+    if shown.typical < _NEARLY_NOTHING and shown.together < _HALF and uncovered > _MOSTLY_UNCOVERED:
+        raise CameraError(
+            f"Cameras and scene have different coordinate frames: {text}, and all {len(cameras)} views together reach "
+            f"{shown.together:.1%}. Instead, {advice}."
+        )
+    return [Decision("cameras", f"warning: they may be in another coordinate frame: {text}", advice)]
+
+
+def compare_photos(
+    scene: Scene, cameras: Sequence[Camera], photos: Sequence[Photo], near: float
+) -> tuple[list[Photo], list[Decision]]:
+    """Compare some photos with renders of the scene, without differences of exposure and white balance.
+
+    Returns:
+        Photos, those that fit in both orientations in the better one; and the decisions about them.
+
+    Raises:
+        ImageError: If a photo cannot be read.
+    """
+    likeness = _Likeness(scene, near)
+    photos, decisions = list(photos), []
+    doubtful = [index for index, photo in enumerate(photos) if photo.ambiguous]
+    if doubtful:
+        some = spread(doubtful, _VIEWS)
+        stored = mean(likeness.psnr(photos[index], cameras[index]) for index in some)
+        turned = mean(likeness.psnr(replace(photos[index], oriented=True), cameras[index]) for index in some)
+        if turned > stored:
+            photos = [replace(photo, oriented=True) if photo.ambiguous else photo for photo in photos]
+        used = f"the EXIF orientation of {len(doubtful)} photos is {'applied' if turned > stored else 'ignored'}"
+        reason = f"PSNR against renders is {max(stored, turned):.1f} dB so, and {min(stored, turned):.1f} dB otherwise"
+        decisions.append(Decision("photos", used, reason))
+    pairs = spread(list(zip(photos, cameras, strict=True)), _VIEWS)
+    found = median(likeness.psnr(photo, camera) for photo, camera in pairs)
+    if found < _UNLIKE_PSNR:
+        decisions.append(
+            Decision(
+                "photos",
+                f"warning: they differ from the scene's renders ({found:.1f} dB PSNR; at least {_UNLIKE_PSNR:.0f} are "
+                "expected)",
+                "they may be cropped, belong to other cameras, or the scene is in another coordinate frame; compare "
+                "them with the images of `sgsst render`",
+            )
+        )
+    return photos, decisions
+
+
+class _Likeness:
+    """Comparison of photos with small renders of a scene."""
+
+    def __init__(self, scene: Scene, near: float) -> None:
+        self._scene, self._rasterizer = scene, make_rasterizer("cpu", scene, near=near)
+        self._renders: dict[str, tuple[Tensor, Tensor]] = {}
+
+    def psnr(self, photo: Photo, camera: Camera) -> float:
+        """Return the PSNR in dB of a photo against the render of its view."""
+        view = resized(camera, min(camera.side, _PHOTO_SIDE))
+        if view.name not in self._renders:
+            colors = view_colors(self._scene.sh_dc, rest_colors(self._scene.sh_rest, self._scene.means, view))
+            self._renders[view.name] = self._rasterizer.render(colors, view), self._rasterizer.coverage(view)
+        return fitted_psnr(load_photo(photo, view), *self._renders[view.name])
+
+
+def fitted_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:
+    """Return the PSNR in dB of a photo after the affine map of each channel that brings it closest to the render.
+
+    Args:
+        photo: Image [H, W, 3].
+        render: Image of the same size.
+        weight: Weight of each pixel, [H, W]; such as its coverage, because a scan has no background.
+    """
+    w = weight.double().flatten()[:, None]
+    x, y = photo.double().flatten(0, 1), render.double().flatten(0, 1)
+    total = w.sum().clamp_min(_TINY)
+    x, y = x - (w * x).sum(0) / total, y - (w * y).sum(0) / total
+    variance, covariance = (w * x * x).sum(0), (w * x * y).sum(0)
+    slope = (covariance / variance.clamp_min(_TINY)).clamp_min(0)  # an inverted photo is none of the scene
+    error = float((w * (y - slope * x) ** 2).sum() / (3 * total))
+    return -10 * math.log10(error + _TINY)

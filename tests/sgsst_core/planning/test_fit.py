@@ -1,0 +1,184 @@
+"""Tests that cameras of another coordinate frame and photos of other views are noticed, and real captures are not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from sgsst_core.errors import CameraError
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.images import save_png
+from sgsst_core.files.photos import Photo, check_photos
+from sgsst_core.files.scene_file import read_scene
+from sgsst_core.orbit.choice import OrbitRequest, make_orbit
+from sgsst_core.planning.fit import compare_photos, fitted_psnr, frame_warnings, shown_by
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera, spread
+from sgsst_core.scene.gaussians import Scene
+from tests.sgsst_core.pictures import picture
+from tests.small_scenes import ball, blind_camera, cameras, wall
+
+NEAR = 0.2
+
+
+def moved(camera: Camera, axis: str = "x", degrees: float = 0.0, scale: float = 1.0) -> Camera:
+    """Return a camera in a world that is rotated about an axis through the origin, and then scaled."""
+    rotation = torch.from_numpy(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
+    pose = camera.world_to_camera.clone()
+    pose[:3, :3] = pose[:3, :3] @ rotation.T
+    pose[:3, 3] *= scale
+    return replace(camera, world_to_camera=pose)
+
+
+def opengl(camera: Camera) -> Camera:
+    """Return a camera whose axes y and z have the wrong signs."""
+    return replace(
+        camera, world_to_camera=camera.world_to_camera.new_tensor([1, -1, -1, 1]).diag() @ camera.world_to_camera
+    )
+
+
+def verdict(scene: Scene, views: list[Camera]) -> str:
+    try:
+        found = frame_warnings(scene, views, NEAR)
+    except CameraError:
+        return "refused"
+    return "warned" if found else "fine"
+
+
+@pytest.mark.parametrize("scene", [wall(), ball()])
+def test_cameras_of_the_scene_are_fine(scene: Scene) -> None:
+    assert frame_warnings(scene, cameras(), NEAR) == []
+
+
+def test_a_scene_that_is_partly_in_view_is_reported() -> None:
+    """A Gaussian counts as shown if its center is in the frame."""
+    shown = shown_by(torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0], [0.0, 0.0, 0.1], [1.4, 0, 3]]), cameras(3), NEAR)
+    assert shown.typical == 0.5  # the views at the sides show the point at x = 1.4 or do not
+    assert shown.together == 0.5
+
+
+def test_cameras_that_see_nothing_are_refused() -> None:
+    with pytest.raises(CameraError, match="None of the 1 cameras sees a Gaussian"):
+        frame_warnings(wall(), [blind_camera()], NEAR)
+
+
+def test_the_plush_is_fine_and_its_cameras_in_other_frames_are_not(shared_data: Path) -> None:
+    folder = shared_data / "scenes" / "snowmiku_plush"
+    scene, own = read_scene(folder / "point_cloud.ply").scene, read_cameras(folder / "cameras.json")
+    for count in (1, 2, 3, 8, 97):
+        assert verdict(scene, spread(own, count)) == "fine"
+    assert verdict(scene, [moved(view, "x", 90) for view in own]) == "warned"  # nerfstudio's frame
+    assert verdict(scene, [moved(view, "y", -90) for view in own]) == "warned"
+    assert verdict(scene, [moved(view, "x", 180) for view in own]) == "refused"  # the other axes of SPZ
+    assert verdict(scene, [opengl(view) for view in own]) == "refused"
+    with pytest.raises(CameraError, match=r"different coordinate frames: .*nerfstudio needs its dataparser_transforms"):
+        frame_warnings(scene, [moved(view, "y", 180) for view in own], NEAR)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "away"),
+    [
+        ("biker", ["x90", "x180", "z90", "z180"]),
+        ("broche", ["x90", "x180", "z90", "z180"]),
+        ("playbot_synthetic_sh2", []),  # around the origin, every rotation shows it
+    ],
+)
+def test_orbits_of_scans_are_fine(shared_data: Path, name: str, away: list[str]) -> None:
+    (path,) = (shared_data / "scenes" / name).iterdir()
+    scene = read_scene(path, drop_invalid=True).scene
+    views = make_orbit(scene, OrbitRequest(24, None, None, None, NEAR)).cameras
+    for count in (1, 3, 24):
+        assert verdict(scene, spread(views, count)) == "fine"
+    assert verdict(scene, [moved(view, scale=2) for view in views]) == "fine"
+    for turn in away:
+        assert verdict(scene, [moved(view, turn[0], float(turn[1:])) for view in views]) != "fine"
+    assert verdict(scene, [opengl(view) for view in views]) == "refused"
+
+
+def rendered(folder: Path, scene: Scene, views: list[Camera]) -> list[Photo]:
+    """Save renders of views as photos."""
+    rasterizer = make_rasterizer("cpu", scene, near=NEAR)
+    colors = (0.5 + 0.28 * scene.sh_dc).clamp(0, 1)
+    for view in views:
+        save_png(folder / f"{view.name}.png", rasterizer.render(colors, view))
+    return [photo for photo in check_photos(folder, views) if photo]
+
+
+def test_photos_of_the_views_are_fine(tmp_path: Path) -> None:
+    scene, views = wall(), cameras()
+    photos = rendered(tmp_path, scene, views)
+    assert compare_photos(scene, views, photos, NEAR) == (photos, [])
+
+
+def test_cropped_photos_are_reported(tmp_path: Path) -> None:
+    scene, views = wall(), cameras()
+    photos = rendered(tmp_path, scene, views)
+    for photo in photos:
+        image = Image.open(photo.path)
+        width, height = image.size
+        image.crop((width // 4, height // 4, width, height)).resize(image.size).save(photo.path)
+    _, (line,) = compare_photos(scene, views, photos, NEAR)
+    assert line.decision.startswith("warning: they differ from the scene's renders (")
+
+
+@pytest.mark.parametrize("applied", [False, True])
+def test_the_orientation_that_resembles_the_scene_is_used(tmp_path: Path, applied: bool) -> None:
+    scene, views = wall(), cameras()
+    for photo in rendered(tmp_path, scene, views):
+        exif = Image.Exif()
+        exif[0x0112] = 3
+        image = Image.open(photo.path)
+        (image.rotate(180) if applied else image).save(photo.path, exif=exif)
+    photos = [photo for photo in check_photos(tmp_path, views) if photo]
+    found, (line,) = compare_photos(scene, views, photos, NEAR)
+    assert {photo.oriented for photo in found} == {applied}
+    assert line.decision == f"the EXIF orientation of 3 photos is {'applied' if applied else 'ignored'}"
+
+
+def test_real_photos_are_fine_and_cropped_ones_are_not(shared_data: Path, tmp_path: Path) -> None:
+    scenes, folder = shared_data / "scenes" / "snowmiku_plush", shared_data / "photos" / "snowmiku_plush"
+    scene, views = read_scene(scenes / "point_cloud.ply").scene, spread(read_cameras(folder / "cameras.json"), 4)
+    photos = [photo for photo in check_photos(folder / "images", views) if photo]
+    assert compare_photos(scene, views, photos, NEAR) == (photos, [])
+    cropped = []
+    for photo in photos:
+        image = Image.open(photo.path)
+        image.crop((50, 37, 940, 705)).resize(image.size).save(tmp_path / photo.path.name)
+        cropped.append(replace(photo, path=tmp_path / photo.path.name))
+    assert compare_photos(scene, views, cropped, NEAR)[1]
+    others = [*photos[1:], photos[0]]
+    assert compare_photos(scene, views, others, NEAR)[1]
+
+
+def reference_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:
+    """Fit each channel by weighted least squares with a general solver."""
+    root, error = weight.double().sqrt().flatten(), 0.0
+    for channel in range(3):
+        x, y = photo[..., channel].double().flatten(), render[..., channel].double().flatten()
+        matrix = root[:, None] * torch.stack([x, torch.ones_like(x)], dim=1)
+        fit = torch.linalg.lstsq(matrix, (root * y)[:, None]).solution
+        error += float(((matrix @ fit)[:, 0] - root * y).square().sum())
+    return -10 * math.log10(error / (3 * float(weight.double().sum())))
+
+
+def test_psnr_ignores_exposure_and_what_is_uncovered() -> None:
+    render, noise = (picture(20, 30, seed=seed, dtype=torch.float32) for seed in (1, 2))
+    photo, weight = 0.9 * render + 0.1 * noise, noise[..., 0]
+    assert fitted_psnr(photo, render, weight) == pytest.approx(reference_psnr(photo, render, weight), abs=1e-6)
+    darker = 0.3 * photo * torch.tensor([1.0, 0.8, 0.6]) + 0.1
+    assert fitted_psnr(darker, render, weight) == pytest.approx(fitted_psnr(photo, render, weight), abs=1e-3)
+    covered = torch.ones(20, 30)
+    covered[:, 15:] = 0
+    elsewhere = torch.cat([render[:, :15], noise[:, 15:]], dim=1)
+    assert fitted_psnr(elsewhere, render, covered) > 100
+    flat = torch.full((20, 30, 3), 0.5)
+    assert fitted_psnr(1 - render, render, covered) == pytest.approx(fitted_psnr(flat, render, covered))
+    assert math.isfinite(fitted_psnr(torch.zeros(20, 30, 3), torch.zeros(20, 30, 3), 0 * covered))

@@ -1,0 +1,161 @@
+"""Tests that cameras and photos are read together, and that the plan reports what was done to them."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+
+from sgsst_core.errors import CameraError, ImageError
+from sgsst_core.files.formats import by_name
+from sgsst_core.files.photos import load_photo
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.scene.gaussians import Scene
+from tests.small_scenes import ball, cameras, wall, write_files
+from worker.capture import Capture, read_capture, with_axes
+from worker.request import SceneRequest
+
+SCENE = wall()
+
+
+def request(folder: Path, **options: Any) -> SceneRequest:
+    ply, file, _ = write_files(folder, SCENE)
+    return SceneRequest(scene=ply, cameras=file, **options)
+
+
+def lines(capture: Capture) -> list[str]:
+    return [f"{line.item}: {line.decision}: {line.reason}" for line in capture.decisions]
+
+
+def write_photos(folder: Path, names: list[str], size: tuple[int, int] = (64, 48)) -> Path:
+    folder.mkdir()
+    for name in names:
+        Image.linear_gradient("L").resize(size).save(folder / f"{name}.png")
+    return folder
+
+
+def distorted(path: Path, count: int = 3, **values: Any) -> Path:
+    """Write a transforms.json whose first `count` cameras have coefficients."""
+    flip = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
+    frames = [
+        {
+            "file_path": view.name,
+            "transform_matrix": (torch.linalg.inv(view.world_to_camera) @ flip).tolist(),
+            **(values if index < count else {}),
+        }
+        for index, view in enumerate(cameras())
+    ]
+    path.write_text(json.dumps({"fl_x": 64, "w": 64, "h": 48, "frames": frames}))
+    return path
+
+
+def test_cameras_without_distortion_and_photos_need_no_line(tmp_path: Path) -> None:
+    capture = read_capture(request(tmp_path), SCENE)
+    assert lines(capture.with_photos(None).checked(SCENE, 0.2)) == []
+    photos = write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2"])
+    assert lines(capture.with_photos(photos)) == []
+    half = read_capture(request(tmp_path, resolution=32), SCENE).with_photos(photos)
+    assert lines(half) == []
+    assert half.cameras[0].width == 32
+
+
+def test_photos_of_another_size_and_missing_ones_are_reported(tmp_path: Path) -> None:
+    capture = read_capture(request(tmp_path), SCENE)
+    photos = write_photos(tmp_path / "photos", ["view_0", "view_2"], (128, 96))
+    found = capture.with_photos(photos)
+    assert [view.name for view in found.cameras] == ["view_0", "view_2"]
+    assert lines(found) == [
+        "photos: warning: 1 of 3 views are left out: they have no photo: view_1",
+        "photos: 2 are resized to their views: they have other sizes, such as 128x96 instead of 64x48",
+    ]
+    (photos / "view_2.png").unlink()
+    with pytest.raises(ImageError, match="no photo for 2 of 3 views: view_1, view_2"):
+        capture.with_photos(photos)
+
+
+def test_photos_that_only_fit_rotated_are_reported(tmp_path: Path) -> None:
+    capture = read_capture(request(tmp_path), SCENE)
+    photos = write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2"])
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (48, 64)).save(photos / "view_1.png", exif=exif)
+    assert lines(capture.with_photos(photos)) == [
+        "photos: the EXIF orientation of 1 is applied: without it they do not have the shapes of their cameras, such "
+        "as view_1.png"
+    ]
+
+
+def test_distortion_is_ignored_without_photos_and_removed_from_them(tmp_path: Path) -> None:
+    source = request(tmp_path).model_copy(update={"cameras": distorted(tmp_path / "transforms.json", 2, k1=0.2)})
+    capture = read_capture(source, SCENE)
+    plain = capture.with_photos(None)
+    assert lines(plain) == [
+        "lenses: only the pinhole part of the cameras is used: 2 of 3 cameras have lens distortion (OPENCV); renders "
+        "have no distortion, and there are no photos to undistort"
+    ]
+    assert {(view.width, view.height) for view in plain.cameras} == {(64, 48)}
+    photos = write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2"])
+    found = capture.with_photos(photos)
+    assert lines(found)[0].startswith("lenses: the photos are undistorted: 2 of 3 cameras have lens distortion")
+    sizes = [(view.width, view.height) for view in found.cameras]
+    assert sizes[0] == sizes[1] < sizes[2] == (64, 48)
+    assert found.photos
+    assert load_photo(found.photos[0], found.cameras[0]).shape == (*sizes[0][::-1], 3)
+
+
+def test_photos_of_lenses_without_a_formula_are_refused(tmp_path: Path) -> None:
+    file = distorted(tmp_path / "transforms.json", camera_model="FISHEYE624")
+    capture = read_capture(request(tmp_path).model_copy(update={"cameras": file}), SCENE)
+    assert "lenses: only the pinhole part" in lines(capture.with_photos(None))[0]
+    with pytest.raises(CameraError, match="FISHEYE624 cannot be undistorted here"):
+        capture.with_photos(write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2"]))
+
+
+def test_orbits_are_not_checked(tmp_path: Path) -> None:
+    capture = read_capture(SceneRequest(scene=tmp_path / "none.ply", orbit=4), ball())
+    assert capture.with_photos(None).checked(ball(), 0.2) == capture
+
+
+def spz(folder: Path, scene: Scene) -> SceneRequest:
+    """Write an SPZ file that does not state its axes."""
+    path = folder / "scene.spz"
+    write_scene(path, scene, by_name("spz"))
+    return SceneRequest(scene=path, cameras=write_files(folder)[1])
+
+
+def turned(scene: Scene) -> Scene:
+    """Return a scene whose positions are rotated by 180 degrees about x."""
+    return replace(scene, means=scene.means * torch.tensor([1.0, -1.0, -1.0]))
+
+
+def test_cameras_choose_the_axes_of_an_spz_scene_that_states_none(tmp_path: Path) -> None:
+    upright, other = tmp_path / "upright", tmp_path / "turned"
+    for folder, scene in ((upright, SCENE), (other, turned(SCENE))):
+        folder.mkdir()
+        source = spz(folder, scene)
+        unstated(source.scene)
+        found, about = with_axes(source)
+        read = read_scene(found.scene, spz_axes=found.spz_axes).scene
+        assert torch.allclose(read.means, SCENE.means, atol=1e-3)
+        assert len(about) == (folder is other)
+    assert about[0].decision == "the scene is rotated by 180 degrees about x (rub: y up, z backward)"
+    assert with_axes(source.model_copy(update={"spz_axes": "rdf"}))[1] == []
+    assert with_axes(source.model_copy(update={"cameras": None, "orbit": 3}))[1] == []
+
+
+def unstated(path: Path) -> None:
+    """Remove the extension with the axes from an SPZ file of version 3."""
+    data = bytearray(gzip.decompress(path.read_bytes()))
+    data[14] &= ~2
+    path.write_bytes(gzip.compress(bytes(data)))
+
+
+def test_axes_that_a_file_states_are_kept(tmp_path: Path) -> None:
+    source = spz(tmp_path, turned(SCENE))
+    assert with_axes(source) == (source, [])

@@ -1,0 +1,181 @@
+"""Cameras and photos of a job, and what the plan says about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sgsst_core.decision import Decision
+from sgsst_core.errors import CameraError, SceneError
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.formats.spz import SpzHeader
+from sgsst_core.files.photos import Photo, check_photos, photo_size, some_names
+from sgsst_core.files.scene_file import read_scene
+from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
+from sgsst_core.planning.fit import compare_photos, frame_warnings, shown_by
+from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.lens import undistorted
+from sgsst_core.settings import Settings
+from worker.request import SceneRequest
+
+#: Axes of an SPZ scene are those under which a typical view shows this many times as many Gaussians.
+_CLEARLY_MORE = 2.0
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Cameras of a job and their photos.
+
+    Attributes:
+        cameras: Cameras at the requested resolution.
+        orbit: Orbit that generated the cameras; None if they come from a file.
+        photo_sizes: Width and height of each camera's photo in the camera file.
+        photos: Photo of each camera; None if the job uses unstylized renders.
+        decisions: Lines about cameras and photos for the plan.
+    """
+
+    cameras: list[Camera]
+    orbit: Orbit | None
+    photo_sizes: list[tuple[int, int]]
+    photos: list[Photo] | None = None
+    decisions: tuple[Decision, ...] = ()
+
+    def fitted(self, settings: Settings) -> Capture:
+        """Return the capture with its cameras reduced to `settings.max_resolution`."""
+        return replace(self, cameras=fit_cameras(self.cameras, settings))
+
+    def with_photos(self, folder: Path | None) -> Capture:
+        """Return the capture with the photos of a folder, without views that lack one.
+
+        If the folder is None, views are compared with unstylized renders. Otherwise the frames of cameras with a lens
+        shrink to what their undistorted photos show.
+
+        Raises:
+            ImageError: If photos are missing or do not fit; see `check_photos`.
+            CameraError: If photos of a camera cannot be undistorted.
+        """
+        if folder is None:
+            return replace(self, decisions=(*self.decisions, *_about_pinholes(self.cameras)))
+        found = check_photos(folder, self.cameras)
+        missing = [camera.name for camera, photo in zip(self.cameras, found, strict=True) if photo is None]
+        kept = [index for index, photo in enumerate(found) if photo is not None]
+        photos = [photo for photo in found if photo is not None]
+        cameras = [undistorted(self.cameras[index]) for index in kept]
+        sizes = [self.photo_sizes[index] for index in kept]
+        lines = _about_photos(cameras, sizes, photos, missing)
+        return Capture(cameras, self.orbit, sizes, photos, (*self.decisions, *lines))
+
+    def checked(self, scene: Scene, near: float) -> Capture:
+        """Return the capture with warnings if it does not fit a scene, and with its photos in the right orientation.
+
+        Raises:
+            CameraError: If the cameras see nearly nothing of the scene.
+            ImageError: If a photo cannot be read.
+        """
+        if self.orbit is not None:
+            return self
+        decisions = frame_warnings(scene, self.cameras, near)
+        photos = self.photos
+        if photos is not None:
+            photos, about = compare_photos(scene, self.cameras, photos, near)
+            decisions += about
+        return replace(self, photos=photos, decisions=(*decisions, *self.decisions))
+
+
+def read_capture(source: SceneRequest, scene: Scene) -> Capture:
+    """Read or generate the requested cameras, at the requested resolution.
+
+    Raises:
+        CameraError: If the cameras cannot be used.
+    """
+    orbit = None
+    if source.cameras is None:
+        orbit = make_orbit(scene, _orbit_request(source))
+        cameras = list(orbit.cameras)
+    else:
+        cameras = read_cameras(source.cameras)
+    if source.views is not None:
+        cameras = spread(cameras, source.views)
+    sizes = [photo_size(camera) for camera in cameras]
+    if source.resolution is not None:
+        cameras = [resized(camera, source.resolution) for camera in cameras]
+    return Capture(cameras, orbit, sizes)
+
+
+def with_axes(source: SceneRequest) -> tuple[SceneRequest, list[Decision]]:
+    """Return the request with the axes of an SPZ scene, if neither request nor file state them.
+
+    They are those under which the cameras see the scene. Without cameras, or if both see it, they stay open. Nothing is
+    raised: `read_scene` and `read_capture` report unusable files.
+    """
+    if source.cameras is None or source.spz_axes != "auto":
+        return source, []
+    try:
+        header = read_scene_header(source.scene)
+        if not isinstance(header, SpzHeader) or header.extended or header.stated_axes is not None:
+            return source, []
+        cameras = read_cameras(source.cameras)
+        means = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene.means
+    except (SceneError, CameraError):
+        return source, []
+    rdf = shown_by(means, cameras, source.near).typical
+    rub = shown_by(means * means.new_tensor([1, -1, -1]), cameras, source.near).typical
+    if rub <= _CLEARLY_MORE * rdf:
+        return source, []
+    reason = f"a typical view has {rub:.1%} of the Gaussians in its frame so, and {rdf:.1%} with rdf; see --spz-axes"
+    line = Decision("axes", "the scene is rotated by 180 degrees about x (rub: y up, z backward)", reason)
+    return source.model_copy(update={"spz_axes": "rub"}), [line]
+
+
+def _orbit_request(source: SceneRequest) -> OrbitRequest:
+    """Convert the orbit options of a request."""
+    up = None
+    if source.up != "auto":
+        x, y, z = (float(name == source.up[-1]) * (-1.0 if source.up.startswith("-") else 1.0) for name in "xyz")
+        up = (x, y, z)
+    count = None if source.orbit in (None, "auto") else int(source.orbit)
+    return OrbitRequest(count, up, source.elevation, source.radius, source.near)
+
+
+def _about_pinholes(cameras: Sequence[Camera]) -> list[Decision]:
+    """Return the line about lens distortion without photos."""
+    models = _models(cameras)
+    if not models:
+        return []
+    reason = f"{models}; renders have no distortion, and there are no photos to undistort"
+    return [Decision("lenses", "only the pinhole part of the cameras is used", reason)]
+
+
+def _models(cameras: Sequence[Camera]) -> str:
+    """Return the text about the number of distorted cameras and their models; empty if there are none."""
+    models = sorted({camera.lens.model for camera in cameras if camera.lens})
+    count = sum(camera.lens is not None for camera in cameras)
+    return f"{count} of {len(cameras)} cameras have lens distortion ({', '.join(models)})" if models else ""
+
+
+def _about_photos(
+    cameras: Sequence[Camera], sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]
+) -> list[Decision]:
+    """Return the lines about missing, resized and rotated photos."""
+    lines = []
+    models = _models(cameras)
+    if models:
+        lines.append(Decision("lenses", "the photos are undistorted", f"{models}; views show what their photos fill"))
+    if missing:
+        left_out = f"warning: {len(missing)} of {len(missing) + len(cameras)} views are left out"
+        lines.append(Decision("photos", left_out, f"they have no photo: {some_names(missing)}"))
+    other = [(photo, size) for photo, size in zip(photos, sizes, strict=True) if photo.size != size]
+    if other:
+        photo, size = other[0]
+        shapes = f"{photo.size[0]}x{photo.size[1]} instead of {size[0]}x{size[1]}"
+        lines.append(
+            Decision("photos", f"{len(other)} are resized to their views", f"they have other sizes, such as {shapes}")
+        )
+    oriented = [photo for photo in photos if photo.oriented]
+    if oriented:
+        reason = f"without it they do not have the shapes of their cameras, such as {oriented[0].path.name}"
+        lines.append(Decision("photos", f"the EXIF orientation of {len(oriented)} is applied", reason))
+    return lines
