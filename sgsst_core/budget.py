@@ -8,6 +8,7 @@ from typing import Generic, Literal, TypeVar
 
 import psutil
 import torch
+from torch import Tensor
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -71,6 +72,11 @@ def forget_device_peak(device: torch.device | str) -> None:
 def device_peak(device: torch.device | str) -> int | None:
     """Return the peak GPU memory held by tensors since `forget_device_peak`, in bytes; None for a CPU."""
     return torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
+
+
+def tensor_bytes(tensor: Tensor) -> int:
+    """Return the size of a tensor's values in bytes."""
+    return tensor.numel() * tensor.element_size()
 
 
 class Cache(Generic[K, V]):

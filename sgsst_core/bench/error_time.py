@@ -251,8 +251,8 @@ def _prepare(stylizer: _TimedStylizer) -> float:
         phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.shares]
         stylizer.job.style_targets(stylizer.job.views.cameras[index])
         scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
-        stylizer.job.views.target(index, scales, stylizer.behind(index))
-        stylizer.keep_weights(index)
+        stylizer.job.view_targets.target(index, scales, stylizer.behind(index))
+        stylizer.cache_weights(index)
         stylizer.job.views.render(index, stylizer.job.views.colors(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started
 

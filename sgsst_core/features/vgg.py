@@ -139,6 +139,46 @@ def convolutions(device: torch.device, *, tf32: bool = False, search: bool = Fal
         _CUDNN.benchmark, _CUDNN.conv.fp32_precision = before
 
 
+@dataclass(frozen=True)
+class _Input:
+    """Map from the pixels of an image to the values that the first convolution reads.
+
+    Attributes:
+        scale, shift: [3], float32 or float64: in bfloat16, each of the 256 gray levels would be rounded twice.
+        gray: Whether the network sees the image's luminance.
+    """
+
+    scale: Tensor
+    shift: Tensor
+    gray: bool
+
+    @staticmethod
+    def of(weights: BackboneWeights, device: torch.device, dtype: torch.dtype) -> _Input:
+        """Create the map for a network that computes in `dtype`."""
+        precision = torch.promote_types(dtype, torch.float32)
+        return _Input(
+            weights.input_scale.to(device, precision), weights.input_shift.to(device, precision), weights.gray
+        )
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the pixels and of their gradient."""
+        return self.scale.dtype
+
+    def pixels(self, rgb: Tensor) -> Tensor:
+        """Return an image [h, w, 3] as the network sees it, before normalization."""
+        rgb = rgb.to(self.scale)
+        return gray(rgb) if self.gray else rgb
+
+    def normalized(self, pixels: Tensor) -> Tensor:
+        """Return the values that the first convolution reads, [h, w, 3]."""
+        return pixels * self.scale + self.shift
+
+    def gradient(self, pixels: Tensor) -> Tensor:
+        """Return the gradient of the image, given that of `pixels`."""
+        return gray_gradient(pixels) if self.gray else pixels
+
+
 class FeatureNetwork:
     """VGG up to the deepest requested layer.
 
@@ -152,8 +192,6 @@ class FeatureNetwork:
             GPUs do this.
 
     Attributes:
-        precision: Precision of convolutions: "tf32", or the name of `dtype`.
-        rounding: Relative rounding error of the features.
         unit: Factor of the content layer's features relative to the units of a 0-255 input.
         pixel_weight: Weight of the terms of `PIXELS`: the layer's factor squared. The features of `PIXELS` are not
             multiplied by this factor.
@@ -177,17 +215,10 @@ class FeatureNetwork:
         self.dtype = dtype
         self.device = torch.device(device)
         self.tf32 = tf32
-        self.precision = "tf32" if tf32 else str(dtype).removeprefix("torch.")
         self.search = False
-        self.rounding = _TF32_EPS if tf32 else torch.finfo(dtype).eps
-        self.halo = HALO[weights.name]
         self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
         self.pixel_weight = weights.scales.get(PIXELS, 1.0) ** 2
-        # Normalize in float32 or float64: in bfloat16, each of the 256 gray levels would be rounded twice.
-        self._input_dtype = torch.promote_types(dtype, torch.float32)
-        self._scale = weights.input_scale.to(self.device, self._input_dtype)
-        self._shift = weights.input_shift.to(self.device, self._input_dtype)
-        self._gray = weights.gray
+        self._input = _Input.of(weights, self.device, dtype)
         self._steps = self._build(weights)
         self._fuse()
         self._channels = {f"relu{name[4:]}": len(bias) for name, (_, bias) in weights.convolutions.items()}
@@ -226,9 +257,24 @@ class FeatureNetwork:
                 if isinstance(step, _Convolution):
                     step.fused = _can_fuse(step)
 
+    @property
+    def precision(self) -> str:
+        """Precision of convolutions: "tf32", or the name of `dtype`."""
+        return "tf32" if self.tf32 else str(self.dtype).removeprefix("torch.")
+
+    @property
+    def rounding(self) -> float:
+        """Relative rounding error of the features."""
+        return _TF32_EPS if self.tf32 else torch.finfo(self.dtype).eps
+
+    @property
+    def halo(self) -> int:
+        """Width in pixels of the halo with which the features that a partition tile owns are exact."""
+        return HALO[self.name]
+
     def rounding_of(self, layer: str) -> float:
         """Return the relative rounding error of a layer's features."""
-        return torch.finfo(self._input_dtype).eps if layer == PIXELS else self.rounding
+        return torch.finfo(self._input.dtype).eps if layer == PIXELS else self.rounding
 
     def channels(self, layer: str) -> int:
         """Return the number of channels of a layer."""
@@ -247,14 +293,12 @@ class FeatureNetwork:
             Activations. A layer whose stride exceeds the image has zero cells (a dimension of size 0).
         """
         height, width = int(rgb.shape[0]), int(rgb.shape[1])
-        rgb = rgb.to(self.device, self._input_dtype)
-        rgb = gray(rgb) if self._gray else rgb
+        pixels = self._input.pixels(rgb)
         kept = Activations({}, size=(height, width))
         if PIXELS in self.layers:
-            kept.features[PIXELS] = rgb * PIXEL_UNIT
-        x = rgb * self._scale + self._shift
+            kept.features[PIXELS] = pixels * PIXEL_UNIT
         # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
-        x = x.to(self.dtype).permute(2, 0, 1).unsqueeze(0)
+        x = self._input.normalized(pixels).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         with convolutions(self.device, tf32=self.tf32, search=self.search):
             self._forward_steps(x, kept, keep)
         for layer in self.layers:
@@ -306,14 +350,14 @@ class FeatureNetwork:
             gradient = self._backward_steps(kept, feature_gradient)
         shape = (*kept.size, 3)
         if gradient is None:
-            pixels = torch.zeros(shape, dtype=self._input_dtype, device=self.device)
+            pixels = torch.zeros(shape, dtype=self._input.dtype, device=self.device)
         else:
-            pixels = gradient[0].permute(1, 2, 0).to(self._input_dtype) * self._scale
+            pixels = gradient[0].permute(1, 2, 0).to(self._input.dtype) * self._input.scale
         if (features := kept.features.pop(PIXELS, None)) is not None:
-            own = torch.zeros(shape, dtype=self._input_dtype, device=self.device)
+            own = torch.zeros(shape, dtype=self._input.dtype, device=self.device)
             feature_gradient(PIXELS, features, own)
             pixels = torch.add(pixels, own, alpha=PIXEL_UNIT)
-        return gray_gradient(pixels) if self._gray else pixels
+        return self._input.gradient(pixels)
 
     def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
         """Return the gradient [1, 3, h, w] of the first step's input; None if no layer has a gradient."""
@@ -349,7 +393,7 @@ class FeatureNetwork:
             else:
                 held += size * int(step.weight.shape[0]) / stride**2
         if PIXELS in self.layers:
-            held += 3 * torch.finfo(self._input_dtype).bits / 8
+            held += 3 * torch.finfo(self._input.dtype).bits / 8
         return held
 
     def working_bytes_per_pixel(self) -> float:

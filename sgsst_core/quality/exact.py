@@ -24,6 +24,7 @@ from sgsst_core.settings import StyleLossName
 from sgsst_core.stylizing.evaluation import Evaluation, evaluate
 from sgsst_core.stylizing.job import StyleTargetCache
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.view_targets import ViewTargets
 from sgsst_core.stylizing.views import Views
 
 
@@ -109,18 +110,24 @@ class Float32Reference(ExactLoss):
             scene,
             stylizer.job.views.cameras,
             rasterizer,
-            self.loss,
             covered=stylizer.job.plan.survey.covered,
-            weighted=stylizer.job.plan.weighted,
-            photos=stylizer.job.photos,
             memory=memory,
             clamp_aware_gradient=settings.clamp_aware_gradient,
+        )
+        self.view_targets = ViewTargets(
+            self.views,
+            self.loss,
+            weighted=stylizer.job.plan.weighted,
+            photos=stylizer.job.view_targets.photos,
+            memory=memory,
             maps=stylizer.job.styles.maps(rasterizer, self.shown),
         )
 
     def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:
         """Return the mean SOS loss over views, by scale, for colors [N, 3] of the whole scene."""
-        return evaluate(self.views, self.style_targets, indices, sh_dc[self.shown].to(self.views.rasterizer.device))
+        return evaluate(
+            self.view_targets, self.style_targets, indices, sh_dc[self.shown].to(self.views.rasterizer.device)
+        )
 
     def gradient(self, index: int, sh_dc: Tensor, scales: list[int]) -> tuple[Tensor, float]:
         """Compute dE/dsh_dc [N, 3] for colors [N, 3] of the whole scene.
@@ -128,7 +135,7 @@ class Float32Reference(ExactLoss):
         Returns:
             Gradient, and the seconds to compute it without the view's targets.
         """
-        target, style = self.views.target(index, scales), self.style_targets(self.views.cameras[index])
+        target, style = self.view_targets.target(index, scales), self.style_targets(self.views.cameras[index])
         gradient = torch.zeros_like(sh_dc)
         values = sh_dc[self.shown].to(self.views.rasterizer.device)
         started = time.perf_counter()

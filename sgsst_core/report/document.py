@@ -138,7 +138,7 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
         "regions": _regions_json(stylizer),
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
-            "used": stylizer.job.views.weighted,
+            "used": stylizer.job.view_targets.weighted,
             "uncovered_share": round(stylizer.job.plan.survey.uncovered_share, 6),
         },
     }

@@ -11,22 +11,23 @@ from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.targets import StyleTargets
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.scene.camera import Camera
-from sgsst_core.stylizing.views import Views
+from sgsst_core.stylizing.view_targets import ViewTargets
 
 Evaluation = dict[int, LossTerms]
 
 
 def evaluate(
-    views: Views, style_targets: Callable[[Camera], StyleTargets], indices: Sequence[int], sh_dc: Tensor
+    targets: ViewTargets, style_targets: Callable[[Camera], StyleTargets], indices: Sequence[int], sh_dc: Tensor
 ) -> Evaluation:
     """Return the mean SOS loss of colors [n, 3] over views, split by scale."""
+    views, loss = targets.views, targets.loss
     evaluations = []
     for index in indices:
         camera = views.cameras[index]
         with torch.no_grad():
             image = views.render(index, views.colors(index, sh_dc))
-        target = views.target(index, views.loss.tiling.scales((camera.height, camera.width)))
-        evaluations.append(views.loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
+        target = targets.target(index, loss.tiling.scales((camera.height, camera.width)))
+        evaluations.append(loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
     return mean_evaluation(evaluations)
 
 

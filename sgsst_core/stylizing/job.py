@@ -34,6 +34,7 @@ from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.schedule import Phase, planned_phases
 from sgsst_core.stylizing.team import Team
+from sgsst_core.stylizing.view_targets import ViewTargets
 from sgsst_core.stylizing.views import Views
 from sgsst_core.timing import Timer
 
@@ -80,7 +81,7 @@ class StylizationJob:
         loss: SOS loss of one view.
         graphs: Replacement for `loss` in steps; None if the plan uses no graphs.
         views: Views of the Gaussians that the views show.
-        photos: Function that loads the content image of a camera; None for unstylized renders.
+        view_targets: Targets of the views, except the style's.
         team: Ranks that take part.
         memory_limit: Memory budget in bytes of all ranks on one machine together. It determines the partition, and
             thereby rounding, so it is identical on all ranks.
@@ -98,7 +99,7 @@ class StylizationJob:
     loss: SosLoss
     graphs: LossGraphs | None
     views: Views
-    photos: PhotoLoader | None
+    view_targets: ViewTargets
     team: Team
     memory_limit: int
     memory: int
@@ -281,22 +282,30 @@ def prepare_job(
     rendered = attenuated if plan.seen.all() else attenuated.subset(plan.seen)
     rendered = rendered if "sh" in settings.keep else rendered.without_zero_bands()
     rasterizer = _make_rasterizer(plan, settings, rendered, memory, planning_context)
+    view_memory = memory_for("views", memory) - _least_intersection_bytes(plan, memory)
+    regions_seen = plan.survey.regions if plan.weighted else None
     views = Views(
         rendered,
         fit_cameras(cameras, settings),
         rasterizer,
-        loss,
         covered=list(plan.covered),
+        memory=view_memory,
+        clamp_aware_gradient=settings.clamp_aware_gradient,
+        regions=regions_seen,
+        collectives=team.group,
+        timer=loss.timer,
+    )
+    view_targets = ViewTargets(
+        views,
+        loss,
         weighted=plan.weighted,
         photos=photos,
-        memory=memory_for("views", memory) - _least_intersection_bytes(plan, memory),
+        memory=view_memory,
         keep_content="content" not in settings.keep,
-        clamp_aware_gradient=settings.clamp_aware_gradient,
-        regions=plan.survey.regions if plan.weighted else None,
+        regions=regions_seen,
         background=settings.background,
         drawn=plan.training_background != "background",
         maps=styles.maps(rasterizer.repeatable, plan.seen),
-        collectives=team.group,
     )
     return StylizationJob(
         plan=plan,
@@ -309,7 +318,7 @@ def prepare_job(
         loss=loss,
         graphs=LossGraphs(loss) if plan.graphs and team.group.size == 1 else None,
         views=views,
-        photos=photos,
+        view_targets=view_targets,
         team=team,
         memory_limit=memory_limit,
         memory=memory,

@@ -164,7 +164,7 @@ class Stylizer:
         started = time.perf_counter()
         self._stylized = None
         self.job.timer.clear()
-        self._keep_visited()
+        self._cache_visited()
         sent = dict(self.job.collectives.sent)
         phase = self.phase
         self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
@@ -209,8 +209,8 @@ class Stylizer:
             scales = phase.scales(self.job.scales(index))
             behind = self.behind(index)
             with self.job.timer("prepare", whole=True):
-                self.keep_weights(index)
-                target = self.job.views.target(index, scales, behind)
+                self.cache_weights(index)
+                target = self.job.view_targets.target(index, scales, behind)
                 self._look_ahead(own_views[place + 1 :], phase)
                 style = self.job.style_targets(self.job.views.cameras[index])
             assert target.division is not None
@@ -267,7 +267,7 @@ class Stylizer:
         speeds = self.job.team.compare_speeds(cost, self.job.timer.seconds)
         if speeds:
             self.job.loss.divider.speeds = speeds
-            self.job.views.uncached_fraction()
+            self.job.view_targets.forget_division()
 
     def _look_ahead(self, left: Sequence[int], phase: Phase) -> None:
         """Announce the view that this group processes next, so that its data can be read while the device works.
@@ -285,7 +285,7 @@ class Stylizer:
             index, phase = self._order.left[-1 - self.job.team.own_group], phase_at(self.job.schedule, self.step + 1)
         else:
             return
-        self.job.views.look_ahead(index, phase.scales(self.job.scales(index)))
+        self.job.view_targets.look_ahead(index, phase.scales(self.job.scales(index)))
 
     @property
     def coming(self) -> list[int]:
@@ -301,18 +301,21 @@ class Stylizer:
             indices: Indices of the views.
             sh_dc: [n, 3], colors of the rendered Gaussians to evaluate; None for the present ones.
         """
-        self._keep_visited()
+        self._cache_visited()
         values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
-        return evaluate(self.job.views, self.job.style_targets, indices, values)
+        return evaluate(self.job.view_targets, self.job.style_targets, indices, values)
 
     def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
         """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its time in seconds.
 
         Targets are prepared before timing starts. This does not affect steps.
         """
-        self._keep_visited()
-        target, style = self.job.views.target(index, scales), self.job.style_targets(self.job.views.cameras[index])
-        with self.job.views.lending_weights(index):
+        self._cache_visited()
+        target, style = (
+            self.job.view_targets.target(index, scales),
+            self.job.style_targets(self.job.views.cameras[index]),
+        )
+        with self.job.views.temporary_weights(index):
             started = time.perf_counter()
             gradient = self._gradient(index, style, target, scales)[0]
             return gradient.cpu(), time.perf_counter() - started
@@ -330,7 +333,7 @@ class Stylizer:
             colors = self.job.views.colors(index, self.sh_dc.detach())
             image = self.job.views.render(index, colors)
             if behind is not None:
-                image = self.job.views.put_behind(index, image, behind)
+                image = self.job.view_targets.put_behind(index, image, behind)
         with self.job.timer("loss"):
             evaluate = self.job.graphs.evaluate if self.job.graphs is not None else self.job.loss.evaluate
             result = evaluate(image, style, target, scales)
@@ -338,15 +341,15 @@ class Stylizer:
             assert result.image_gradient is not None
             return self.job.views.gradient(index, result.image_gradient.to(colors.device), colors), result
 
-    def keep_weights(self, index: int) -> None:
+    def cache_weights(self, index: int) -> None:
         """Cache a view's blend weights, if they fit, as its first step does.
 
         Only steps cache weights. Renders between steps happen at varying times, and must not affect the results of
         steps.
         """
-        self.job.views.keep_weights(index)
+        self.job.views.cache_weights(index)
 
-    def _keep_visited(self) -> None:
+    def _cache_visited(self) -> None:
         """Cache, once after a resume, the blend weights that previous steps cached.
 
         The order is the same, so that the same views fit.
@@ -359,7 +362,7 @@ class Stylizer:
             for _ in range(steps):
                 views = [next(order) for _ in range(self.job.settings.views_per_step)]
                 for index in views[self.job.team.own_group :: self.job.team.groups]:
-                    self.keep_weights(index)
+                    self.cache_weights(index)
 
     def stylized(self) -> Tensor:
         """Return sh_dc [N, 3] float32 of the whole scene on the CPU: optimized colors, and colors of unseen Gaussians.

@@ -101,7 +101,7 @@ def _last_picture(stylizer: Stylizer) -> Tensor:
 def _at_the_end(stylizer: Stylizer, note: str) -> CaseResult:
     if not bool(torch.isfinite(stylizer.sh_dc).all()):
         return CaseResult(math.inf, 0.0, "colors are not finite")
-    content = stylizer.job.views.content(0)
+    content = stylizer.job.view_targets.content(0)
     result = compare_losses(_last_picture(stylizer), _style(), content)
     return CaseResult(result.error, result.bound, note)
 

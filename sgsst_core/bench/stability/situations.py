@@ -194,8 +194,8 @@ def reference_error(job: Stylizer) -> tuple[float, float, int]:
     """
     index = job.job.views.covered[0]
     picture = job.job.views.render(index, job.job.views.colors(index, job.sh_dc.detach()))
-    content = job.job.views.content(index)
-    coverage = job.job.views.coverage(index)[0] if job.job.views.weighted else None
+    content = job.job.view_targets.content(index)
+    coverage = job.job.view_targets.coverage(index)[0] if job.job.view_targets.weighted else None
     double = DecisionsOf(job.job.weights, job.job.network)
     given, weight = (picture, content, coverage), job.job.settings.content_weight
     found, exact = _evaluate_both(job, double, *given, weight)

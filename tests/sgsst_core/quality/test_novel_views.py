@@ -25,7 +25,8 @@ from sgsst_core.loss.statistics_terms import GRAM_WEIGHT
 from sgsst_core.planning.measuring import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
 from sgsst_core.quality.lpips import Lpips
-from sgsst_core.quality.novel_views import MOST_VIEWS, NovelViews, neighbors
+from sgsst_core.quality.novel_cameras import neighbors
+from sgsst_core.quality.novel_views import MOST_VIEWS, NovelViews
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
@@ -380,7 +381,7 @@ def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, v
         make_rasterizer("cpu", scene),
         stylizer.job.loss,
         stylizer.job.style_targets,
-        weighted=stylizer.job.views.weighted,
+        weighted=stylizer.job.view_targets.weighted,
         lpips=lpips,
     )
     assert len(measured.cameras) >= 6

@@ -133,7 +133,7 @@ def test_a_step_reads_the_next_photo_and_waits_once(
             large = {line: size for line, size in counts.copies.items() if size > SCALARS}
             assert list(large.values()) == [PHOTO_BYTES], large  # the photo, and nothing else
         assert len(stylizer.state().queue) == -(step + 1) % VIEWS  # the queue was read, not refilled
-    stylizer.job.views.end_look_ahead()
+    stylizer.job.view_targets.end_look_ahead()
     assert photos.asked == drawn() == [record.view for record in stylizer.history]
     assert photos.here == drawn()[::VIEWS]  # only the first of a round is unknown in advance; the thread reads the rest
     assert not threads()

@@ -251,7 +251,7 @@ def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
 def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     stylizer = make(tiny_weights, scene, halves(scene))
-    view = stylizer.job.views.target(0, [0])
+    view = stylizer.job.view_targets.target(0, [0])
     targets = stylizer.job.style_targets(stylizer.job.views.cameras[0])
     image = stylizer.job.views.render(0, stylizer.job.views.colors(0, stylizer.sh_dc.detach()))
     bare = ViewTarget(view.content_image, view.content, view.coverage, view.division)

@@ -309,10 +309,10 @@ def test_position_weights_are_for_views_with_an_empty_background(
     tiny_weights: BackboneWeights, thing: Any, preset: PresetName, values: dict[str, Any], weighted: bool
 ) -> None:
     stylizer = make(tiny_weights, thing(), preset=preset, **values)
-    assert stylizer.job.views.weighted is weighted
+    assert stylizer.job.view_targets.weighted is weighted
     uncovered = stylizer.job.plan.survey.uncovered_share
     assert uncovered > 0.3 if thing is ball else uncovered < 0.01
-    assert (stylizer.job.views.target(0, [0]).coverage is not None) is weighted
+    assert (stylizer.job.view_targets.target(0, [0]).coverage is not None) is weighted
 
 
 def test_views_that_see_nothing_are_left_out(tiny_weights: BackboneWeights, scene: Scene) -> None:
@@ -376,7 +376,7 @@ class ClockEvent:
 def test_a_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scene: Scene) -> None:
     """The seconds of all parts are known when the step has finished, as with a GPU's events."""
     clock, events = (make(tiny_weights, scene) for _ in range(2))
-    events.job.loss.timer = Timer(event=ClockEvent)
+    events.job.loss.timer = events.job.views.timer = Timer(event=ClockEvent)
     for _ in range(6):  # the last step is on all scales
         expected, found = clock.run_step(), events.run_step()
         assert found.parts.keys() == expected.parts.keys()

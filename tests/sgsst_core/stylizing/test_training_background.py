@@ -82,7 +82,7 @@ def test_another_color_behind_is_what_is_rendered_with_it(scale: int) -> None:
 
 def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Color | None) -> tuple[Any, Any]:
     target, targets = (
-        stylizer.job.views.target(index, scales, behind),
+        stylizer.job.view_targets.target(index, scales, behind),
         stylizer.job.style_targets(stylizer.job.views.cameras[0]),
     )
     return stylizer._gradient(index, targets, target, scales, behind)
@@ -113,10 +113,10 @@ def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeight
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings(training_background="random", steps_sos=2)
     stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
-    coverage = stylizer.job.views.coverage(0)[0][..., None]
+    coverage = stylizer.job.view_targets.coverage(0)[0][..., None]
     content = coverage * photo + (1 - coverage) * torch.tensor(COLOR)
     expected = stylizer.job.loss.targets.of_view(content, coverage[..., 0]).content[0]
-    found = stylizer.job.views.target(0, [0], COLOR).content[0]
+    found = stylizer.job.view_targets.target(0, [0], COLOR).content[0]
     for tile, features in expected.items():
         torch.testing.assert_close(found[tile], features, rtol=1e-4, atol=1e-2)
 

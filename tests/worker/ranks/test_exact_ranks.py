@@ -23,6 +23,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.view_targets import ViewTargets
 from sgsst_core.stylizing.views import Views
 from tests.networks import comparing_pixels, tiny_weights
 from tests.sgsst_core.pictures import picture, relative_error
@@ -67,15 +68,19 @@ def gradient(
         scene,
         [camera],
         rasterizer,
-        loss,
         covered=[0],
+        regions=survey.regions if weighted else None,
+        collectives=collectives,
+    )
+    view_targets = ViewTargets(
+        views,
+        loss,
         weighted=weighted,
         regions=survey.regions if weighted else None,
         maps=styles.maps(rasterizer),
-        collectives=collectives,
     )
     scales = range(loss.tiling.scale_count((camera.height, camera.width)))
-    target = views.target(0, scales)
+    target = view_targets.target(0, scales)
     targets = styles.targets(loss, (camera.height, camera.width))
     colors = views.colors(0, torch.roll(scene.sh_dc, 1, dims=0).to(dtype))
     result = loss.evaluate(views.render(0, colors), targets, target, scales)

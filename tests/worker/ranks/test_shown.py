@@ -10,8 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.sos import SosLoss
+from sgsst_core.features.vgg import STYLE_LAYERS
 from sgsst_core.loss.terms import TERMS
 from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
 from sgsst_core.parallel.division import divide_rows
@@ -33,9 +32,8 @@ WIDTH, HEIGHT = 128, 96
 
 def make_views(collectives: Collectives, scene: Scene, camera: Camera, memory: int = 1 << 30) -> Views:
     """Return views with this memory budget for caches; they cache nothing if it is 0."""
-    loss = SosLoss(FeatureNetwork(tiny_weights(), (*STYLE_LAYERS, CONTENT_LAYER)), collectives=collectives)
     rasterizer = make_rasterizer("cpu", scene)
-    return Views(scene, [camera], rasterizer, loss, covered=[0], weighted=False, memory=memory, collectives=collectives)
+    return Views(scene, [camera], rasterizer, covered=[0], memory=memory, collectives=collectives)
 
 
 def pixels(camera: Camera, seed: int) -> Tensor:

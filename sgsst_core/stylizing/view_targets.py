@@ -1,0 +1,216 @@
+"""Targets of a job's views: content, coverage and region maps, prepared when a view first needs them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+
+from torch import Tensor
+
+from sgsst_core.budget import Cache, tensor_bytes
+from sgsst_core.features.partition import PartitionTile, Rectangle
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.targets import ContentFeatures, ViewTarget
+from sgsst_core.loss.tiling import Division
+from sgsst_core.parallel.division import Piece
+from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.scene.pyramid import downscale
+from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
+from sgsst_core.stylizing.training_background import Color, put_behind
+from sgsst_core.stylizing.views import Views
+
+
+class ViewTargets:
+    """Targets of a job's views.
+
+    Preparing targets involves all ranks, so a view's targets must be cached on all ranks or on none. What is cached
+    therefore depends only on sizes that are identical on all ranks.
+
+    Args:
+        views: Views; the content of a view is its unstylized render, unless there are photos.
+        loss: Loss that prepares the targets, of the same ranks that render the views.
+        weighted: Whether statistics are weighted by rendered coverage.
+        photos: Function that loads the content image [H, W, 3] of a view by its index; None for unstylized renders.
+            With a GPU it is also called in a thread, see `look_ahead`.
+        memory: Memory budget in bytes for everything that is cached about views. A quarter of it is for colors
+            (`Views`), a quarter for coverage, and the rest for content and region maps.
+        keep_content: Whether to cache content features that fit; False recomputes them at each visit, for comparison.
+        regions: Rectangle of each view that contains all covered pixels; None if unknown.
+        background: Background color of the rasterizer.
+        drawn: Whether the background color changes from step to step; content images are then cached instead of
+            features.
+        maps: Renderer of region maps; None if the scene has no regions.
+    """
+
+    def __init__(
+        self,
+        views: Views,
+        loss: SosLoss,
+        *,
+        weighted: bool,
+        photos: PhotoLoader | None = None,
+        memory: int = 1 << 30,
+        keep_content: bool = True,
+        regions: Sequence[Rectangle] | None = None,
+        background: Color = (0.0, 0.0, 0.0),
+        drawn: bool = False,
+        maps: RegionMaps | None = None,
+    ) -> None:
+        self.views = views
+        self.loss = loss
+        self.weighted = weighted
+        self.photos = photos
+        device = loss.network.device
+        self._ahead = PhotosAhead(photos, device) if photos is not None and device.type == "cuda" else None
+        self._regions = regions
+        self._background = background
+        self._drawn = drawn
+        self._maps = maps
+        self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
+        #: Budget for content, half of which goes to region maps if there are any.
+        content = memory // 2 if maps is None else memory // 4
+        self._region_weights: Cache[int, list[list[Tensor]]] = Cache(
+            0 if maps is None else memory // 4, lambda every: sum(map(_pyramid_bytes, every))
+        )
+        cached = content if keep_content else 0
+        images = cached // 2 if drawn else 0
+        self._images: Cache[_ImageKey, Tensor] = Cache(images, tensor_bytes)
+        self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
+        self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
+
+    def target(self, index: int, scales: Sequence[int], behind: Color | None = None) -> ViewTarget:
+        """Return the target of a view at some scales; cached if it fits.
+
+        Features are computed only for requested scales: phase 1 needs those of one.
+
+        Args:
+            index: Index of the view.
+            scales: Requested scales.
+            behind: Background color, which the content gets too; None for the rasterizer's own. Features with a
+                background color are used only once, so only the images they are computed from are cached.
+        """
+        coverage = self.coverage(index) if self.weighted else None
+        division = self._division(index, scales, coverage)
+        target = ViewTarget(coverage=coverage, division=division, regions=self.region_weights(index))
+        if self.loss.content_weight and behind is not None:
+            for scale, content in self._content_images(index, scales).items():
+                over = self._content_behind(index, content, behind, scale)
+                target.content[scale] = self.loss.targets.content_features(over, 0, division.tiles[scale])
+        elif self.loss.content_weight:
+            image = functools.cache(lambda: self.content(index))
+            for scale in scales:
+                pieces = division.pieces[scale]
+                make = functools.partial(self._features, image, scale, division.tiles[scale])
+                size = self.loss.targets.content_bytes(pieces)
+                target.content[scale] = self._content.get((index, scale, pieces), make, size)
+        return target
+
+    def content(self, index: int) -> Tensor:
+        """Return the content image [H, W, 3]: the photo, or the render of the unstylized scene.
+
+        Photos are on the GPU if there is one.
+        """
+        if self._ahead is not None:
+            return self._ahead(index)
+        if self.photos is not None:
+            return self.photos(index)
+        views = self.views
+        colors = views.colors(index, views.scene.sh_dc.to(views.rasterizer.device))
+        # The result is cached over many steps, so it must not depend on which blend weights are cached.
+        return views.render(index, colors, views.rasterizer.repeatable)
+
+    def coverage(self, index: int) -> list[Tensor]:
+        """Return the coverage [H >> k, W >> k] of a view at powers of two, on the network's device.
+
+        It is cached if it fits.
+        """
+        return self._coverage.get(index, lambda: self._rendered_coverage(index))
+
+    def region_weights(self, index: int) -> list[list[Tensor]] | None:
+        """Return the map of each region in a view, in the format of `coverage`; None if the scene has no regions."""
+        maps = self._maps
+        return None if maps is None else self._region_weights.get(index, lambda: self._rendered_regions(index, maps))
+
+    def put_behind(self, index: int, image: Tensor, color: Color, scale: int = 0) -> Tensor:
+        """Replace the background color of a view's image [h, w, 3] at a scale.
+
+        The result is on the network's device.
+        """
+        return put_behind(image.to(self.loss.network.device), self.coverage(index)[scale], color, self._background)
+
+    def look_ahead(self, index: int, scales: Sequence[int]) -> None:
+        """Start reading, on a GPU, the photo of the view whose target is requested next, if it will be needed."""
+        if self._ahead is not None and self._needs_content(index, scales):
+            self._ahead.begin(index)
+
+    def end_look_ahead(self) -> None:
+        """Stop prefetching until the next call of `look_ahead`."""
+        if self._ahead is not None:
+            self._ahead.end()
+
+    def forget_division(self) -> None:
+        """Clear the caches that depend on the division of work, because it is about to change."""
+        self._content.clear()
+        self._divisions.clear()
+
+    def _needs_content(self, index: int, scales: Sequence[int]) -> bool:
+        """Return whether the content features of a view at some scales, or their images, are not cached."""
+        if not self.loss.content_weight:
+            return False
+        if self._drawn:
+            return any((index, scale) not in self._images for scale in scales)
+        division = self._divisions.get((index, tuple(scales)))  # features are cached only after their division is known
+        return division is None or any((index, scale, division.pieces[scale]) not in self._content for scale in scales)
+
+    def _content_images(self, index: int, scales: Sequence[int]) -> dict[int, Tensor]:
+        """Return the content of a view at some scales, [H >> s, W >> s, 3] on the network's device."""
+        whole = functools.cache(lambda: self.content(index).to(self.loss.network.device))
+
+        def scaled(scale: int) -> Tensor:
+            return downscale(whole(), scale)
+
+        return {scale: self._images.get((index, scale), functools.partial(scaled, scale)) for scale in scales}
+
+    def _content_behind(self, index: int, image: Tensor, behind: Color, scale: int) -> Tensor:
+        """Return the content of a view at a scale with another background color.
+
+        In a photo, the color replaces everything that no Gaussian covers.
+        """
+        if self.photos is None:
+            return self.put_behind(index, image, behind, scale)
+        coverage = self.coverage(index)[scale]
+        return put_behind(image * coverage[..., None].to(image.dtype), coverage, behind, (0.0, 0.0, 0.0))
+
+    def _division(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> Division:
+        """Return the division of work on some scales of a view.
+
+        It is computed once, because it requires reading the coverage.
+        """
+        key = (index, tuple(scales))
+        if key not in self._divisions:
+            camera = self.views.cameras[index]
+            sizes = {scale: (camera.height >> scale, camera.width >> scale) for scale in scales}
+            known = self._regions[index] if self._regions and self.loss.network.device.type != "cpu" else None
+            self._divisions[key] = self.loss.divider.divide(sizes, coverage, known)
+        return self._divisions[key]
+
+    def _rendered_coverage(self, index: int) -> list[Tensor]:
+        rows = self.views.own_rows(index, self.views.rasterizer.repeatable.coverage)
+        return self.loss.targets.position_weights(self.views.gathered(index, rows))
+
+    def _rendered_regions(self, index: int, maps: RegionMaps) -> list[list[Tensor]]:
+        whole = self.views.gathered(index, self.views.own_rows(index, maps.render, maps.count))
+        return [self.loss.targets.position_weights(weights) for weights in whole.unbind(2)]
+
+    def _features(self, image: Callable[[], Tensor], scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
+        return self.loss.targets.content_features(image(), scale, tiles)
+
+
+#: Index of the view, and scale.
+_ImageKey = tuple[int, int]
+#: Index of the view, scale, and every rank's pieces of it.
+_ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
+
+
+def _pyramid_bytes(pyramid: list[Tensor]) -> int:
+    return sum(map(tensor_bytes, pyramid))
