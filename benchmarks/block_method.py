@@ -55,14 +55,14 @@ def _scale(network: FeatureNetwork, image: Tensor, style: StyleTarget, content: 
     tiles = blocks(*size)
     parts: dict[str, list] = {layer: [] for layer in STYLE_LAYERS}
     for tile in tiles:  # first forward: statistics
-        features = network.forward(image[tile.outer.slices], keep=False).features
+        features = network.forward(image[tile.outer.slices], cache=False).features
         for layer in STYLE_LAYERS:
             parts[layer].append(layer_statistics(features[layer][tile.owned_cells(layer, size)[1].slices]))
     maps = {layer: style_loss(merge_all(parts[layer]), style.layers[layer])[1] for layer in STYLE_LAYERS}
     cells = torch.tensor(float((size[0] // 8) * (size[1] // 8)), dtype=torch.float64)
     result = torch.zeros_like(image)
     for tile in tiles:
-        wanted = network.forward(content[tile.outer.slices], keep=False).features[CONTENT_LAYER]  # content forward
+        wanted = network.forward(content[tile.outer.slices], cache=False).features[CONTENT_LAYER]  # content forward
         activations = network.forward(image[tile.outer.slices])  # second forward
 
         def pull(layer: str, features: Tensor, so_far: Tensor, wanted: Tensor = wanted) -> None:

@@ -21,10 +21,10 @@ from benchmarks.machine import write_result
 from benchmarks.work import Counted, Work, meta
 from sgsst_core.budget import GPU_SHARE, memory_for
 from sgsst_core.constants import RASTER_TILE
-from sgsst_core.features.fused_statistics import SPAN_VALUES, TILE, matrix_precision
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
+from sgsst_core.features.statistics import SPAN_VALUES, TILE, matrix_precision
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.content import ContentDifference
 from sgsst_core.loss.sos import SosLoss
@@ -175,7 +175,7 @@ class Passes:
         self.sizes = {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
         tiles = {scale: loss.divider.tiles(scaled) for scale, scaled in self.sizes.items()}
         self.tiles = [(tile, self.sizes[scale]) for scale, own in tiles.items() for tile in own]
-        self.kept = loss.tiling.kept([tile.outer.pixels for tile, _ in self.tiles])
+        self.kept = loss.tiling.cached([tile.outer.pixels for tile, _ in self.tiles])
 
     def network(self) -> tuple[list[Work], list[Work]]:
         """Return the work of forward pass and backward pass; the latter includes recomputing activations."""
@@ -234,7 +234,7 @@ def _cells(layer: str, tile: PartitionTile, size: Size) -> int:
 
 
 def statistics(channels: int, positions: int, size: int) -> Work:
-    """Return the work of `fused_kernels.shifted_moments` and its subsequent kernels.
+    """Return the work of `statistics_kernels.shifted_moments` and its subsequent kernels.
 
     Args:
         channels: Number of channels of the layer.
@@ -252,7 +252,7 @@ def statistics(channels: int, positions: int, size: int) -> Work:
 
 
 def style_gradient(channels: int, positions: int, size: int) -> Work:
-    """Return the work of `fused_kernels.add_style_gradient`.
+    """Return the work of `statistics_terms_kernels.add_style_gradient`.
 
     Each channel tile reads all features, and reads and writes its own part of the gradient.
     """

@@ -150,7 +150,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "halo": halo,
         "held_pixels": loss.tiling.held,
         "pixels_one_rank": sum(map(sum, areas)),
-        "pixels_twice_one_rank": sum(computed_twice(each, loss.tiling.kept(each)) for each in areas),
+        "pixels_twice_one_rank": sum(computed_twice(each, loss.tiling.cached(each)) for each in areas),
         "working": loss.tiling.working,
     }
 

@@ -26,8 +26,8 @@ from triton.compiler import ASTSource
 
 from benchmarks.machine import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
-from sgsst_core.features import fused_kernels as statistics_kernels
-from sgsst_core.features.fused_statistics import (
+from sgsst_core.features import statistics_kernels
+from sgsst_core.features.statistics import (
     POSITIONS,
     SPAN_VALUES,
     SPANS,
@@ -36,8 +36,8 @@ from sgsst_core.features.fused_statistics import (
     block_of_entries,
     matrix_precision,
 )
-from sgsst_core.loss import fused_kernels as loss_kernels
-from sgsst_core.loss import fused_terms
+from sgsst_core.loss import statistics_terms
+from sgsst_core.loss import statistics_terms_kernels as loss_kernels
 from sgsst_core.loss.statistics_terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
 from sgsst_core.rasterizer import triton_cached_kernels as cached_kernels
 from sgsst_core.rasterizer import triton_kernels as kernels
@@ -105,7 +105,7 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
         ),
         f"add_style_gradient_{of}": Target(
             loss_kernels.add_style_gradient,
-            {**matrix, "K": block_of_channels(channels, fused_terms.STEP), "P": fused_terms.POSITIONS},
+            {**matrix, "K": block_of_channels(channels, statistics_terms.STEP), "P": statistics_terms.POSITIONS},
             4,
             {"features": features, "gradient": features},
         ),

@@ -34,10 +34,10 @@ class RoundedToTf32(FeatureNetwork):
         super().__init__(*arguments, tf32=True)
         self._decisions = decisions
 
-    def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
-        kept = super().forward(rgb, keep=keep)
+    def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
+        kept = super().forward(rgb, cache=cache)
         if self._decisions:
-            kept.outputs = self._decisions.forward(rgb, keep=keep).outputs
+            kept.outputs = self._decisions.forward(rgb, cache=cache).outputs
         return kept
 
     def _convolve(self, x: Tensor, step: vgg._Convolution) -> Tensor:

@@ -33,7 +33,7 @@ def run(sizes: Sizes, found: Findings) -> None:
     exact: dict[str, Tensor] = {}
     for precision, make in precisions(weights).items():
         network = make()
-        features = network.forward(picture, keep=False).features
+        features = network.forward(picture, cache=False).features
         exact = exact or features
         found.add(f"{precision}/error_of_features", max(_error(features[name], exact[name]) for name in exact))
         for name, action in _passes(network, picture).items():

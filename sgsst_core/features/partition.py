@@ -141,7 +141,7 @@ def _spans(first: int, last: int, tile_size: int) -> list[tuple[int, int]]:
     return [(start, min(start + step, last)) for start in range(first, last, step)]
 
 
-def kept_tiles(areas: Sequence[int], held: float, working: float) -> list[bool]:
+def cached_tiles(areas: Sequence[int], held: float, working: float) -> list[bool]:
     """Return which tiles cache their activations between the forward and the backward pass: the largest that fit.
 
     Cached tiles must be back-propagated first, so that their memory is free when other tiles are recomputed.
@@ -151,18 +151,18 @@ def kept_tiles(areas: Sequence[int], held: float, working: float) -> list[bool]:
         held: Number of pixels whose activations fit in the memory budget.
         working: Additional memory of a tile during back-propagation, as a fraction of the memory of its activations.
     """
-    kept = [False] * len(areas)
-    room = held - working * max(areas, default=0)
-    for place in sorted(range(len(areas)), key=lambda place: -areas[place]):
-        if areas[place] <= room:
-            kept[place] = True
-            room -= areas[place]
-    return kept
+    cached = [False] * len(areas)
+    left = held - working * max(areas, default=0)
+    for index in sorted(range(len(areas)), key=lambda index: -areas[index]):
+        if areas[index] <= left:
+            cached[index] = True
+            left -= areas[index]
+    return cached
 
 
-def computed_twice(areas: Sequence[int], kept: Sequence[bool]) -> int:
+def computed_twice(areas: Sequence[int], cached: Sequence[bool]) -> int:
     """Return the number of pixels in tiles that are not cached, which need a second forward pass."""
-    return sum(area for area, flag in zip(areas, kept, strict=True) if not flag)
+    return sum(area for area, flag in zip(areas, cached, strict=True) if not flag)
 
 
 #: Candidate tile sizes. Below 64, the halo costs more than the saved memory is worth.
@@ -191,6 +191,6 @@ def choose_tile_size(
         areas = [tile.outer.pixels for tile in partition(height, width, size, halo, region)]
         if max(areas, default=0) * (1 + working) > held and size != TILE_SIZES[0]:
             return math.inf
-        return 2 * sum(areas) + computed_twice(areas, kept_tiles(areas, held, working))
+        return 2 * sum(areas) + computed_twice(areas, cached_tiles(areas, held, working))
 
     return min((None, *TILE_SIZES), key=work)

@@ -281,12 +281,12 @@ class FeatureNetwork:
         return self._channels[layer]
 
     @torch.no_grad()
-    def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
+    def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
         """Compute the features of an image.
 
         Args:
             rgb: [h, w, 3], values 0..1 (not clamped), any float dtype.
-            keep: Whether to store the activations that `backward` needs; if False, only the requested features are
+            cache: Whether to store the activations that `backward` needs; if False, only the requested features are
                 returned.
 
         Returns:
@@ -294,34 +294,34 @@ class FeatureNetwork:
         """
         height, width = int(rgb.shape[0]), int(rgb.shape[1])
         pixels = self._input.pixels(rgb)
-        kept = Activations({}, size=(height, width))
+        activations = Activations({}, size=(height, width))
         if PIXELS in self.layers:
-            kept.features[PIXELS] = pixels * PIXEL_UNIT
+            activations.features[PIXELS] = pixels * PIXEL_UNIT
         # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
         x = self._input.normalized(pixels).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         with convolutions(self.device, tf32=self.tf32, search=self.search):
-            self._forward_steps(x, kept, keep)
+            self._forward_steps(x, activations, cache)
         for layer in self.layers:
-            if layer not in kept.features:
+            if layer not in activations.features:
                 stride = layer_stride(layer)
-                kept.features[layer] = x.new_empty((height // stride, width // stride, self.channels(layer)))
-        return kept
+                activations.features[layer] = x.new_empty((height // stride, width // stride, self.channels(layer)))
+        return activations
 
-    def _forward_steps(self, x: Tensor, kept: Activations, keep: bool) -> None:
+    def _forward_steps(self, x: Tensor, activations: Activations, cache: bool) -> None:
         """Run the steps on the pixels [1, 3, h, w], up to the last layer that has cells."""
         for step in self._steps:
             if isinstance(step, _Pool):
                 if min(x.shape[2:]) < 2:
                     break
                 x = max_pool(x)
-                if keep:
-                    kept.outputs.append(x.new_empty(0))
+                if cache:
+                    activations.outputs.append(x.new_empty(0))
                 continue
             x = self._convolve(x, step)
-            if keep:
-                kept.outputs.append(x)
+            if cache:
+                activations.outputs.append(x)
             if step.layer in self.layers:
-                kept.features[step.layer] = x[0].permute(1, 2, 0)
+                activations.features[step.layer] = x[0].permute(1, 2, 0)
 
     def _convolve(self, x: Tensor, step: _Convolution) -> Tensor:
         """Apply convolution, bias and ReLU to x [1, in, h, w]."""
@@ -334,11 +334,11 @@ class FeatureNetwork:
         return F.conv2d(gradient, step.backward_weight, padding=1)
 
     @torch.no_grad()
-    def backward(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor:
-        """Compute the gradient with respect to the pixels; consumes `kept`.
+    def backward(self, activations: Activations, feature_gradient: FeatureGradient) -> Tensor:
+        """Compute the gradient with respect to the pixels; consumes `activations`.
 
         Args:
-            kept: Result of a forward pass with keep=True; its tensors are released along the way.
+            activations: Result of a forward pass with cache=True; its tensors are released along the way.
             feature_gradient: Callback for each reported layer, deepest first. It receives the layer's name, its
                 features [h, w, c] and the accumulated gradient [h, w, c], and adds dL/dfeatures to the gradient in
                 place.
@@ -347,30 +347,30 @@ class FeatureNetwork:
             dL/drgb, [h, w, 3], float32 (float64 for a float64 network).
         """
         with convolutions(self.device, tf32=self.tf32, search=self.search):
-            gradient = self._backward_steps(kept, feature_gradient)
-        shape = (*kept.size, 3)
+            gradient = self._backward_steps(activations, feature_gradient)
+        shape = (*activations.size, 3)
         if gradient is None:
             pixels = torch.zeros(shape, dtype=self._input.dtype, device=self.device)
         else:
             pixels = gradient[0].permute(1, 2, 0).to(self._input.dtype) * self._input.scale
-        if (features := kept.features.pop(PIXELS, None)) is not None:
+        if (features := activations.features.pop(PIXELS, None)) is not None:
             own = torch.zeros(shape, dtype=self._input.dtype, device=self.device)
             feature_gradient(PIXELS, features, own)
             pixels = torch.add(pixels, own, alpha=PIXEL_UNIT)
         return self._input.gradient(pixels)
 
-    def _backward_steps(self, kept: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
+    def _backward_steps(self, activations: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
         """Return the gradient [1, 3, h, w] of the first step's input; None if no layer has a gradient."""
         gradient: Tensor | None = None  # [1, c, h, w]
         masked = False  # whether the gradient is already 0 wherever the ReLU's output is 0
-        steps = self._steps[: len(kept.outputs)]
+        steps = self._steps[: len(activations.outputs)]
         for step in reversed(steps):
-            output = kept.outputs.pop()
+            output = activations.outputs.pop()
             if isinstance(step, _Pool):
                 if gradient is not None:
-                    gradient, masked = max_pool_backward(gradient, kept.outputs[-1]), True
+                    gradient, masked = max_pool_backward(gradient, activations.outputs[-1]), True
                 continue
-            features = kept.features.pop(step.layer, None)
+            features = activations.features.pop(step.layer, None)
             if features is not None and features.numel():
                 gradient = torch.zeros_like(output) if gradient is None else gradient
                 feature_gradient(step.layer, features, gradient[0].permute(1, 2, 0))

@@ -91,13 +91,13 @@ def is_original(weights: BackboneWeights) -> bool:
     return bool((weights.input_scale == 255).all())
 
 
-def paper_scales(weights: BackboneWeights, picture: Path = STARRY_NIGHT) -> dict[str, float]:
+def paper_scales(weights: BackboneWeights, image: Path = STARRY_NIGHT) -> dict[str, float]:
     """Return the layer factors with which an image, by default The Starry Night, produces the published losses.
 
     Factors are rounded to two digits, which makes no visible difference. The published run used another painting; two
     other paintings give factors within 25 % of these (docs/quality.md).
     """
-    with Image.open(picture) as painting:
+    with Image.open(image) as painting:
         size = [round(side * _SIDE / max(painting.size)) for side in painting.size]
         small = painting.convert("RGB").resize((size[0], size[1]), Image.Resampling.LANCZOS)
     pixels = torch.from_numpy(np.array(small, dtype=np.float32)) / 255
@@ -129,10 +129,10 @@ def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> Backbo
     return replace(weights, convolutions=convolutions, scales=dict(scales))
 
 
-def _features(weights: BackboneWeights, picture: Tensor) -> dict[str, Tensor]:
+def _features(weights: BackboneWeights, image: Tensor) -> dict[str, Tensor]:
     """Return the features [h, w, c] of the published layers for an image [H, W, 3]."""
     network = FeatureNetwork(weights, tuple(PUBLISHED), torch.float32)
-    return network.forward(picture, keep=False).features
+    return network.forward(image, cache=False).features
 
 
 def _gram(features: Tensor) -> Tensor:

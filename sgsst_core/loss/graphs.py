@@ -41,7 +41,7 @@ def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
         tiling: Partitioning rules of the loss.
         areas: Pixel count of the single partition tile of each scale.
     """
-    return tiling.keep_activations and 2 * max(areas, default=0) * (1 + tiling.working) <= tiling.held
+    return tiling.cache_activations and 2 * max(areas, default=0) * (1 + tiling.working) <= tiling.held
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,6 @@ class _Key:
 
     size: tuple[int, ...]
     dtype: torch.dtype
-    image_scale: int
     tiles: tuple[tuple[int, PartitionTile], ...]
     coverage: tuple[int, ...] | None
     regions: int
@@ -120,14 +119,12 @@ class LossGraphs:
         style: StyleTargets,
         view: ViewTarget,
         scales: Sequence[int],
-        *,
-        image_scale: int = 0,
     ) -> SosResult:
         """Evaluate the loss and its gradient, as `SosLoss.evaluate` does.
 
         The next evaluation overwrites the image gradient of the result. `style` must never be changed in place.
         """
-        key = self._key(image, style, view, scales, image_scale)
+        key = self._key(image, style, view, scales)
         graph = self._graphs.get(key) if key else None
         if graph is None and key in self._visited and self.problem is None and len(self._graphs) < self._most:
             assert key is not None
@@ -135,7 +132,7 @@ class LossGraphs:
         if graph is None:
             if key and len(self._visited) < self._most:
                 self._visited[key] = style
-            return self.loss.evaluate(image, style, view, scales, image_scale=image_scale)
+            return self.loss.evaluate(image, style, view, scales)
         with self.loss.timer("network"):
             return graph.replay(image, view)
 
@@ -145,7 +142,6 @@ class LossGraphs:
         style: StyleTargets,
         view: ViewTarget,
         scales: Sequence[int],
-        image_scale: int,
     ) -> _Key | None:
         """Return the graph key of an evaluation; None if the evaluation cannot be captured."""
         division = view.division
@@ -160,7 +156,7 @@ class LossGraphs:
             return None
         coverage = tuple(view.coverage[0].shape) if view.coverage else None
         regions = len(view.regions or ())
-        return _Key(tuple(image.shape), image.dtype, image_scale, tiles, coverage, regions, id(style))
+        return _Key(tuple(image.shape), image.dtype, tiles, coverage, regions, id(style))
 
     def _captured(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph | None:
         """Capture, cache and return the graph for a key; return None if capturing fails."""
@@ -189,7 +185,7 @@ class LossGraphs:
                 torch.cuda.stream(self._stream),
                 torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"),
             ):
-                found = loss.evaluate(static_image, style, static_view, scales, image_scale=key.image_scale)
+                found = loss.evaluate(static_image, style, static_view, scales)
                 assert found.image_gradient is not None
                 # Copy to memory that other graphs do not reuse for activations.
                 values.copy_(found.values)

@@ -83,7 +83,7 @@ def nearest_layers(style_loss: StyleLossName, network: str) -> tuple[str, ...]:
     return tuple(f"relu3_{index}" for index in range(1, count + 1))
 
 
-def chosen_places(count: int, most: int = MOST_VECTORS) -> Tensor:
+def chosen_positions(count: int, most: int = MOST_VECTORS) -> Tensor:
     """Return at most `most` of `count` indices, evenly spread, int64 in ascending order.
 
     If `count` is at most `most`, all indices are returned. Otherwise the range is divided into `most` equal intervals,
@@ -107,13 +107,13 @@ def positions_per_image(counts: Sequence[int], weights: Sequence[float], most: i
     return [min(count, max(1, int(most * weight))) for count, weight in zip(counts, weights, strict=True)]
 
 
-def places_in(places: Tensor, width: int, cells: Rectangle) -> tuple[Tensor, Tensor, Tensor]:
+def positions_in(positions: Tensor, width: int, cells: Rectangle) -> tuple[Tensor, Tensor, Tensor]:
     """Select the row-major positions in a feature map of the given width that lie inside a rectangle.
 
     Returns:
         Mask [k] bool of those inside, and their rows and columns relative to the rectangle.
     """
-    row, column = places // width, places % width
+    row, column = positions // width, positions % width
     inside = (row >= cells.top) & (row < cells.bottom) & (column >= cells.left) & (column < cells.right)
     return inside, row[inside] - cells.top, column[inside] - cells.left
 
@@ -161,8 +161,8 @@ class Matches:
                 found = position_weights[part] > 0
                 cosine[part][found], nearest[part][found] = search(block[found], units)
             else:
-                values, places = search(block.reshape(-1, block.shape[2]), units)
-                cosine[part], nearest[part] = values.view(lengths.shape), places.view(lengths.shape)
+                values, positions = search(block.reshape(-1, block.shape[2]), units)
+                cosine[part], nearest[part] = values.view(lengths.shape), positions.view(lengths.shape)
         return Matches(nearest, cosine, inverse)
 
     def distance(self, position_weights: Tensor | None = None) -> Tensor:
@@ -215,10 +215,10 @@ def search(units: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
     for top in range(0, len(units), rows):
         part = slice(top, top + rows)
         for first in range(0, len(style), columns):
-            values, places = (units[part] @ style[first : first + columns].T).max(dim=1)
+            values, positions = (units[part] @ style[first : first + columns].T).max(dim=1)
             nearer = values > best[part]
             best[part] = torch.where(nearer, values, best[part])
-            nearest[part] = torch.where(nearer, places + first, nearest[part])
+            nearest[part] = torch.where(nearer, positions + first, nearest[part])
     return best, nearest
 
 

@@ -34,7 +34,7 @@ class ScaleWeights:
         """Return the scales with a positive weight among the first `count`, finest first."""
         return [scale for scale in range(count) if self.of(scale) > 0]
 
-    def shares(self, scales: Iterable[int]) -> dict[int, float]:
+    def fractions(self, scales: Iterable[int]) -> dict[int, float]:
         """Return the weights of some scales, normalized to add up to 1.
 
         Raises:
@@ -72,7 +72,7 @@ def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: 
     if not asked.values:
         return
     counts = {camera.name: scale_count(camera.height, camera.width, coarsest) for camera in cameras}
-    most, last = max(counts.values()), max(place for place, weight in enumerate(weights) if weight > 0)
+    most, last = max(counts.values()), max(scale for scale, weight in enumerate(weights) if weight > 0)
     if last >= most:
         have = "one scale, 0" if most == 1 else f"{most} scales, 0 to {most - 1}"
         raise SettingsError(

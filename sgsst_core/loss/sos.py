@@ -77,7 +77,7 @@ class SosLoss:
         style_scale: Magnification of the style image relative to its default size.
         scales: Weights of the pyramid's scales; those of weight 0 are not computed.
         leave_out: Whether the network skips pixels of weight 0. False is meant for comparisons.
-        keep_activations: Whether to cache as many activations as fit between the two passes. False computes each tile
+        cache_activations: Whether to cache as many activations as fit between the two passes. False computes each tile
             twice; it is meant for comparisons.
         timer: Timer for `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
         collectives: Collectives of the ranks that evaluate each view together. All ranks must call the same methods
@@ -102,7 +102,7 @@ class SosLoss:
         style_scale: float = 1.0,
         scales: ScaleWeights = EVEN,
         leave_out: bool = True,
-        keep_activations: bool = True,
+        cache_activations: bool = True,
         timer: Timer | None = None,
         collectives: Collectives = ALONE,
     ) -> None:
@@ -115,7 +115,7 @@ class SosLoss:
         self.collectives = collectives
         held = network.held_bytes_per_pixel()
         working = network.working_bytes_per_pixel() / held
-        self.tiling = Tiling(network.halo, memory / held, working, coarsest, tile_size, keep_activations, scales)
+        self.tiling = Tiling(network.halo, memory / held, working, coarsest, tile_size, cache_activations, scales)
         self.divider = Divider(self.tiling, collectives, leave_out=leave_out)
         self.targets = TargetBuilder(
             network,
@@ -136,37 +136,35 @@ class SosLoss:
         scales: Sequence[int] | None = None,
         *,
         gradient: bool = True,
-        image_scale: int = 0,
     ) -> SosResult:
         """Compute the loss of an image [H, W, 3] (0..1, not clamped) and dE/dimage.
 
         Args:
-            image: Image of the view at scale `image_scale`.
+            image: Image of the view at full size.
             style: Style targets, from `targets.of_style`.
             view: View targets, from `targets.of_view`.
-            scales: Scales to evaluate, each with a positive weight and none finer than the image; phase 1 passes only
-                the coarsest. None for the full SOS loss of a full-size image.
+            scales: Scales to evaluate, each with a positive weight; phase 1 passes only the coarsest. None for the full
+                SOS loss.
             gradient: Whether to compute the gradient.
-            image_scale: Scale of the image; 0 is full size.
         """
         height, width = image.shape[0], image.shape[1]
         scales = self.tiling.scales((height, width)) if scales is None else scales
-        sizes = {scale: (height >> scale - image_scale, width >> scale - image_scale) for scale in scales}
-        division, weights = self._division(view, sizes), self.weights.shares(sizes)
+        sizes = {scale: (height >> scale, width >> scale) for scale in scales}
+        division, weights = self._division(view, sizes), self.weights.fractions(sizes)
         dtype = torch.promote_types(self.network.dtype, torch.float32)
         total = torch.zeros(image.shape, dtype=dtype, device=self.network.device)
         values: dict[int, Tensor] = {}
         for some in rounds(list(sizes), self.collectives.size):
             passes = []
             for scale in some:
-                scaled = ScaledView(downscale(image.to(self.network.device), scale - image_scale), scale)
+                scaled = ScaledView(downscale(image.to(self.network.device), scale), scale)
                 passes.append(self._pass(scaled, division.tiles[scale], style[scale], view))
-            cached = self._collect(passes, keep=gradient)
+            cached = self._collect(passes, cache=gradient)
             values |= {pass_.view.scale: pass_.values for pass_ in passes}
             gradients = self._backward(passes, cached) if gradient else []
             for pass_, pixel_gradient in zip(passes, gradients, strict=gradient):
                 scale = pass_.view.scale
-                add_upscaled_(total, pixel_gradient, scale - image_scale, weights[scale])
+                add_upscaled_(total, pixel_gradient, scale, weights[scale])
         stacked = torch.stack(list(values.values()))
         return SosResult(tuple(values), stacked, total if gradient else None, self.weights)
 
@@ -200,7 +198,7 @@ class SosLoss:
             raise ValueError("the view was prepared without content, but content_weight is not 0")
         return self.targets.content_features(view.content_image, scale, tiles)
 
-    def _collect(self, passes: Sequence[_ScalePass], *, keep: bool) -> list[dict[PartitionTile, Activations]]:
+    def _collect(self, passes: Sequence[_ScalePass], *, cache: bool) -> list[dict[PartitionTile, Activations]]:
         """Run the first pass of some scales, and set the values of their terms.
 
         Ranks start merging the statistics of all these scales before the first backward pass.
@@ -210,20 +208,20 @@ class SosLoss:
         """
         cached: list[dict[PartitionTile, Activations]] = []
         merged: list[Merged] = []
-        fits = iter(self.tiling.kept([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
+        fits = iter(self.tiling.cached([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
         for pass_ in passes:
             cached.append({})
             statistics: list[LayerStatistics] = []
             values = dict.fromkeys(TERMS, torch.zeros((), dtype=torch.float64, device=self.network.device))
             for tile in pass_.tiles:
-                keep_this = next(fits) and keep
-                activations = self._forward(pass_, tile, keep=keep_this)
+                cache_this = next(fits) and cache
+                activations = self._forward(pass_, tile, cache=cache_this)
                 with self.timer("statistics"):
                     own = pass_.statistics.statistics(tile, activations.features)
                     statistics = [merge(*pair) for pair in zip(statistics, own, strict=True)] if statistics else own
                     for term in pass_.terms:
                         values[term.name] = values[term.name] + term.value(tile, activations.features)
-                if keep_this:
+                if cache_this:
                     cached[-1][tile] = activations
             numbers = torch.stack(list(values.values()))
             merged.append(self.collectives.all_reduce_statistics(statistics or pass_.statistics.zero(), numbers))
@@ -267,9 +265,9 @@ class SosLoss:
         with self.timer("vgg_backward"):
             result[tile.outer.slices] += self.network.backward(activations, add)
 
-    def _forward(self, pass_: _ScalePass, tile: PartitionTile, *, keep: bool = True) -> Activations:
+    def _forward(self, pass_: _ScalePass, tile: PartitionTile, *, cache: bool = True) -> Activations:
         with self.timer("vgg_forward"):
-            return self.network.forward(pass_.view.image[tile.outer.slices], keep=keep)
+            return self.network.forward(pass_.view.image[tile.outer.slices], cache=cache)
 
 
 @dataclass
@@ -317,7 +315,7 @@ def make_loss(
         style_scale=settings.style_scale,
         scales=ScaleWeights(settings.scales),
         leave_out="uncovered" not in settings.keep,
-        keep_activations="activations" not in settings.keep,
+        cache_activations="activations" not in settings.keep,
         timer=timer,
         collectives=collectives,
     )

@@ -16,12 +16,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sgsst_core.features.fused_statistics import can_be_fused, fused_statistics, has_kernels
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
-from sgsst_core.features.statistics import LayerStatistics, blocks_of, center, layer_statistics
+from sgsst_core.features.statistics import (
+    TILE,
+    LayerStatistics,
+    block_of_channels,
+    block_of_entries,
+    block_of_positions,
+    blocks_of,
+    can_be_fused,
+    center,
+    has_kernels,
+    layer_statistics,
+    matrix_precision,
+)
 from sgsst_core.features.vgg import PIXELS, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
 from sgsst_core.loss.position_term import StyledRegion, TermInputs
 from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.settings import StyleLossName
@@ -35,6 +45,8 @@ GRAM_WEIGHT = 1e3
 MEAN_WEIGHT = 1e4
 #: w_s.
 STD_WEIGHT = 1e4
+#: Positions per program of the gradient kernel, and channels per step. Larger values would cause register spilling.
+POSITIONS, STEP = 64, 32
 
 
 class TermWeights(NamedTuple):
@@ -174,11 +186,6 @@ def style_loss(
     return torch.where(some, terms, 0.0), StyleGradient(matrix / count, statistics.mean, offset / count)
 
 
-def statistics_of(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
-    """Compute the statistics of features [h, w, c] with weights [h, w], on a GPU by its kernels if they can."""
-    return (fused_statistics if can_be_fused(features) else layer_statistics)(features, position_weights)
-
-
 def compared_layers(style_loss: StyleLossName, network: FeatureNetwork) -> list[str]:
     """Return the reported layers of a network whose statistics a loss compares."""
     return [layer for layer in (PIXELS, *STYLE_LAYERS) if layer in network.layers] if has_statistics(style_loss) else []
@@ -214,7 +221,7 @@ class StatisticsTerms:
                 owned, weights = features[layer][in_tile.slices], self._view.weights(layer, in_view, region.weights)
                 nowhere = self._is_nowhere(weights)
                 zero = LayerStatistics.zero(owned.shape[-1], owned.device) if nowhere else None
-                statistics.append(zero or statistics_of(owned, weights))
+                statistics.append(zero or layer_statistics(owned, weights))
         return statistics
 
     def compare(self, statistics: Sequence[LayerStatistics]) -> dict[str, Tensor]:
@@ -256,3 +263,71 @@ class StatisticsTerms:
         Weights on a GPU count as unknown, because reading them would synchronize with the device.
         """
         return len(self._regions) > 1 and weights is not None and not weights.is_cuda and not bool(weights.any())
+
+
+# --- on a GPU: one kernel launch each ---
+
+
+def fused_style_loss(
+    statistics: LayerStatistics,
+    target: tuple[Tensor, Tensor, Tensor],
+    weights: tuple[float, float, float],
+    feature_eps: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Compute `style_loss` on a GPU.
+
+    Args:
+        statistics: Statistics of the view's features.
+        target: Gram matrix, mean and standard deviation of the style, float64.
+        weights: c^2 w_G, w_m and w_s.
+        feature_eps: Relative rounding error of the features, as in `style_loss`.
+
+    Returns:
+        Terms [3] float64, and the gradient's matrix [c, c], mean [c] and offset [c] in float32.
+    """
+    from sgsst_core.loss import statistics_terms_kernels as kernels
+
+    device, channels = statistics.mean.device, len(statistics.mean)
+    terms = torch.empty((channels, 3), dtype=torch.float64, device=device)
+    matrix = torch.empty((channels, channels), device=device)
+    mean, offset = torch.empty(channels, device=device), torch.empty(channels, device=device)
+    gram_weight, mean_weight, std_weight = weights
+    columns = block_of_channels(channels)
+    rows = block_of_entries(channels) // columns
+    kernels.compare[(-(-channels // rows),)](
+        statistics.count, statistics.mean, statistics.centered, *target, terms, matrix, mean, offset,
+        GRAM=gram_weight, MEAN=mean_weight, STD=std_weight, EPS=feature_eps, CHANNELS=channels, ROWS=rows,
+        COLUMNS=columns,
+    )  # fmt: skip
+    return terms.sum(dim=0), matrix, mean, offset
+
+
+def fused_add_style_gradient(
+    gradient: Tensor,
+    features: Tensor,
+    matrix: Tensor,
+    mean: Tensor,
+    offset: Tensor,
+    position_weights: Tensor | None = None,
+) -> None:
+    """Add a_p (matrix (F_p - mean) + offset) to a gradient in place.
+
+    Args:
+        gradient: [h, w, c].
+        features: [h, w, c], same dtype as the gradient.
+        matrix: [c, c] from `fused_style_loss`.
+        mean: [c] from `fused_style_loss`.
+        offset: [c] from `fused_style_loss`.
+        position_weights: [h, w]; None for equal weights.
+    """
+    from sgsst_core.loss import statistics_terms_kernels as kernels
+
+    height, width, channels = features.shape
+    positions, tile, block = height * width, block_of_channels(channels, TILE), block_of_positions(POSITIONS)
+    weights = features if position_weights is None else position_weights
+    kernels.add_style_gradient[(-(-positions // block), -(-channels // tile))](
+        features, weights, gradient, matrix, mean, offset,
+        positions, width, *features.stride()[:2], *weights.stride()[:2], *gradient.stride()[:2],
+        CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEP), P=block,
+        WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
+    )  # fmt: skip

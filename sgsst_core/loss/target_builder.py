@@ -9,10 +9,10 @@ from torch import Tensor
 
 from sgsst_core.errors import ImageError
 from sgsst_core.features.partition import PartitionTile
-from sgsst_core.features.statistics import LayerStatistics, merge
+from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork, layer_stride
-from sgsst_core.loss.nearest import MOST_VECTORS, chosen_places, nearest_layers, places_in, positions_per_image
-from sgsst_core.loss.statistics_terms import compared_layers, statistics_of
+from sgsst_core.loss.nearest import MOST_VECTORS, chosen_positions, nearest_layers, positions_in, positions_per_image
+from sgsst_core.loss.statistics_terms import compared_layers
 from sgsst_core.loss.targets import ContentFeatures, LayerTarget, StyleTarget, StyleTargets, StyleVectors, ViewTarget
 from sgsst_core.loss.tiling import Divider
 from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
@@ -129,7 +129,7 @@ class TargetBuilder:
         for tile in tiles:
             features = self._forward(image, tile).features
             with self._timer("statistics"):
-                own = [statistics_of(features[c][tile.owned_cells(c, size)[1].slices]) for c in self._compared]
+                own = [layer_statistics(features[c][tile.owned_cells(c, size)[1].slices]) for c in self._compared]
                 total = [merge(*pair) for pair in zip(total, own, strict=True)] if total else own
         zero = [LayerStatistics.zero(self._network.channels(layer), device) for layer in self._compared]
         return self._collectives.all_reduce_statistics(
@@ -151,7 +151,7 @@ class TargetBuilder:
         counts = [(size[0] // stride) * (size[1] // stride) for size in map(_size, images)]
         chosen = positions_per_image(counts, weights, MOST_VECTORS)
         vectors = [
-            self._vectors_of(image, chosen_places(count, some))
+            self._vectors_of(image, chosen_positions(count, some))
             for image, count, some in zip(images, counts, chosen, strict=True)
             if count
         ]
@@ -172,25 +172,25 @@ class TargetBuilder:
         for tile in self._divider.tiles(size):
             features = self._forward(image, tile).features
             in_image, in_tile = tile.owned_cells(self._matched[0], size)
-            inside, row, column = places_in(positions, width, in_image)
+            inside, row, column = positions_in(positions, width, in_image)
             for layer, values in vectors.items():
                 values[inside] = features[layer][in_tile.slices].cpu()[row, column]
         return vectors
 
-    def of_view(self, content: Tensor, coverage: Tensor | None = None, *, keep_content: bool = True) -> ViewTarget:
+    def of_view(self, content: Tensor, coverage: Tensor | None = None, *, cache_content: bool = True) -> ViewTarget:
         """Compute the targets of a view.
 
         Args:
             content: Content image [H, W, 3] in 0..1.
             coverage: [H, W] in 0..1; None for equal weights.
-            keep_content: Whether to compute and cache the content features now, instead of in every evaluation.
+            cache_content: Whether to compute and cache the content features now, instead of in every evaluation.
         """
         height, width = _size(content)
         weights = None if coverage is None else self.position_weights(coverage)
         scales = self._divider.tiling.scales((height, width))
         division = self._divider.divide({scale: (height >> scale, width >> scale) for scale in scales}, weights)
         target = ViewTarget(content_image=content, coverage=weights, division=division)
-        if self._has_content and keep_content:
+        if self._has_content and cache_content:
             target.content = {
                 scale: self.content_features(content, scale, tiles) for scale, tiles in division.tiles.items()
             }
@@ -225,7 +225,7 @@ class TargetBuilder:
 
     def _forward(self, image: Tensor, tile: PartitionTile) -> Activations:
         with self._timer("vgg_forward"):
-            return self._network.forward(image[tile.outer.slices], keep=False)
+            return self._network.forward(image[tile.outer.slices], cache=False)
 
 
 def _size(image: Tensor) -> Size:

@@ -10,9 +10,9 @@ from torch import Tensor
 from sgsst_core.features.partition import (
     PartitionTile,
     Rectangle,
+    cached_tiles,
     choose_tile_size,
     covered_region,
-    kept_tiles,
     partition,
     scaled_region,
 )
@@ -32,7 +32,7 @@ class Tiling:
         working: Additional memory that a tile needs during a pass, as a fraction of the memory of its activations.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
-        keep_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
+        cache_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
             twice.
         weights: Weights of the scales.
     """
@@ -42,7 +42,7 @@ class Tiling:
     working: float
     coarsest: int
     tile_size: int | None = None
-    keep_activations: bool = True
+    cache_activations: bool = True
     weights: ScaleWeights = EVEN
 
     def scale_count(self, size: Size) -> int:
@@ -63,14 +63,14 @@ class Tiling:
             tile_size = choose_tile_size(*size, self.halo, held=self.held, working=self.working, region=region)
         return partition(*size, tile_size, self.halo, region)
 
-    def kept(self, areas: Sequence[int]) -> list[bool]:
+    def cached(self, areas: Sequence[int]) -> list[bool]:
         """Return which of the tiles with these pixel counts cache their activations.
 
         The memory budget applies to the sum over all given tiles.
         """
-        if not self.keep_activations:
+        if not self.cache_activations:
             return [False] * len(areas)
-        return kept_tiles(areas, self.held, self.working)
+        return cached_tiles(areas, self.held, self.working)
 
 
 @dataclass(frozen=True)

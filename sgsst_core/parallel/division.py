@@ -65,49 +65,49 @@ def divide(pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...]) -> t
     if len(speeds) == 1:
         return (tuple(sorted(pieces, key=lambda piece: piece.scale)),)
     half = len(speeds) // 2
-    share = sum(speeds[:half]) / sum(speeds)
-    first, second = _cut(pieces, share, halo)
+    fraction = sum(speeds[:half]) / sum(speeds)
+    first, second = _halves(pieces, fraction, halo)
     return divide(first, halo, speeds[:half]) + divide(second, halo, speeds[half:])
 
 
-def _cut(pieces: tuple[Piece, ...], share: float, halo: int) -> tuple[tuple[Piece, ...], tuple[Piece, ...]]:
+def _halves(pieces: tuple[Piece, ...], fraction: float, halo: int) -> tuple[tuple[Piece, ...], tuple[Piece, ...]]:
     """Divide pieces into two sets; the first set has a given fraction of the cost."""
     ordered = sorted(pieces, key=lambda piece: -piece.cost(halo))
     costs = [piece.cost(halo) for piece in ordered]
     total = sum(costs)
     before = 0
-    place = 0  # index of the piece to split
-    while place < len(ordered) - 1 and before + costs[place] < share * total:
-        before += costs[place]
-        place += 1
+    index = 0  # index of the piece to split
+    while index < len(ordered) - 1 and before + costs[index] < fraction * total:
+        before += costs[index]
+        index += 1
     if not total:
         return tuple(ordered), ()
-    after = total - before - costs[place]
+    after = total - before - costs[index]
 
     def load(parts: tuple[Piece | None, Piece | None]) -> float:
         own, other = (part.cost(halo) if part else 0 for part in parts)
-        return max((before + own) / share, (after + other) / (1 - share))
+        return max((before + own) / fraction, (after + other) / (1 - fraction))
 
-    left, right = min(_cuts(ordered[place]), key=load)
-    first = (*ordered[:place], *((left,) if left else ()))
-    return first, (*((right,) if right else ()), *ordered[place + 1 :])
+    left, right = min(_splits(ordered[index]), key=load)
+    first = (*ordered[:index], *((left,) if left else ()))
+    return first, (*((right,) if right else ()), *ordered[index + 1 :])
 
 
-def _cuts(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
+def _splits(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
     """Return all ways to split a piece in two: at every 16th row or column, or not at all."""
     area = piece.region
-    cuts: list[tuple[Piece | None, Piece | None]] = [(piece, None), (None, piece)]
+    splits: list[tuple[Piece | None, Piece | None]] = [(piece, None), (None, piece)]
 
     def part(region: Rectangle) -> Piece:
         return Piece(piece.scale, piece.size, region)
 
     for row in range(area.top + ALIGNMENT, area.bottom, ALIGNMENT):  # rows first, because they are contiguous in memory
         upper = part(Rectangle(area.top, area.left, row, area.right))
-        cuts.append((upper, part(Rectangle(row, area.left, area.bottom, area.right))))
+        splits.append((upper, part(Rectangle(row, area.left, area.bottom, area.right))))
     for column in range(area.left + ALIGNMENT, area.right, ALIGNMENT):
         left = part(Rectangle(area.top, area.left, area.bottom, column))
-        cuts.append((left, part(Rectangle(area.top, column, area.bottom, area.right))))
-    return cuts
+        splits.append((left, part(Rectangle(area.top, column, area.bottom, area.right))))
+    return splits
 
 
 def divide_rows(height: int, count: int, covered: Rows | None = None) -> list[Rows]:

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 from sgsst_core.budget import least_intersection_memory, measuring_memory, memory_for
 from sgsst_core.features.partition import (
     Rectangle,
+    cached_tiles,
     choose_tile_size,
     computed_twice,
-    kept_tiles,
     partition,
     scaled_region,
 )
@@ -159,7 +159,7 @@ class Work:
         peak = 0.0
         for piece in (piece for pieces in views for piece in pieces):
             areas = [tile.outer.pixels for tile in tiling.tiles(piece.size, piece.region)]
-            flags = tiling.kept(areas)
+            flags = tiling.cached(areas)
             twice = computed_twice(areas, flags)
             pixels += sum(areas)
             again += twice
@@ -435,7 +435,7 @@ class IterationWork:
         seconds = 0.0
         for scales in rounds(list(areas), ranks):
             together = [area for scale in scales for area in areas[scale]]
-            twice = computed_twice(together, kept_tiles(together, held, self.working))
+            twice = computed_twice(together, cached_tiles(together, held, self.working))
             seconds += sum(together) * self.pixel + twice * self.forward
         return seconds
 
@@ -723,7 +723,7 @@ def tiling_of(probe: Probe, settings: Settings) -> Tiling:
         memory_for("activations", probe.machine.memory) / network.held_bytes,
         network.working_bytes / network.held_bytes,
         settings.coarsest_side,
-        keep_activations="activations" not in settings.keep,
+        cache_activations="activations" not in settings.keep,
         weights=ScaleWeights(settings.scales),
     )
 

@@ -166,7 +166,7 @@ def _vgg16(
         )
 
     def features(rgb: Tensor) -> list[Tensor]:
-        found = network.forward(rgb, keep=False).features
+        found = network.forward(rgb, cache=False).features
         return [found[layer] for layer in _VGG16_LAYERS]
 
     return features

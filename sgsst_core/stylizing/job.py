@@ -301,7 +301,7 @@ def prepare_job(
         weighted=plan.weighted,
         photos=photos,
         memory=view_memory,
-        keep_content="content" not in settings.keep,
+        cache_content="content" not in settings.keep,
         regions=regions_seen,
         background=settings.background,
         drawn=plan.training_background != "background",

@@ -34,7 +34,7 @@ class ViewTargets:
             With a GPU it is also called in a thread, see `look_ahead`.
         memory: Memory budget in bytes for everything that is cached about views. A quarter of it is for colors
             (`Views`), a quarter for coverage, and the rest for content and region maps.
-        keep_content: Whether to cache content features that fit; False recomputes them at each visit, for comparison.
+        cache_content: Whether to cache content features that fit; False recomputes them at each visit, for comparison.
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
         background: Background color of the rasterizer.
         drawn: Whether the background color changes from step to step; content images are then cached instead of
@@ -50,7 +50,7 @@ class ViewTargets:
         weighted: bool,
         photos: PhotoLoader | None = None,
         memory: int = 1 << 30,
-        keep_content: bool = True,
+        cache_content: bool = True,
         regions: Sequence[Rectangle] | None = None,
         background: Color = (0.0, 0.0, 0.0),
         drawn: bool = False,
@@ -72,7 +72,7 @@ class ViewTargets:
         self._region_weights: Cache[int, list[list[Tensor]]] = Cache(
             0 if maps is None else memory // 4, lambda every: sum(map(_pyramid_bytes, every))
         )
-        cached = content if keep_content else 0
+        cached = content if cache_content else 0
         images = cached // 2 if drawn else 0
         self._images: Cache[_ImageKey, Tensor] = Cache(images, tensor_bytes)
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)

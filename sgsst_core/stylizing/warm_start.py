@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
-from sgsst_core.loss.nearest import chosen_places
+from sgsst_core.loss.nearest import chosen_positions
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
 from sgsst_core.style import Style, mixed_moments
@@ -52,7 +52,7 @@ def _some_pixels(style: Style) -> Tensor:
     parts = []
     for picture, weight in zip(style.images, style.weights, strict=True):
         pixels, count = picture.reshape(-1, 3), max(1, round(_PIXELS * weight))
-        places = chosen_places(len(pixels), count)
+        places = chosen_positions(len(pixels), count)
         if len(style.images) > 1 and len(places) < count:  # repeat the pixels of a small image
             places = torch.arange(count) * len(pixels) // count
         parts.append(pixels[places])

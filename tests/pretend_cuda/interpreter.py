@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from sgsst_core.features import fused_statistics
+from sgsst_core.features import statistics
 from sgsst_core.loss import statistics_terms as terms
 
 
 def leave_out_kernels(patch: pytest.MonkeyPatch) -> None:
     """Compute statistics and style loss with PyTorch operations instead of Triton kernels."""
-    for module in (fused_statistics, terms):
+    for module in (statistics, terms):
         patch.setattr(module, "has_kernels", lambda device, channels: False)

@@ -242,8 +242,8 @@ class DecisionsOf(FeatureNetwork):
         """Record the other network's forward passes in this block; later passes of this network use their decisions."""
         forward = self.other.forward
 
-        def heard(rgb: Tensor, *, keep: bool = True) -> Activations:
-            made = forward(rgb, keep=keep)
+        def heard(rgb: Tensor, *, cache: bool = True) -> Activations:
+            made = forward(rgb, cache=cache)
             self._heard.append(list(made.outputs))
             return made
 
@@ -258,9 +258,9 @@ class DecisionsOf(FeatureNetwork):
         """
         return self.other.rounding_of(layer)
 
-    def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
+    def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
         """Run `FeatureNetwork.forward`; store the decisions of the next recorded pass for `backward`."""
-        own = super().forward(rgb, keep=keep)
+        own = super().forward(rgb, cache=cache)
         theirs = Activations({}, self._heard.popleft())
         for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
             self.flips += int((mine != other).sum())

@@ -78,7 +78,7 @@ def _long_sum(full: bool) -> CaseResult:
 
 def _float16(full: bool) -> CaseResult:
     """Check that float16 is refused: features reach 1e4 and Gram entries 1e8, but float16 has a maximum of 65504."""
-    activations = FeatureNetwork(vgg16(), STYLE_LAYERS).forward(texture(32, 40).round(), keep=False)
+    activations = FeatureNetwork(vgg16(), STYLE_LAYERS).forward(texture(32, 40).round(), cache=False)
     largest = max(float(features.max()) for features in activations.features.values())
     gram = max(float(layer_statistics(features).gram().max()) for features in activations.features.values())
     note = f"features up to {largest:.1e}, Gram entries up to {gram:.1e}; float16 ends at 6.6e+04 and is refused"
@@ -153,8 +153,8 @@ def _features() -> tuple[torch.Tensor, LayerTarget]:
     The loss of similar images is a small difference of large values, which magnifies rounding errors.
     """
     network = FeatureNetwork(vgg16(), ("relu1_1",))
-    style = network.forward(texture(100, 100, 5) ** 3, keep=False).features["relu1_1"]
-    return network.forward(texture(160, 224, 4), keep=False).features["relu1_1"], LayerTarget.of(
+    style = network.forward(texture(100, 100, 5) ** 3, cache=False).features["relu1_1"]
+    return network.forward(texture(160, 224, 4), cache=False).features["relu1_1"], LayerTarget.of(
         layer_statistics(style)
     )
 

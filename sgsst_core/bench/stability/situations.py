@@ -238,8 +238,8 @@ class _Rounded(DecisionsOf):
     Images are rounded too, because the pixels of coarser scales are averages.
     """
 
-    def forward(self, rgb: Tensor, *, keep: bool = True) -> Activations:
-        return super().forward(rgb.float(), keep=keep)
+    def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
+        return super().forward(rgb.float(), cache=cache)
 
     def _convolve(self, x: Tensor, step: Any) -> Tensor:
         features = super()._convolve(x, step)
@@ -249,7 +249,7 @@ class _Rounded(DecisionsOf):
 
 def _feature_rounding(job: Stylizer, content: Tensor) -> float:
     """Return the rounding error of a difference of float32 content features."""
-    features = job.job.network.forward(content, keep=False).features[CONTENT_LAYER]
+    features = job.job.network.forward(content, cache=False).features[CONTENT_LAYER]
     return _FEATURE_ROUNDING * float(features.square().mean().sqrt()) if features.numel() else 0.0
 
 

@@ -3,10 +3,10 @@ import torch
 
 from sgsst_core.features.partition import (
     Rectangle,
+    cached_tiles,
     choose_tile_size,
     computed_twice,
     covered_region,
-    kept_tiles,
     partition,
     scaled_region,
 )
@@ -89,7 +89,7 @@ def test_work_outside_the_region_does_not_count():
 @pytest.mark.parametrize("working", [0.0, 0.4])
 def test_what_is_kept_fits_beside_the_pass_in_hand_and_leaves_no_room_for_another_tile(held, working):
     areas = [40, 100, 60, 100]
-    kept = kept_tiles(areas, held, working)
+    kept = cached_tiles(areas, held, working)
     total = sum(area for area, flag in zip(areas, kept, strict=True) if flag)
     others = [area for area, flag in zip(areas, kept, strict=True) if not flag]
     assert total == 0 or total + working * max(areas) <= held
@@ -98,6 +98,6 @@ def test_what_is_kept_fits_beside_the_pass_in_hand_and_leaves_no_room_for_anothe
 
 
 def test_a_view_that_just_fits_is_kept_whole():
-    assert kept_tiles([100], 140.0, 0.4) == [True]
-    assert kept_tiles([100], 139.0, 0.4) == [False]
+    assert cached_tiles([100], 140.0, 0.4) == [True]
+    assert cached_tiles([100], 139.0, 0.4) == [False]
     assert choose_tile_size(1000, 1000, 64, held=1.4e6, working=0.4) is None

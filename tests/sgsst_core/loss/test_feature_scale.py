@@ -32,7 +32,7 @@ def trained_anew(tiny_weights: BackboneWeights) -> BackboneWeights:
 
 def features(weights: BackboneWeights, picture: torch.Tensor) -> dict[str, torch.Tensor]:
     network = FeatureNetwork(weights, LAYERS, torch.float64)
-    return network.forward(picture.double(), keep=False).features
+    return network.forward(picture.double(), cache=False).features
 
 
 def test_features_of_each_layer_are_its_factor_times_as_large(tiny_weights: BackboneWeights) -> None:

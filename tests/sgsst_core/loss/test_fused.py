@@ -6,11 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.features.fused_statistics import fused_statistics
-from sgsst_core.features.statistics import LayerStatistics, layer_statistics_reference
+from sgsst_core.features.statistics import LayerStatistics, fused_statistics, layer_statistics_reference
 from sgsst_core.loss import statistics_terms as terms
-from sgsst_core.loss.fused_terms import fused_add_style_gradient, fused_style_loss
-from sgsst_core.loss.statistics_terms import StyleGradient, style_loss
+from sgsst_core.loss.statistics_terms import (
+    StyleGradient,
+    fused_add_style_gradient,
+    fused_style_loss,
+    style_loss,
+)
 from sgsst_core.loss.targets import LayerTarget
 from tests.sgsst_core.pictures import nearly_one_color, relative_error
 

@@ -123,7 +123,7 @@ def test_graphs_hold_the_search_for_nearest_vectors(
 
 @pytest.mark.usefixtures("without_triton")
 def test_every_kind_of_evaluation_has_a_graph_of_its_own(tiny_weights: BackboneWeights) -> None:
-    """Graphs differ by scales, image scale and style targets, and interleaved ones do not interfere."""
+    """Graphs differ by scales and style targets, and interleaved ones do not interfere."""
     loss = make_loss(tiny_weights)
     whole, other = (
         style_of(loss),
@@ -138,16 +138,11 @@ def test_every_kind_of_evaluation_has_a_graph_of_its_own(tiny_weights: BackboneW
         return ViewTarget(content=own, division=share)
 
     for step in range(3):
-        for pixels, style, scales, image_scale in (
-            (image(step), whole, SCALES, 0),
-            (image(step), whole, [1], 0),
-            (image(step, HEIGHT // 2, WIDTH // 2), whole, [1], 1),
-            (image(step), other, [1], 0),
-        ):
-            expected = loss.evaluate(pixels, style, view(scales), scales, image_scale=image_scale)
-            found = graphs.evaluate(pixels, style, view(scales), scales, image_scale=image_scale)
+        for style, scales in ((whole, SCALES), (whole, [1]), (other, [1])):
+            expected = loss.evaluate(image(step), style, view(scales), scales)
+            found = graphs.evaluate(image(step), style, view(scales), scales)
             assert_same(found, expected)
-    assert graphs.captured == 4
+    assert graphs.captured == 3
 
 
 @pytest.mark.usefixtures("without_triton")
@@ -189,7 +184,7 @@ def test_what_cannot_be_captured_is_evaluated_as_ever(
 
 @pytest.mark.usefixtures("without_triton")
 @pytest.mark.parametrize(
-    ("options", "fits"), [({"tile_size": 32}, 9.0), ({"keep_activations": False}, 9.0), ({}, 1.9), ({}, 2.1)]
+    ("options", "fits"), [({"tile_size": 32}, 9.0), ({"cache_activations": False}, 9.0), ({}, 1.9), ({}, 2.1)]
 )
 def test_only_scales_of_one_tile_that_fit_twice_are_captured(
     tiny_weights: BackboneWeights, options: dict[str, Any], fits: float
@@ -208,7 +203,7 @@ def test_only_scales_of_one_tile_that_fit_twice_are_captured(
 def test_a_view_without_its_content_is_not_captured(tiny_weights: BackboneWeights) -> None:
     """A graph would recompute the content features of the captured view in every replay."""
     loss = make_loss(tiny_weights)
-    style, view = style_of(loss), loss.targets.of_view(image(2), keep_content=False)
+    style, view = style_of(loss), loss.targets.of_view(image(2), cache_content=False)
     graphs = LossGraphs(loss)
     for step in range(FIRST_VISITS):
         assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))

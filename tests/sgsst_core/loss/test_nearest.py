@@ -14,7 +14,7 @@ from sgsst_core.loss.nearest import (
     MOST_VECTORS,
     NEAREST_WEIGHTS,
     Matches,
-    chosen_places,
+    chosen_positions,
     nearest_layers,
     nearest_reference,
     search,
@@ -139,7 +139,7 @@ def test_tiles_that_are_computed_twice_are_matched_once(
 
     kept = evaluate(loss_of(tiny_weights, style_loss, tile_size=48), case)
     monkeypatch.setattr(nearest, "search", counted)
-    twice = evaluate(loss_of(tiny_weights, style_loss, tile_size=48, keep_activations=False), case)
+    twice = evaluate(loss_of(tiny_weights, style_loss, tile_size=48, cache_activations=False), case)
     assert torch.equal(gradient_of(twice), gradient_of(kept))
     assert sum(searched) == 24 * 32
 
@@ -252,15 +252,15 @@ def test_a_style_without_a_vector_is_refused(tiny_weights: BackboneWeights) -> N
 
 
 def test_large_styles_are_thinned_evenly() -> None:
-    assert chosen_places(MOST_VECTORS).tolist() == list(range(MOST_VECTORS))
-    places = chosen_places(1000 * 700, 5000)
+    assert chosen_positions(MOST_VECTORS).tolist() == list(range(MOST_VECTORS))
+    places = chosen_positions(1000 * 700, 5000)
     assert len(places) == 5000
     assert (places.diff() >= 0).all()
     assert 0 <= int(places[0]) <= int(places[-1]) < 700_000
     for count, most in ((places // 700, 1000), (places % 700, 700)):  # rows and columns are both uniform
         assert torch.histc(count.double(), 10, 0, most).sub(500).abs().max() < 25
     # With fewer than two positions per sample, all are in range and few repeat.
-    assert len(chosen_places(6001, 6000).unique()) > 4000
+    assert len(chosen_positions(6001, 6000).unique()) > 4000
 
 
 @pytest.mark.parametrize("tile_size", [None, 64, 208])
@@ -272,9 +272,9 @@ def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
     loss = loss_of(tiny_weights, "nnfm", tile_size=tile_size)
     vectors = loss.targets.of_style(Style.of(style), (130, 201))[0][0].vectors
     assert vectors is not None
-    found = loss.network.forward(style, keep=False).features
+    found = loss.network.forward(style, cache=False).features
     whole = torch.cat([found[layer] for layer in nearest_layers("nnfm", "vgg16")], dim=2).flatten(0, 1)
-    expected = whole[chosen_places(32 * 50, 200)]
+    expected = whole[chosen_positions(32 * 50, 200)]
     assert relative_error(vectors.units, expected / expected.norm(dim=1, keepdim=True)) < 1e-12
 
 

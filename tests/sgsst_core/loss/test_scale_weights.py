@@ -34,9 +34,9 @@ def evaluate(
     network = FeatureNetwork(weights, dtype=dtype)
     seen, forward = [], network.forward
 
-    def looked(rgb: torch.Tensor, *, keep: bool = True) -> object:
+    def looked(rgb: torch.Tensor, *, cache: bool = True) -> object:
         seen.append((int(rgb.shape[0]), int(rgb.shape[1])))
-        return forward(rgb, keep=keep)
+        return forward(rgb, cache=cache)
 
     network.forward = looked  # type: ignore[method-assign, assignment]
     loss = SosLoss(network, tile_size=tile_size, coarsest=COARSEST, scales=ScaleWeights(values))
@@ -88,10 +88,10 @@ def test_shares_add_up_and_none_is_a_mistake() -> None:
     weights = ScaleWeights((1.0, 0.0, 3.0))
     assert weights.chosen(5) == [0, 2]
     assert EVEN.chosen(3) == [0, 1, 2]
-    assert weights.shares([0, 2]) == {0: 0.25, 2: 0.75}
+    assert weights.fractions([0, 2]) == {0: 0.25, 2: 0.75}
     assert weights.mean({0: 4.0, 2: 8.0}) == 7
     with pytest.raises(ValueError, match="none of the scales"):
-        weights.shares([1])
+        weights.fractions([1])
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (-1.0, 1.0), (math.nan,), (math.inf, 1.0), (1e13,), (1.0,) * 17])

@@ -128,9 +128,9 @@ class DecisionsOf(FeatureNetwork):
         self.flips = 0
         self.decisions = 0
 
-    def forward(self, rgb, *, keep=True) -> Activations:
-        own = super().forward(rgb, keep=keep)
-        theirs = self.other.forward(rgb.float(), keep=keep)
+    def forward(self, rgb, *, cache=True) -> Activations:
+        own = super().forward(rgb, cache=cache)
+        theirs = self.other.forward(rgb.float(), cache=cache)
         for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
             self.flips += int((mine != other).sum())
             self.decisions += mine.numel()
@@ -171,7 +171,7 @@ def test_content_features_kept_or_computed_again(tiny_weights):
     loss = SosLoss(network)
     targets = loss.targets.of_style(Style.of(style), (200, 300))
     kept = loss.evaluate(image, targets, loss.targets.of_view(content))
-    again = loss.evaluate(image, targets, loss.targets.of_view(content, keep_content=False))
+    again = loss.evaluate(image, targets, loss.targets.of_view(content, cache_content=False))
     assert kept.loss == again.loss
     assert torch.equal(kept.image_gradient, again.image_gradient)
     assert kept.terms[0]["content"] > 0

@@ -117,7 +117,7 @@ def test_colors_of_equal_luminance_are_the_same_to_the_loss(tiny_weights: Backbo
     network = FeatureNetwork(replace(tiny_weights, gray=True), dtype=torch.float64)
     image = picture(40, 48, seed=1)
     other = image + torch.tensor([0.587, -0.299, 0.0], dtype=torch.float64) * picture(40, 48, seed=5)[..., :1]
-    first, second = (network.forward(each, keep=False).features for each in (image, other))
+    first, second = (network.forward(each, cache=False).features for each in (image, other))
     for layer, features in first.items():
         torch.testing.assert_close(features, second[layer])
 

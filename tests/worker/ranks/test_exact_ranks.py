@@ -86,7 +86,7 @@ def gradient(
     result = loss.evaluate(views.render(0, colors), targets, target, scales)
     assert result.image_gradient is not None
     assert target.division is not None
-    kept = loss.tiling.kept([tile.outer.pixels for tiles in target.division.tiles.values() for tile in tiles])
+    kept = loss.tiling.cached([tile.outer.pixels for tiles in target.division.tiles.values() for tile in tiles])
     return views.gradient(0, result.image_gradient, colors), result.loss, kept
 
 

@@ -14,7 +14,7 @@ import triton.language as tl
 
 
 @triton.jit
-def places_of(there, channel, CHANNELS: tl.constexpr):
+def mask_of(there, channel, CHANNELS: tl.constexpr):
     """Return the load mask [P, C] of valid positions and channels.
 
     A block may have more channels than the layer; the excess channels are invalid.
@@ -25,9 +25,9 @@ def places_of(there, channel, CHANNELS: tl.constexpr):
 @triton.jit
 def load_centered(features, shift, row_step, column_step, width, position, channel, there, CHANNELS: tl.constexpr):
     """Load features minus shift [P, C] as float32, at row-major positions; invalid features count as 0."""
-    place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
-    mask = places_of(there, channel, CHANNELS)
-    values = tl.load(features + place[:, None] + channel[None, :], mask=mask, other=0.0).to(tl.float32)
+    offset = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
+    mask = mask_of(there, channel, CHANNELS)
+    values = tl.load(features + offset[:, None] + channel[None, :], mask=mask, other=0.0).to(tl.float32)
     return values - tl.load(shift + channel, mask=channel < CHANNELS, other=0.0)[None, :]
 
 
@@ -35,8 +35,8 @@ def load_centered(features, shift, row_step, column_step, width, position, chann
 def load_weights(weights, row_step, column_step, width, position, there, WEIGHTED: tl.constexpr):
     """Load position weights [P] as float32, 0 at invalid positions."""
     if WEIGHTED:
-        place = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
-        return tl.load(weights + place, mask=there, other=0.0).to(tl.float32)
+        offset = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
+        return tl.load(weights + offset, mask=there, other=0.0).to(tl.float32)
     return there.to(tl.float32)
 
 
@@ -109,7 +109,7 @@ def add_moments(
     inside = entry < CHANNELS * CHANNELS
     i, j = tl.where(inside, entry // CHANNELS, 0), entry % CHANNELS
     # Blocks below the diagonal are not computed: the matrix is symmetric, so read the transposed entry.
-    place = tl.where(i <= j, i * CHANNELS + j, j * CHANNELS + i)
+    offset = tl.where(i <= j, i * CHANNELS + j, j * CHANNELS + i)
     n = tl.zeros([S], tl.float64)
     down, across, second = (
         tl.zeros([ENTRIES], tl.float64),
@@ -124,7 +124,7 @@ def add_moments(
         n += tl.load(counts + span, mask=there, other=0.0).to(tl.float64)
         down += tl.sum(tl.load(firsts + row + i[None, :], mask=there[:, None], other=0.0).to(tl.float64), 0)
         across += tl.sum(tl.load(firsts + row + j[None, :], mask=there[:, None], other=0.0).to(tl.float64), 0)
-        each = tl.load(seconds + row * CHANNELS + place[None, :], mask=there[:, None], other=0.0)
+        each = tl.load(seconds + row * CHANNELS + offset[None, :], mask=there[:, None], other=0.0)
         second += tl.sum(each.to(tl.float64), 0)
         begin += S
     total = tl.sum(n, 0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sgsst_core.features.fused_kernels import load_centered, load_weights, places_of
+from sgsst_core.features.statistics_kernels import load_centered, load_weights, mask_of
 
 
 @triton.jit
@@ -77,7 +77,7 @@ def add_style_gradient(
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
         weights: Position weights [h, width]; ignored if WEIGHTED is false.
-        gradient: [h, width, CHANNELS] in the dtype of the features, updated in place.
+        gradient: [h, width, CHANNELS] in the dtype of the features, updated in cell.
         matrix, mean, offset: Outputs of `compare`; the matrix is symmetric.
         positions: Number of positions, h * width.
     """
@@ -89,14 +89,14 @@ def add_style_gradient(
     while k < CHANNELS:
         channel = k + tl.arange(0, K)
         centered = load_centered(features, mean, row_step, column_step, width, position, channel, there, CHANNELS)
-        part_of = places_of(channel < CHANNELS, own, CHANNELS)
+        part_of = mask_of(channel < CHANNELS, own, CHANNELS)
         part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :], mask=part_of, other=0.0)
         sums += tl.dot(centered, part, input_precision=PRECISION)
         k += K
     a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
     sums = (sums + tl.load(offset + own, mask=own < CHANNELS, other=0.0)[None, :]) * a[:, None]
-    place = (position // width).to(tl.int64) * out_row_step + (position % width).to(tl.int64) * out_column_step
-    target = gradient + place[:, None] + own[None, :]
-    mask = places_of(there, own, CHANNELS)
+    cell = (position // width).to(tl.int64) * out_row_step + (position % width).to(tl.int64) * out_column_step
+    target = gradient + cell[:, None] + own[None, :]
+    mask = mask_of(there, own, CHANNELS)
     before = tl.load(target, mask=mask, other=0.0)
     tl.store(target, (before.to(tl.float32) + sums).to(before.dtype), mask=mask)
