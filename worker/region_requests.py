@@ -250,7 +250,8 @@ def region_requests(
             raise SettingsError(
                 f"Region {region.name!r} is frozen, so it cannot have a style or weight. Remove one or the other."
             )
-    if len([name for name in names if name != REST]) > MOST_REGIONS:
-        raise SettingsError(f"There are {len(found)} regions. At most {MOST_REGIONS} are allowed.")
+    selecting = len([name for name in names if name != REST])
+    if selecting > MOST_REGIONS:
+        raise SettingsError(f"There are {selecting} regions. At most {MOST_REGIONS} are allowed.")
     rest = next((region for region in found if region.name == REST), None)
     return (*([rest] if rest else []), *(region for region in found if region.name != REST))

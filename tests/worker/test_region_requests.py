@@ -86,6 +86,10 @@ def test_the_command_lines_texts_come_together(tmp_path: Path) -> None:
             ([f"a{n}:sphere=0,0,0,1" for n in range(MOST_REGIONS + 1)], [], [], []),
             rf"There are {MOST_REGIONS + 1} regions\. At most {MOST_REGIONS} are allowed",
         ),
+        (  # the rest does not count
+            ([f"a{n}:sphere=0,0,0,1" for n in range(MOST_REGIONS + 1)], [], [], [REST]),
+            rf"There are {MOST_REGIONS + 1} regions\. At most {MOST_REGIONS} are allowed",
+        ),
         (
             (["a:sphere=0,0,0,1"], ["a=x.jpg"] * (MOST_PICTURES + 1), [], []),
             rf"{MOST_PICTURES + 1} style images\. At most {MOST_PICTURES} are allowed",
