@@ -10,7 +10,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError, SceneError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
-from sgsst_core.files.formats.spz import SpzHeader
+from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.photos import Photo, check_photos, photo_size, some_names
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
@@ -105,29 +105,29 @@ def read_capture(source: SceneRequest, scene: Scene) -> Capture:
     return Capture(cameras, orbit, sizes)
 
 
-def with_axes(source: SceneRequest) -> tuple[SceneRequest, list[Decision]]:
-    """Return the request with the axes of an SPZ scene, if neither request nor file state them.
+def choose_axes(source: SceneRequest) -> tuple[SpzAxes, list[Decision]]:
+    """Return the axes to read an SPZ scene with, and the line for the plan if the cameras decide.
 
-    They are those under which the cameras see the scene. Without cameras, or if both see it, they stay open. Nothing is
-    raised: `read_scene` and `read_capture` report unusable files.
+    If neither request nor file state them, they are those under which the cameras see the scene. Without cameras, or if
+    both see it, they stay open. Nothing is raised: `read_scene` and `read_capture` report unusable files.
     """
-    if source.cameras is None or source.spz_axes != "auto":
-        return source, []
+    asked = source.spz_axes
+    if source.cameras is None or asked != "auto":
+        return asked, []
     try:
         header = read_scene_header(source.scene)
         if not isinstance(header, SpzHeader) or header.extended or header.stated_axes is not None:
-            return source, []
+            return asked, []
         cameras = read_cameras(source.cameras)
         means = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene.means
     except (SceneError, CameraError):
-        return source, []
+        return asked, []
     rdf = shown_by(means, cameras, source.near).typical
     rub = shown_by(means * means.new_tensor([1, -1, -1]), cameras, source.near).typical
     if rub <= _CLEARLY_MORE * rdf:
-        return source, []
+        return asked, []
     reason = f"a typical view has {rub:.1%} of the Gaussians in its frame so, and {rdf:.1%} with rdf; see --spz-axes"
-    line = Decision("axes", "the scene is rotated by 180 degrees about x (rub: y up, z backward)", reason)
-    return source.model_copy(update={"spz_axes": "rub"}), [line]
+    return "rub", [Decision("axes", "the scene is rotated by 180 degrees about x (rub: y up, z backward)", reason)]
 
 
 def _orbit_request(source: SceneRequest) -> OrbitRequest:

@@ -32,7 +32,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job_styles import check_style_size
-from worker.capture import Capture, read_capture, with_axes
+from worker.capture import Capture, choose_axes, read_capture
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 from worker.selecting import select_regions
@@ -81,7 +81,8 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
         InvalidInputError: If an input cannot be used. Every rank raises the same error.
     """
     settings, images = request.settings, request.images
-    source, about_axes = collectives.broadcast(lambda: with_axes(request.source))
+    source = request.source
+    axes, about_axes = collectives.broadcast(lambda: choose_axes(source))
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_styles(request.styles))
     scene_file, reader = read_shared_scene(
@@ -89,7 +90,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
         collectives,
         drop_invalid=source.drop_invalid,
         growth=settings.refine,
-        spz_axes=source.spz_axes,
+        spz_axes=axes,
     )
     together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
     capture = _capture_on_all_ranks(source, scene_file.scene, collectives).fitted(settings)
@@ -162,8 +163,8 @@ def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> 
         CameraError: If the cameras cannot be used.
         ImageError: If the photos cannot be used.
     """
-    source, about_axes = with_axes(source)
-    file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes)
+    axes, about_axes = choose_axes(source)
+    file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     capture = read_capture(source, file.scene).with_photos(images).checked(file.scene, source.near)
     return file, replace(capture, decisions=(*about_axes, *capture.decisions))
 

@@ -52,7 +52,7 @@ from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job_styles import check_style_size
 from sgsst_core.stylizing.refining import refine, refined
-from worker.capture import Capture, read_capture, with_axes
+from worker.capture import Capture, choose_axes, read_capture
 from worker.inputs import check_something_in_view, load_styles, read_regions
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
@@ -118,8 +118,8 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         if source.cameras is not None:
             _check_frames_have_sizes(source.cameras)
     with _errors_of("scene"):
-        source, about_axes = with_axes(source)
-        file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes)
+        axes, about_axes = choose_axes(source)
+        file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
         check_sh_attenuation(file, settings.sh_attenuation)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _errors_of("style"):

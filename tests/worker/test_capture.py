@@ -18,7 +18,7 @@ from sgsst_core.files.photos import load_photo
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from tests.small_scenes import ball, cameras, wall, write_files
-from worker.capture import Capture, read_capture, with_axes
+from worker.capture import Capture, choose_axes, read_capture
 from worker.request import SceneRequest
 
 SCENE = wall()
@@ -140,13 +140,13 @@ def test_cameras_choose_the_axes_of_an_spz_scene_that_states_none(tmp_path: Path
         folder.mkdir()
         source = spz(folder, scene)
         unstated(source.scene)
-        found, about = with_axes(source)
-        read = read_scene(found.scene, spz_axes=found.spz_axes).scene
+        axes, about = choose_axes(source)
+        read = read_scene(source.scene, spz_axes=axes).scene
         assert torch.allclose(read.means, SCENE.means, atol=1e-3)
         assert len(about) == (folder is other)
     assert about[0].decision == "the scene is rotated by 180 degrees about x (rub: y up, z backward)"
-    assert with_axes(source.model_copy(update={"spz_axes": "rdf"}))[1] == []
-    assert with_axes(source.model_copy(update={"cameras": None, "orbit": 3}))[1] == []
+    assert choose_axes(source.model_copy(update={"spz_axes": "rdf"}))[1] == []
+    assert choose_axes(source.model_copy(update={"cameras": None, "orbit": 3}))[1] == []
 
 
 def unstated(path: Path) -> None:
@@ -158,4 +158,4 @@ def unstated(path: Path) -> None:
 
 def test_axes_that_a_file_states_are_kept(tmp_path: Path) -> None:
     source = spz(tmp_path, turned(SCENE))
-    assert with_axes(source) == (source, [])
+    assert choose_axes(source) == ("auto", [])

@@ -16,9 +16,12 @@ from torch import Tensor
 
 from sgsst_core.decision import Decision
 from sgsst_core.errors import SceneError
+from sgsst_core.files.photos import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.lens import radial_lens
+from worker.capture import Capture
 from worker.ranks.messages import decode, encode
 from worker.request import Outputs
 
@@ -39,6 +42,10 @@ VALUES = [
     LossTerms(gram=1 / 3, content=2.0),
     Decision("ranks", "2", "measured", seconds=0.1),
     Outputs(Path("out/s.ply")),
+    Capture(
+        [], None, [(640, 480)], [Photo(Path("a.jpg"), (640, 480), oriented=True)], (Decision("axes", "rub", "seen"),)
+    ),
+    radial_lens("OPENCV", (0.1, -0.02), (640, 480), (500.0, 500.0, 320.0, 240.0)),
     Prediction(1.0, 2.0, 3),
 ]
 
