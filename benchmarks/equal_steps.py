@@ -95,7 +95,7 @@ def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: d
 def _judged(judge: Judge, sh_dc: torch.Tensor, palette: torch.Tensor) -> dict[str, float]:
     judgment = judge.judge(sh_dc)
     assert judgment is not None, "no view can be judged: give more cameras, or larger views"
-    sliced = [sliced_distance(judge.pictures(sh_dc, view), palette) for view in judge.cameras]
+    sliced = [sliced_distance(judge.renders(sh_dc, view), palette) for view in judge.cameras]
     return {**asdict(judgment), "sliced": sum(sliced) / len(sliced)}
 
 
@@ -157,7 +157,7 @@ def _mean(results: list[dict[str, float]]) -> dict[str, Any]:
 def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
     """Write each row's colors, and a contact sheet with one row of views per setting."""
     folder.mkdir(parents=True, exist_ok=True)
-    rows = [(way, [judge.pictures(sh_dc, view)[0] for view in judge.cameras[:SHOWN]]) for way, sh_dc in colors.items()]
+    rows = [(way, [judge.renders(sh_dc, view)[0] for view in judge.cameras[:SHOWN]]) for way, sh_dc in colors.items()]
     write_rows(folder / f"{name}.jpg", style, rows)
     torch.save(colors, folder / f"{name}.pt")
 

@@ -119,7 +119,7 @@ def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, col
     cameras = judge.cameras[:SHOWN]
     rows = []
     for way, sh_dc in colors.items():
-        renders = [judge.pictures(sh_dc, camera) for camera in cameras]
+        renders = [judge.renders(sh_dc, camera) for camera in cameras]
         rows.append((way, [*(pair[0] for pair in renders), renders[0][1]]))
     write_rows(folder / f"{name}.jpg", style, rows)
     torch.save(colors, folder / f"{name}.pt")

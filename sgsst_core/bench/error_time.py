@@ -152,8 +152,8 @@ class _TimedStylizer(Stylizer):
     def phase(self) -> Phase:
         """Phase at the elapsed optimization time."""
         end = 0.0
-        for stage, scale, share in self.shares[:-1]:
-            end += share * self.budget
+        for stage, scale, fraction in self.shares[:-1]:
+            end += fraction * self.budget
             if self.seconds < end:
                 return Phase(stage, 1, scale)
         stage, scale, _ = self.shares[-1]
@@ -200,8 +200,8 @@ def error_time(
         settings: Settings for all variants that override the standard preset.
     """
     base = make_settings("standard", **settings)
-    share = (base.memory_limit or default_memory_limit()) // (len(variants) + 1)
-    base = base.model_copy(update={"memory_limit": share})
+    fraction = (base.memory_limit or default_memory_limit()) // (len(variants) + 1)
+    base = base.model_copy(update={"memory_limit": fraction})
     exact = Float32Reference(Stylizer.planned(scene, cameras, style, base, weights=weights), style_loss="sos")
     views = exact.views.covered
     start = exact.evaluate(views, scene.sh_dc)
@@ -342,9 +342,9 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], scale: int | None) -> Floa
         column([point.relative if scale is None else point.by_scale.get(scale) for point in curve.points])
         for curve in curves
     ]
-    for place, curve in enumerate(curves):
-        look = {"marker": _MARKERS[place % len(_MARKERS)], "color": color_of(place), "label": curve.variant.name}
-        draw_points(axes, seconds[place], losses[place], markersize=4, linewidth=1, **look)
+    for index, curve in enumerate(curves):
+        look = {"marker": _MARKERS[index % len(_MARKERS)], "color": color_of(index), "label": curve.variant.name}
+        draw_points(axes, seconds[index], losses[index], markersize=4, linewidth=1, **look)
     set_log_x(axes, log_limits(joined(seconds), X_MARGIN), "seconds of optimization")
     axes.set_title("mean of the scales" if scale is None else scale_name(scale))
     return joined(losses)

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from sgsst_core.bench.error_time import Curve, Point, Variant, error_time
 from sgsst_core.bench.error_time import as_dict as curves_as_dict
+from sgsst_core.budget import measuring_memory
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import atomic_path
@@ -193,7 +194,7 @@ def make_novel_views(stylizer: Stylizer) -> NovelViews:
         exact.loss,
         exact.style_targets,
         weighted=stylizer.job.plan.weighted,
-        memory=stylizer.job.memory // 16,
+        memory=measuring_memory(stylizer.job.memory),
     )
 
 
@@ -206,9 +207,9 @@ def write_plot(path: Path, quality: Quality, title: str) -> None:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7, 5), dpi=110, layout="constrained")
         axes = figure.subplots()
-        for place, outcome in enumerate(quality.outcomes):
+        for index, outcome in enumerate(quality.outcomes):
             point = (outcome.judgment.content, outcome.judgment.style)
-            axes.plot(*point, "o", color=color_of(place), clip_on=False)
+            axes.plot(*point, "o", color=color_of(index), clip_on=False)
             axes.annotate(outcome.name, point, xytext=(5, 4), textcoords="offset points", color=INK)
         front = [outcome.judgment for outcome in quality.front()]
         axes.plot([one.content for one in front], [one.style for one in front], "--", color=INK, alpha=0.5)
@@ -229,7 +230,7 @@ def write_sheet(path: Path, quality: Quality) -> None:
     cameras = quality.judge.cameras[:_SHOWN]
     rows = []
     for outcome in quality.outcomes:
-        pictures = [quality.judge.pictures(outcome.sh_dc, camera) for camera in cameras]
-        rows.append((outcome.name, [*(pair[0] for pair in pictures), pictures[0][1]]))
+        images = [quality.judge.renders(outcome.sh_dc, camera) for camera in cameras]
+        rows.append((outcome.name, [*(pair[0] for pair in images), images[0][1]]))
     with torch.no_grad():
         write_rows(path, quality.style, rows)

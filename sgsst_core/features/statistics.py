@@ -92,10 +92,10 @@ def merge(first: LayerStatistics, second: LayerStatistics) -> LayerStatistics:
     synchronize with the device.
     """
     count = first.count + second.count
-    share = second.count / torch.where(count > 0, count, 1.0)
+    fraction = second.count / torch.where(count > 0, count, 1.0)
     delta = second.mean - first.mean
-    mean = first.mean + delta * share
-    centered = first.centered + second.centered + torch.outer(delta, delta) * (first.count * share)
+    mean = first.mean + delta * fraction
+    centered = first.centered + second.centered + torch.outer(delta, delta) * (first.count * fraction)
     return LayerStatistics(count, mean, centered)
 
 

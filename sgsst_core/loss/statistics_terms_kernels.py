@@ -39,7 +39,7 @@ def compare(
     n = tl.load(count)
     some = n > 0
     divisor = tl.where(some, n, 1.0)
-    share = tl.where(some, 1.0 / divisor, 0.0)
+    fraction = tl.where(some, 1.0 / divisor, 0.0)
     own, means = tl.load(mean + i, mask=row, other=0.0), tl.load(mean + j, mask=column, other=0.0)
     wanted = tl.load(target_gram + entry, mask=both, other=0.0)
     gram_error = tl.load(centered + entry, mask=both, other=0.0) / divisor + own[:, None] * means[None, :] - wanted
@@ -49,11 +49,11 @@ def compare(
     slope = tl.where(std > EPS * tl.abs(own), std_error / tl.where(std > 0, std, 1.0), 0.0)
     weight: tl.constexpr = GRAM / (CHANNELS * CHANNELS)
     line = (4 * weight / (CHANNELS * CHANNELS)) * gram_error
-    drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * share
+    drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * fraction
     line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
     # `add_style_gradient` centers features about the float32 mean; the offset compensates for its rounding error.
-    drawn += tl.sum(line * (means.to(tl.float32).to(tl.float64) - means)[None, :], 1) * share
-    tl.store(matrix + entry, (line * share).to(tl.float32), mask=both)
+    drawn += tl.sum(line * (means.to(tl.float32).to(tl.float64) - means)[None, :], 1) * fraction
+    tl.store(matrix + entry, (line * fraction).to(tl.float32), mask=both)
     tl.store(own_mean + i, own.to(tl.float32), mask=row)
     tl.store(offset + i, drawn.to(tl.float32), mask=row)
     present = tl.where(some, 1.0, 0.0).to(tl.float64)

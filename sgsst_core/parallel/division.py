@@ -134,6 +134,6 @@ def rounds(scales: Sequence[int], ranks: int) -> list[list[int]]:
     return [[scale] for scale in scales] if ranks == 1 else [list(scales)]
 
 
-def loads(shares: Sequence[Sequence[Piece]], halo: int) -> list[int]:
+def loads(fractions: Sequence[Sequence[Piece]], halo: int) -> list[int]:
     """Return the number of pixels that each rank passes through the network."""
-    return [sum(piece.cost(halo) for piece in share) for share in shares]
+    return [sum(piece.cost(halo) for piece in fraction) for fraction in fractions]

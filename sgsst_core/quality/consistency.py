@@ -258,11 +258,11 @@ def find_warp(
         x, y, z = project_pixels(depth.depth[band], top, camera, other)
         found = depth.known[band] & (z > 0) & (x >= 0) & (x <= other.width) & (y >= 0) & (y <= other.height)
         source, weight = _around(other_depth, x[found], y[found], z[found], tolerance)
-        share = weight.sum(dim=0)
-        agrees = share > 1 - _FOREIGN_SHARE
+        fraction = weight.sum(dim=0)
+        agrees = fraction > 1 - _FOREIGN_SHARE
         pixels.append(found.view(-1).nonzero()[agrees, 0] + top * camera.width)
         sources.append(source[:, agrees])
-        weights.append(weight[:, agrees] / share[agrees])
+        weights.append(weight[:, agrees] / fraction[agrees])
     return Warp((camera.height, camera.width), torch.cat(pixels), torch.cat(sources, dim=1), torch.cat(weights, dim=1))
 
 
@@ -321,10 +321,10 @@ def shown(image: Tensor, camera: Camera, device: torch.device) -> Tensor:
     image = image.detach().to(device)
     if tuple(image.shape) != (camera.height, camera.width, 3):
         raise ValueError(
-            f"picture of view {camera.name!r}: shape {tuple(image.shape)}, not {(camera.height, camera.width, 3)}"
+            f"image of view {camera.name!r}: shape {tuple(image.shape)}, not {(camera.height, camera.width, 3)}"
         )
     if not bool(image.isfinite().all()):
-        raise ValueError(f"picture of view {camera.name!r}: holds NaN or infinity")
+        raise ValueError(f"image of view {camera.name!r}: holds NaN or infinity")
     return image.clamp(0, 1).contiguous()
 
 

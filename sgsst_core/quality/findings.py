@@ -100,8 +100,8 @@ def findings_of(
     """
     rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: nothing is allocated yet
     found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, survey=survey)]
-    pictures = () if style is None else Style.of(style).images
-    return [*found, *(finding for picture in pictures for finding in style_findings(picture, cameras))]
+    images = () if style is None else Style.of(style).images
+    return [*found, *(finding for image in images for finding in style_findings(image, cameras))]
 
 
 def scene_findings(file: SceneFile) -> list[Finding]:
@@ -113,7 +113,7 @@ def scene_findings(file: SceneFile) -> list[Finding]:
         *scene.sizes(),
         *scene.opacities(),
         *scene.harmonics(),
-        *scene.place(),
+        *scene.distance(),
     ]
 
 
@@ -143,15 +143,15 @@ class _Scene:
         counts = [0] * len(questions)
         worst = [(-math.inf, -1, math.nan)] * len(questions)  # (value to compare, Gaussian, value)
         for part in _parts(len(self.scene)):
-            for place, (extreme, value) in enumerate(look(part)):
+            for number, (extreme, value) in enumerate(look(part)):
                 count = int(extreme.sum())
                 if count:
-                    counts[place] += count
-                    order = value.double() if questions[place].largest else -value.double()
+                    counts[number] += count
+                    order = value.double() if questions[number].largest else -value.double()
                     index = int(torch.where(extreme, order, -math.inf).argmax())
                     found = (float(order[index]), part.start + index, float(value[index]))
-                    if worst[place][1] < 0 or found[0] > worst[place][0]:
-                        worst[place] = found
+                    if worst[number][1] < 0 or found[0] > worst[number][0]:
+                        worst[number] = found
         return [
             Finding(subject, ask.what, count, len(self.scene), f"Gaussian {self._row(at)}: {value:.3g}", ask.done)
             for ask, count, (_, at, value) in zip(questions, counts, worst, strict=True)
@@ -245,7 +245,7 @@ class _Scene:
                 found += self.ask(_large_coefficients(values), question)
         return found
 
-    def place(self) -> list[Finding]:
+    def distance(self) -> list[Finding]:
         far = float(self.center.norm()) / self.extent
         if far < FAR_WORLD:
             return []
@@ -394,20 +394,20 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
     return found if refused else [*found, *_seldom_seen(file, blend_weights)]
 
 
-def _uncovered(shares: list[float], cameras: Sequence[Camera]) -> list[Finding]:
+def _uncovered(fractions: list[float], cameras: Sequence[Camera]) -> list[Finding]:
     """Report views that see nothing or leave pixels uncovered, given each view's fraction of uncovered pixels."""
     return [
         *_of_views(
             "see no Gaussian",
-            shares,
-            [share == 1 for share in shares],
+            fractions,
+            [fraction == 1 for fraction in fractions],
             cameras,
             "skipped; a job needs at least one view that sees a Gaussian",
         ),
         *_of_views(
             f"more than {UNCOVERED:.0%} uncovered (value: fraction)",
-            shares,
-            [UNCOVERED < share < 1 for share in shares],
+            fractions,
+            [UNCOVERED < fraction < 1 for fraction in fractions],
             cameras,
             "statistics are weighted by coverage if the mean over all views exceeds 1 % (--position-weights auto)",
         ),

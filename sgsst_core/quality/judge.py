@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.constants import SH_C0
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.quality.consistency import shown
 from sgsst_core.quality.lpips import Lpips, unit_features
 from sgsst_core.rasterizer import Rasterizer
@@ -27,7 +27,8 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from sgsst_core.style import Style, mixed_moments
+from sgsst_core.style import Style
+from sgsst_core.stylizing.color_moments import Moments, color_moments, square_root, style_moments
 from sgsst_core.stylizing.job_styles import JobStyles
 
 #: Maximum longer side of judged views in pixels. The limit keeps results at different resolutions comparable, and
@@ -118,13 +119,13 @@ class Judge:
         sh_dc = sh_dc.detach().to(self._rasterizer.device)
         views = [self._view(camera, sh_dc) for camera in self.cameras]
         style, color_distance, content, features = (
-            fmean(fmean(one[place] for one in view) for view in views) for place in range(4)
+            fmean(fmean(one[index] for one in view) for view in views) for index in range(4)
         )
         background_sensitivity = fmean(abs(view[0][0] - view[1][0]) for view in views)
         return Judgment(style, color_distance, content, features, background_sensitivity, saturated(sh_dc))
 
     @torch.no_grad()
-    def pictures(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
+    def renders(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
         """Render colors `sh_dc` [N, 3] on black and on white, as images [H, W, 3]."""
         image, coverage = self._render(sh_dc.detach().to(self._rasterizer.device), camera)
         return [self._on(image, coverage, camera, behind) for behind in _BEHIND]
@@ -137,15 +138,15 @@ class Judge:
         parts = self._parts(camera, weights)
         found = []
         for behind in _BEHIND:
-            picture, original = (self._on(values, coverage, camera, behind) for values in (image, before))
-            own, theirs = self._lpips.features(picture), self._lpips.features(original)
+            stylized, original = (self._on(values, coverage, camera, behind) for values in (image, before))
+            own, theirs = self._lpips.features(stylized), self._lpips.features(original)
             distance = self._lpips.between(own, theirs, (camera.height, camera.width)).map
             found.append(
                 (
-                    sum(share * judge.distance(own, part) for judge, part, share in parts),
-                    sum(share * judge.color_distance(picture, part) for judge, part, share in parts),
+                    sum(fraction * judge.distance(own, part) for judge, part, fraction in parts),
+                    sum(fraction * judge.color_distance(stylized, part) for judge, part, fraction in parts),
                     _weighted_mean(distance, weights),
-                    fmean(_turned(x, y, weights) for x, y in zip(own, theirs, strict=True)),
+                    fmean(_change_of_direction(x, y, weights) for x, y in zip(own, theirs, strict=True)),
                 )
             )
         return found
@@ -174,10 +175,10 @@ class Judge:
         """
         if self._maps is None:
             return [(self._judges[0], coverage, 1.0)]
-        weights = [share.to(coverage) for share in self._maps.render(camera).unbind(2)]
-        sums = [float(share.sum(dtype=torch.float64)) for share in weights]
+        weights = [fraction.to(coverage) for fraction in self._maps.render(camera).unbind(2)]
+        sums = [float(fraction.sum(dtype=torch.float64)) for fraction in weights]
         parts = zip(self._judges, weights, sums, strict=True)
-        return [(judge, share, own / sum(sums)) for judge, share, own in parts if own > 0]
+        return [(judge, fraction, own / sum(sums)) for judge, fraction, own in parts if own > 0]
 
 
 class _StyleJudge:
@@ -185,14 +186,13 @@ class _StyleJudge:
 
     def __init__(self, lpips: Lpips, style: Style) -> None:
         self._lpips = lpips
-        self._style = style.map(lambda picture: picture.to(lpips.device, torch.float32))
-        moments = [_moments(each.reshape(-1, 3), each.new_ones(each[..., 0].numel())) for each in self._style.images]
-        self._palette = mixed_moments(moments, style.weights)
+        self._style = style.map(lambda image: image.to(lpips.device, torch.float32))
+        self._colors = style_moments(self._style)
         self._targets: dict[tuple[int, int], list[Tensor]] = {}
 
-    def color_distance(self, picture: Tensor, weights: Tensor) -> float:
+    def color_distance(self, image: Tensor, weights: Tensor) -> float:
         """Return the Frechet distance of the colors of an image [H, W, 3] with position weights [H, W]."""
-        return frechet_distance(_moments(picture.reshape(-1, 3), weights.reshape(-1)), self._palette)
+        return frechet_distance(color_moments(image.reshape(-1, 3), weights.reshape(-1)), self._colors)
 
     def distance(self, features: list[Tensor], weights: Tensor) -> float:
         """Return the mean relative distance of Gram matrices over the layers of an image.
@@ -214,28 +214,28 @@ class _StyleJudge:
         Style images are resized as in the loss, but not below AlexNet's minimum size.
         """
         if view not in self._targets:
-            every = [self._grams_of(picture, view) for picture in self._style.images]
+            every = [self._grams_of(image, view) for image in self._style.images]
             self._targets[view] = [
                 reduce(operator.add, [weight * gram for gram, weight in zip(grams, self._style.weights, strict=True)])
                 for grams in zip(*every, strict=True)
             ]
         return self._targets[view]
 
-    def _grams_of(self, picture: Tensor, view: tuple[int, int]) -> list[Tensor]:
+    def _grams_of(self, image: Tensor, view: tuple[int, int]) -> list[Tensor]:
         """Return the Gram matrices of one style image."""
-        height, width = style_size((picture.shape[0], picture.shape[1]), view)
+        height, width = style_size((image.shape[0], image.shape[1]), view)
         enlarged = max(1.0, self._lpips.minimum_side / min(height, width))
-        features = self._lpips.features(resize_area(picture, (round(height * enlarged), round(width * enlarged))))
+        features = self._lpips.features(resize_area(image, (round(height * enlarged), round(width * enlarged))))
         return [_gram(x, torch.ones(x.shape[:2], device=x.device)) for x in features]
 
 
 def saturated(sh_dc: Tensor) -> float:
     """Return the fraction of colors `sh_dc` [N, 3] with a channel outside [0, 1], which no screen can show."""
-    colors = 0.5 + SH_C0 * sh_dc.double()
+    colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
     return float(((colors < 0) | (colors > 1)).any(dim=1).double().mean())
 
 
-def frechet_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float:
+def frechet_distance(first: Moments, second: Moments) -> float:
     """Return the Frechet distance of two normal distributions of colors, in 8-bit levels.
 
     Args:
@@ -244,27 +244,11 @@ def frechet_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]
     """
     (mean, covariance), (other_mean, other) = first, second
     other_mean, other = other_mean.to(mean), other.to(covariance)
-    root = _square_root(covariance)
+    root = square_root(covariance)
     # Trace of (C C')^1/2. Rounding can make an eigenvalue of 0 slightly negative.
     shared = torch.linalg.eigvalsh(root @ other @ root).clamp_min(0).sqrt().sum()
     spread = covariance.trace() + other.trace() - 2 * shared
     return _LEVELS * float(((mean - other_mean).square().sum() + spread.clamp_min(0)).sqrt())
-
-
-def _square_root(matrix: Tensor) -> Tensor:
-    """Return the square root of a symmetric positive semidefinite matrix."""
-    values, vectors = torch.linalg.eigh(matrix)
-    root: Tensor = vectors * values.clamp_min(0).sqrt() @ vectors.T
-    return root
-
-
-def _moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the weighted mean [3] and covariance [3, 3] of colors [n, 3] in float64."""
-    colors, weights = colors.double(), weights.double()
-    total = weights.sum()
-    mean = colors.T @ weights / total
-    centered = colors - mean
-    return mean, (weights[:, None] * centered).T @ centered / total
 
 
 def _pooled(coverage: Tensor, features: Tensor) -> Tensor:
@@ -283,7 +267,7 @@ def _gram(features: Tensor, weights: Tensor) -> Tensor:
     return (weighted.T @ flat).double() / weights.sum(dtype=torch.float64)
 
 
-def _turned(x: Tensor, y: Tensor, coverage: Tensor) -> float:
+def _change_of_direction(x: Tensor, y: Tensor, coverage: Tensor) -> float:
     """Return the weighted mean of 1 - cosine between the features [h, w, c] of two images.
 
     Positions where both are zero count as unchanged.

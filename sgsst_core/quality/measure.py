@@ -190,18 +190,18 @@ class Measurements:
             colors: Colors `sh_dc` [N, 3] to measure with.
             seconds: Time of a moment apart from its views.
         """
-        stylizer, place = self._stylizer, self._stylizer.job.plan.measuring
+        stylizer, index = self._stylizer, self._stylizer.job.plan.measuring
         again = 0.0
-        if LEVELS[place].views and LEVELS[place].start:
+        if LEVELS[index].views and LEVELS[index].start:
             novel_views, prices = self._trial(colors, seconds)
             if novel_views.views:
-                place = stylizer.job.collectives.broadcast(lambda: self._affordable(place, prices))
-                again = prices.again(LEVELS[place])
-            if LEVELS[place].views == 1:
+                index = stylizer.job.collectives.broadcast(lambda: self._affordable(index, prices))
+                again = prices.again(LEVELS[index])
+            if LEVELS[index].views == 1:
                 self._novel_views = novel_views
         if self._novel_views is None:
-            self._novel_views = self._make(LEVELS[place].views)
-        return {"level": place, "again": again}
+            self._novel_views = self._make(LEVELS[index].views)
+        return {"level": index, "again": again}
 
     def _trial(self, colors: Tensor, seconds: float) -> tuple[NovelViews, Prices]:
         """Measure one novel view; return it with the measured times.
@@ -222,17 +222,17 @@ class Measurements:
         again = clock[-1] - clock[-2]
         return novel_views, Prices(max(clock[-2] - clock[0] - again, 0.0), again, seconds)
 
-    def _affordable(self, place: int, prices: Prices) -> int:
-        """Return the index of the first affordable level at or after `place`, given the measured times.
+    def _affordable(self, index: int, prices: Prices) -> int:
+        """Return the index of the first affordable level at or after `index`, given the measured times.
 
         The times include no compilation, because some steps have already run.
         """
         stylizer, expected = self._stylizer, self._stylizer.job.plan.prediction
         if expected is None:
-            return place
+            return index
         allowed = novel_view_seconds(stylizer.job.settings.measure, expected)
         # One view is already prepared, so measuring it at the end is always affordable.
-        return min(choose_level(prices, allowed, stylizer.job.total_steps, place), NOTHING - 1)
+        return min(choose_level(prices, allowed, stylizer.job.total_steps, index), NOTHING - 1)
 
     def _source_of_statistics(self) -> StylizationJob | ExactLoss:
         """Return the object whose loss and style targets define Gram distances.

@@ -174,8 +174,8 @@ class NovelViews:
                 coverage = self._coverage.get(index, partial(self.rasterizer.coverage, self.cameras[index]))
             target = self._loss.targets.of_view(image(index), coverage)
             if self._maps is not None:
-                shares = self._maps.render(self.cameras[index]).unbind(2)
-                target.regions = [self._loss.targets.position_weights(share) for share in shares]
+                fractions = self._maps.render(self.cameras[index]).unbind(2)
+                target.regions = [self._loss.targets.position_weights(fraction) for fraction in fractions]
             style = self._style_targets(self.cameras[index])
             for scale, terms in self._loss.evaluate(image(index), style, target, gradient=False).terms.items():
                 values.setdefault(scale, []).append(terms["gram"])

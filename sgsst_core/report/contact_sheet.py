@@ -43,13 +43,10 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
             dcs = (views.scene.sh_dc.to(device), stylizer.shown())
             # Call the rasterizer directly, because only one rank writes the sheet and the other ranks do not render.
             camera = views.cameras[index]
-            renders = [_picture(views.rasterizer.render(views.colors(index, dc), camera)) for dc in dcs]
+            renders = [_to_image(views.rasterizer.render(views.colors(index, dc), camera)) for dc in dcs]
             pairs.append((camera, renders))
-    sheet = _sheet(
-        _stacked([_picture(picture) for style in stylizer.job.styles.all for picture in style.images]), pairs
-    )
-    with atomic_path(path) as temporary:
-        sheet.save(temporary, format="JPEG", quality=88)
+    sheet = _sheet(_stacked([_to_image(image) for style in stylizer.job.styles.all for image in style.images]), pairs)
+    _save(path, sheet)
 
 
 def write_views(
@@ -76,22 +73,21 @@ def write_views(
     """
     part = sampled(scene, _VIEW_GAUSSIANS)
     rasterizer = make_rasterizer("cpu", part, background=background, near=near)
-    pictures = []
+    images = []
     for camera in spread(cameras, _MOST_VIEWS):
         small = resized(camera, min(camera.side, _VIEW_SIDE))
         colors = scene_colors(part, small)
-        pictures.append((camera.name, _picture(rasterizer.render(colors, small))))
-    width = max(picture.width for _, picture in pictures) + _GAP
-    height = max(picture.height for _, picture in pictures) + _GAP + _LABEL
-    columns = min(len(pictures), max(1, round(math.sqrt(_SHEET_SHAPE * len(pictures) * height / width))))
-    rows = -(-len(pictures) // columns)
+        images.append((camera.name, _to_image(rasterizer.render(colors, small))))
+    width = max(image.width for _, image in images) + _GAP
+    height = max(image.height for _, image in images) + _GAP + _LABEL
+    columns = min(len(images), max(1, round(math.sqrt(_SHEET_SHAPE * len(images) * height / width))))
+    rows = -(-len(images) // columns)
     sheet = Image.new("RGB", (columns * width + _GAP, rows * height + _GAP), PAPER)
     draw = ImageDraw.Draw(sheet)
-    for place, (name, picture) in enumerate(pictures):
-        row, column = divmod(place, columns)
-        _place(sheet, draw, picture, _GAP + column * width, _GAP + _LABEL + row * height, name)
-    with atomic_path(path) as temporary:
-        sheet.save(temporary, format="JPEG", quality=88)
+    for index, (name, image) in enumerate(images):
+        row, column = divmod(index, columns)
+        _draw(sheet, draw, image, _GAP + column * width, _GAP + _LABEL + row * height, name)
+    _save(path, sheet)
 
 
 def write_rows(path: Path, style: Tensor, rows: Sequence[tuple[str, Sequence[Tensor]]]) -> None:
@@ -101,77 +97,78 @@ def write_rows(path: Path, style: Tensor, rows: Sequence[tuple[str, Sequence[Ten
         OutputError: If the file cannot be written.
     """
     named = [
-        (name, [_fitted(_picture(image), _MAX_CELL_WIDTH, _CELL_HEIGHT) for image in images])
-        for name, images in [("style", [style]), *rows]
+        (name, [_fitted(_to_image(render), _MAX_CELL_WIDTH, _CELL_HEIGHT) for render in renders])
+        for name, renders in [("style", [style]), *rows]
     ]
     line = _LABEL + _GAP
-    widths = [sum(picture.width + _GAP for picture in pictures) for _, pictures in named]
-    heights = [max(picture.height for picture in pictures) + line for _, pictures in named]
+    widths = [sum(image.width + _GAP for image in images) for _, images in named]
+    heights = [max(image.height for image in images) + line for _, images in named]
     sheet = Image.new("RGB", (max(widths) + _GAP, sum(heights) + _GAP), PAPER)
     draw, top = ImageDraw.Draw(sheet), line
-    for (name, pictures), height in zip(named, heights, strict=True):
+    for (name, images), height in zip(named, heights, strict=True):
         left = _GAP
-        for place, picture in enumerate(pictures):
-            _place(sheet, draw, picture, left, top, "" if place else name)
-            left += picture.width + _GAP
+        for index, image in enumerate(images):
+            _draw(sheet, draw, image, left, top, "" if index else name)
+            left += image.width + _GAP
         top += height
+    _save(path, sheet)
+
+
+def _save(path: Path, sheet: Image.Image) -> None:
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
 
 
-def _picture(image: Tensor) -> Image.Image:
+def _to_image(image: Tensor) -> Image.Image:
     values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
     return Image.fromarray(values.numpy())
 
 
-def _stacked(pictures: Sequence[Image.Image]) -> Image.Image:
+def _stacked(images: Sequence[Image.Image]) -> Image.Image:
     """Stack images vertically, all at the width of the widest; a single image is unchanged."""
-    if len(pictures) == 1:
-        return pictures[0]
-    width = max(picture.width for picture in pictures)
-    fitted = [_fitted(picture, width, max(1, round(picture.height * width / picture.width))) for picture in pictures]
-    whole = Image.new("RGB", (width, sum(picture.height for picture in fitted)), PAPER)
+    if len(images) == 1:
+        return images[0]
+    width = max(image.width for image in images)
+    fitted = [_fitted(image, width, max(1, round(image.height * width / image.width))) for image in images]
+    whole = Image.new("RGB", (width, sum(image.height for image in fitted)), PAPER)
     top = 0
-    for picture in fitted:
-        whole.paste(picture, (0, top))
-        top += picture.height
+    for image in fitted:
+        whole.paste(image, (0, top))
+        top += image.height
     return whole
 
 
-def _fitted(picture: Image.Image, width: int, height: int) -> Image.Image:
+def _fitted(image: Image.Image, width: int, height: int) -> Image.Image:
     """Resize an image to the largest size that fits a box, enlarging it if needed."""
-    factor = min(width / picture.width, height / picture.height)
-    size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
-    return picture.resize(size, Image.Resampling.LANCZOS)
+    factor = min(width / image.width, height / image.height)
+    size = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
+    return image.resize(size, Image.Resampling.LANCZOS)
 
 
 def _sheet(style: Image.Image, pairs: Sequence[tuple[Camera, list[Image.Image]]]) -> Image.Image:
     style = _fitted(style, _MAX_CELL_WIDTH, _CELL_HEIGHT)
     columns = [
-        (camera.name, [_fitted(picture, _MAX_CELL_WIDTH, _CELL_HEIGHT) for picture in pictures])
-        for camera, pictures in pairs
+        (camera.name, [_fitted(image, _MAX_CELL_WIDTH, _CELL_HEIGHT) for image in images]) for camera, images in pairs
     ]
-    heights = [max(pictures[row].height for _, pictures in columns) for row in (0, 1)]
-    widths = [style.width, *(pictures[0].width for _, pictures in columns)]
+    heights = [max(images[row].height for _, images in columns) for row in (0, 1)]
+    widths = [style.width, *(images[0].width for _, images in columns)]
     line = _LABEL + _GAP
     size = (sum(widths) + _GAP * (len(widths) + 1), max(sum(heights) + 2 * line, style.height + line) + _GAP)
     sheet = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(sheet)
-    _place(sheet, draw, style, _GAP, line, "style")
+    _draw(sheet, draw, style, _GAP, line, "style")
     left = _GAP + style.width + _GAP
-    for name, pictures in columns:
+    for name, images in columns:
         short = name if len(name) <= 24 else "…" + name[-23:]
-        _place(sheet, draw, pictures[0], left, line, f"{short}: original")
-        _place(sheet, draw, pictures[1], left, line + heights[0] + line, "stylized")
-        left += pictures[0].width + _GAP
+        _draw(sheet, draw, images[0], left, line, f"{short}: original")
+        _draw(sheet, draw, images[1], left, line + heights[0] + line, "stylized")
+        left += images[0].width + _GAP
     return sheet
 
 
-def _place(
-    sheet: Image.Image, draw: ImageDraw.ImageDraw, picture: Image.Image, left: int, top: int, label: str
-) -> None:
-    sheet.paste(picture, (left, top))
+def _draw(sheet: Image.Image, draw: ImageDraw.ImageDraw, image: Image.Image, left: int, top: int, label: str) -> None:
+    sheet.paste(image, (left, top))
     font = ImageFont.load_default(size=_LABEL - 4)
-    while label and draw.textlength(label, font) > picture.width:  # narrow portrait views
+    while label and draw.textlength(label, font) > image.width:  # narrow portrait views
         label = label[:-1]
     draw.text((left, top - _LABEL), label, INK, font)

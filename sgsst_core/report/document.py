@@ -150,8 +150,8 @@ def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
     if regions is not None and not regions.mapped and regions.every[regions.active[0]].style is not None:
         paths = tuple(map(Path, style.names))  # a single active region with its own style covers the whole scene
     return [
-        {"path": str(path), "width": picture.shape[1], "height": picture.shape[0], "weight": weight}
-        for path, picture, weight in zip(paths, style.images, style.weights, strict=True)
+        {"path": str(path), "width": image.shape[1], "height": image.shape[0], "weight": weight}
+        for path, image, weight in zip(paths, style.images, style.weights, strict=True)
     ]
 
 
@@ -165,14 +165,14 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
         {
             "name": region.name,
             "select": region.select or None,
-            "gaussians": int(regions.members(place).sum()),
-            "share": float(weights[regions.members(place)].sum() / weights.sum()),
+            "gaussians": int(regions.members(index).sum()),
+            "share": float(weights[regions.members(index)].sum() / weights.sum()),
             "style": region.style and region.style.text,
             "weight": region.weight,
             "freeze": region.freeze,
-            "stylized": place in regions.active,
+            "stylized": index in regions.active,
         }
-        for place, region in enumerate(regions.every)
+        for index, region in enumerate(regions.every)
     ]
 
 
@@ -259,10 +259,10 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float |
 def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
     """Return the number of measurements, their time, and its ratio to the time of the steps."""
     seconds, expected = stylizer.seconds_by_part.get("measuring", 0.0), stylizer.job.plan.prediction
-    share = stylizer.job.settings.measure
+    fraction = stylizer.job.settings.measure
     return {
-        "share": share,
-        "allowed": allowed_seconds(share, expected.job - expected.measuring) if expected else None,
+        "share": fraction,
+        "allowed": allowed_seconds(fraction, expected.job - expected.measuring) if expected else None,
         "seconds": round(seconds, 3),
         "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
         "loss_views": len(stylizer.job.evaluation_views),

@@ -171,8 +171,8 @@ def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
     x, values = x[shown], values[shown]
     if not len(x):
         return Thinned(x, values, values, values)
-    places = np.floor(np.log(x / x[0]) / width)
-    first = np.flatnonzero(np.diff(places, prepend=-1.0))
+    positions = np.floor(np.log(x / x[0]) / width)
+    first = np.flatnonzero(np.diff(positions, prepend=-1.0))
     count = np.diff(first, append=len(x))
 
     def mean(numbers: Floats) -> Floats:
@@ -186,7 +186,7 @@ def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
     """Return the geometric mean of the `window` values around each index, or of fewer values near the ends."""
     logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
     sums = np.concatenate([[0.0], np.cumsum(logs)])
-    places = np.arange(len(logs))
-    reach = np.minimum(np.minimum(places, places[::-1]), window // 2)
-    means: Floats = np.exp((sums[places + reach + 1] - sums[places - reach]) / (2 * reach + 1))
+    positions = np.arange(len(logs))
+    reach = np.minimum(np.minimum(positions, positions[::-1]), window // 2)
+    means: Floats = np.exp((sums[positions + reach + 1] - sums[positions - reach]) / (2 * reach + 1))
     return means

@@ -24,6 +24,6 @@ PAGE = {
 }
 
 
-def color_of(place: int) -> str:
+def color_of(index: int) -> str:
     """Return the color of the data series with the given index; colors repeat after the last one."""
-    return COLORS[place % len(COLORS)]
+    return COLORS[index % len(COLORS)]

@@ -19,9 +19,9 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:,.0f}" if 10**digits <= abs(value) < 1e9 else f"{value:,.{digits}g}"
 
 
-def percent(share: float | None, digits: int = 2) -> str:
+def percent(fraction: float | None, digits: int = 2) -> str:
     """Format a fraction in percent, with `digits` significant digits."""
-    return NOTHING if share is None else f"{number(100 * share, digits)}{_GAP}%"
+    return NOTHING if fraction is None else f"{number(100 * fraction, digits)}{_GAP}%"
 
 
 def duration(seconds: float | None) -> str:

@@ -178,10 +178,10 @@ def _add_regions(digest: Any, regions: Regions) -> None:
     """Add the grouping and treatment of Gaussians to a digest, without the names of the regions."""
     digest.update(regions.labels.contiguous().numpy().data)
     for region in regions.every:
-        pictures, weights = (region.style.images, region.style.weights) if region.style else ((), ())
+        images, weights = (region.style.images, region.style.weights) if region.style else ((), ())
         digest.update(repr((region.freeze, region.weight, weights)).encode())
-        for picture in pictures:
-            digest.update(repr(tuple(picture.shape)).encode() + picture.contiguous().numpy().tobytes())
+        for image in images:
+            digest.update(repr(tuple(image.shape)).encode() + image.contiguous().numpy().tobytes())
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, job: str) -> None:

@@ -48,9 +48,9 @@ def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
     Returns:
         [N, 3] float64.
     """
-    begun = colors.clamp(-_FARTHEST, _FARTHEST)
-    rounds = _rounds(begun[_drawn(weights)], wanted)
-    return _through(begun, rounds) if begun.is_cuda else _through_compiled(begun, rounds)
+    start = colors.clamp(-_FARTHEST, _FARTHEST)
+    rounds = _rounds(start[_drawn(weights)], wanted)
+    return _through(start, rounds) if start.is_cuda else _through_compiled(start, rounds)
 
 
 def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
@@ -77,8 +77,8 @@ def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]
     knots = torch.full((len(rounds), 3, _KNOTS), math.inf, dtype=torch.float64)
     targets = torch.empty_like(knots)
     for number, (_, maps) in enumerate(rounds):
-        for axis, (places, become) in enumerate(maps):
-            knots[number, axis, : len(places)] = places
+        for axis, (positions, become) in enumerate(maps):
+            knots[number, axis, : len(positions)] = positions
             targets[number, axis] = become[-1]
             targets[number, axis, : len(become)] = become
     axes = torch.stack([axes.contiguous() for axes, _ in rounds])
@@ -125,15 +125,15 @@ def _along(values: Tensor, wanted: Tensor) -> _Map:
 def _quantiles(values: Tensor) -> Tensor:
     """Return [_KNOTS] quantiles of values [n], from the minimum to the maximum."""
     ordered = values.sort().values
-    places = torch.linspace(0, len(ordered) - 1, _KNOTS, dtype=torch.float64, device=values.device)
-    return ordered[places.round().long()]
+    positions = torch.linspace(0, len(ordered) - 1, _KNOTS, dtype=torch.float64, device=values.device)
+    return ordered[positions.round().long()]
 
 
 def _mapped(values: Tensor, knots: Tensor, targets: Tensor) -> Tensor:
     """Map values [n] by a piecewise linear function that is constant beyond its ends."""
     if len(knots) == 1:
         return targets.expand(len(values))
-    place = torch.searchsorted(knots, values.contiguous()).clamp(1, len(knots) - 1)
-    low, high = knots[place - 1], knots[place]
-    share = ((values - low) / (high - low)).clamp(0, 1)
-    return torch.lerp(targets[place - 1], targets[place], share)
+    index = torch.searchsorted(knots, values.contiguous()).clamp(1, len(knots) - 1)
+    low, high = knots[index - 1], knots[index]
+    fraction = ((values - low) / (high - low)).clamp(0, 1)
+    return torch.lerp(targets[index - 1], targets[index], fraction)

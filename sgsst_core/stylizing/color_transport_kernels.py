@@ -15,21 +15,21 @@ _TOGETHER = 512
 
 
 @compiled()
-def _map(values, places, knots, targets, slopes):
+def _map(values, positions, knots, targets, slopes):
     """Map values [n] in place by a piecewise linear function with knots [k], constant beyond its ends."""
     # Each step of the binary search runs over all values before the next one starts. Which half a value is in is
     # unpredictable, so the code contains no branch on it.
     for i in range(len(values)):
         values[i] = max(values[i], knots[0])
-        places[i] = 0
+        positions[i] = 0
     half = len(knots) >> 1
     while half > 0:
         for i in range(len(values)):
-            places[i] += half * (knots[places[i] + half] <= values[i])
+            positions[i] += half * (knots[positions[i] + half] <= values[i])
         half >>= 1
     for i in range(len(values)):
-        place = places[i]
-        values[i] = targets[place] + slopes[place] * (values[i] - knots[place])
+        index = positions[i]
+        values[i] = targets[index] + slopes[index] * (values[i] - knots[index])
 
 
 @compiled(parallel=True)
@@ -47,14 +47,14 @@ def through(colors, axes, knots, targets):
     parts = (len(colors) + _TOGETHER - 1) // _TOGETHER
     for part in numba.prange(parts):
         some = colors[part * _TOGETHER : (part + 1) * _TOGETHER]
-        along, places = np.empty((3, len(some))), np.empty(len(some), dtype=np.int64)
+        along, positions = np.empty((3, len(some))), np.empty(len(some), dtype=np.int64)
         for r in range(len(axes)):
             turn = axes[r]
             for a in range(3):
                 values = along[a]
                 for i in range(len(some)):
                     values[i] = some[i, 0] * turn[0, a] + some[i, 1] * turn[1, a] + some[i, 2] * turn[2, a]
-                _map(values, places, knots[r, a], targets[r, a], slopes[r, a])
+                _map(values, positions, knots[r, a], targets[r, a], slopes[r, a])
             for i in range(len(some)):
                 for c in range(3):
                     some[i, c] = along[0, i] * turn[c, 0] + along[1, i] * turn[c, 1] + along[2, i] * turn[c, 2]

@@ -55,12 +55,12 @@ class JobStyles:
         """
         if regions is None:
             return JobStyles(prepared_style(style, settings, sh_dc, weights))
-        asked = [regions.every[place].style or style for place in regions.active]
+        asked = [regions.every[index].style or style for index in regions.active]
         if not regions.mapped:
             return JobStyles(prepared_style(asked[0], settings, sh_dc, weights), regions)
         each = [
-            prepared_style(own, settings, sh_dc, torch.where(regions.members(place), weights, 0.0))
-            for place, own in zip(regions.active, asked, strict=True)
+            prepared_style(own, settings, sh_dc, torch.where(regions.members(index), weights, 0.0))
+            for index, own in zip(regions.active, asked, strict=True)
         ]
         rest = each[regions.active.index(0)] if 0 in regions.active else prepared_style(style, settings, sh_dc, weights)
         return JobStyles(rest, regions, tuple(each))
@@ -108,8 +108,8 @@ class JobStyles:
             return transfer(sh_dc, weights, self.own)
         assert self.regions is not None
         result, labels = sh_dc.clone(), self.regions.labels[rows]
-        for place, style in zip(self.regions.active, self.each, strict=True):
-            own = labels == place
+        for index, style in zip(self.regions.active, self.each, strict=True):
+            own = labels == index
             if bool((weights[own] > 0).any()):
                 result[own] = transfer(sh_dc[own], weights[own], style)
         return result

@@ -46,17 +46,17 @@ def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style:
 
 def _drawn_picture(style: Style, number: float) -> Tensor:
     """Return the image of a mixture that a random number in [0, 1) selects, with probabilities equal to the weights."""
-    for picture, weight in zip(style.images, style.weights, strict=True):
+    for image, weight in zip(style.images, style.weights, strict=True):
         number -= weight
         if number < 0:
-            return picture
+            return image
     return style.images[-1]  # the sum of the weights may be rounded down
 
 
 def _uniform(*numbers: int) -> Color:
     """Return three pseudorandom numbers in [0, 1), identical for the same arguments on every machine."""
     digest = hashlib.blake2b(",".join(map(str, numbers)).encode(), digest_size=24).digest()
-    first, second, third = (int.from_bytes(digest[place : place + 8], "big") >> 64 - _BITS for place in (0, 8, 16))
+    first, second, third = (int.from_bytes(digest[index : index + 8], "big") >> 64 - _BITS for index in (0, 8, 16))
     return first / 2**_BITS, second / 2**_BITS, third / 2**_BITS
 
 

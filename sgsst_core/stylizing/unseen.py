@@ -35,23 +35,23 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
         return torch.zeros((0, 3))
     count = min(NEIGHBORS, int(seen.sum()))
     tree = cKDTree(means[seen].double().numpy())
-    weights, change, places = weights[seen], change[seen], means[~seen]
-    votes = torch.empty((len(places), 3))
-    for part in _near_each_other(places).split(_CHUNK):
-        _, nearest = tree.query(places[part].double().numpy(), k=count, workers=torch.get_num_threads())
+    weights, change, positions = weights[seen], change[seen], means[~seen]
+    votes = torch.empty((len(positions), 3))
+    for part in _near_each_other(positions).split(_CHUNK):
+        _, nearest = tree.query(positions[part].double().numpy(), k=count, workers=torch.get_num_threads())
         votes[part] = _votes(torch.as_tensor(nearest).reshape(-1, count), change, weights).float()
     return votes
 
 
-def _near_each_other(places: Tensor) -> Tensor:
+def _near_each_other(positions: Tensor) -> Tensor:
     """Return the indices [U] that sort points [U, 3] by the cells of a coarse grid.
 
     Consecutive neighbor searches then read the same part of the search tree.
     """
-    places = places.double()
-    lowest = places.amin(dim=0)
-    size = (places.amax(dim=0) - lowest).clamp_min(1e-300)
-    cells = ((places - lowest) / size * (_CELLS - 1)).long()
+    positions = positions.double()
+    lowest = positions.amin(dim=0)
+    size = (positions.amax(dim=0) - lowest).clamp_min(1e-300)
+    cells = ((positions - lowest) / size * (_CELLS - 1)).long()
     return torch.argsort((cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2], stable=True)
 
 
@@ -62,8 +62,8 @@ def _votes(nearest: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     """
     own = weights[nearest]
     # Relative to the largest weight, so that tiny weights do not underflow.
-    share = own / own.amax(dim=1, keepdim=True)
-    return (change[nearest].double() * share[:, :, None]).sum(dim=1) / share.sum(dim=1, keepdim=True)
+    fraction = own / own.amax(dim=1, keepdim=True)
+    return (change[nearest].double() * fraction[:, :, None]).sum(dim=1) / fraction.sum(dim=1, keepdim=True)
 
 
 def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:

@@ -21,6 +21,7 @@ from sgsst_core.loss.nearest import chosen_positions
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
 from sgsst_core.style import Style, mixed_moments
+from sgsst_core.stylizing.color_moments import color_moments, square_root, style_moments
 from sgsst_core.stylizing.color_transport import transported
 
 #: A direction counts as flat if the variance of the colors along it is less than this fraction of their largest
@@ -50,22 +51,22 @@ def warm_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
 def _some_pixels(style: Style) -> Tensor:
     """Return evenly spread pixels [n, 3] of a style, in proportion to the weights of its images."""
     parts = []
-    for picture, weight in zip(style.images, style.weights, strict=True):
-        pixels, count = picture.reshape(-1, 3), max(1, round(_PIXELS * weight))
-        places = chosen_positions(len(pixels), count)
-        if len(style.images) > 1 and len(places) < count:  # repeat the pixels of a small image
-            places = torch.arange(count) * len(pixels) // count
-        parts.append(pixels[places])
+    for image, weight in zip(style.images, style.weights, strict=True):
+        pixels, count = image.reshape(-1, 3), max(1, round(_PIXELS * weight))
+        positions = chosen_positions(len(pixels), count)
+        if len(style.images) > 1 and len(positions) < count:  # repeat the pixels of a small image
+            positions = torch.arange(count) * len(pixels) // count
+        parts.append(pixels[positions])
     return torch.cat(parts)
 
 
 def with_moments(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
     """Return DC coefficients with the style's mean and covariance, clipped to 0..1; arguments as in `warm_start`."""
-    colors = 0.5 + SH_C0 * sh_dc.double()
-    mean, covariance = _moments(colors, weights.double() / weights.double().amax())
-    wanted_mean, wanted = _style_moments(style)
+    colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
+    mean, covariance = color_moments(colors, weights.double() / weights.double().amax())
+    wanted_mean, wanted = style_moments(style)
     matched = (colors - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
-    return on_screen(((matched.clamp(0, 1) - 0.5) / SH_C0).to(sh_dc.dtype))
+    return on_screen(((matched.clamp(0, 1) - COLOR_OFFSET) / SH_C0).to(sh_dc.dtype))
 
 
 def in_colors_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
@@ -78,25 +79,16 @@ def in_colors_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
         sh_dc: [N, 3], see `warm_start`.
         weights: [N] float64, see `warm_start`.
     """
-    colors = (0.5 + SH_C0 * sh_dc.double()).clamp(0, 1)
-    wanted_mean, wanted = _moments(colors, weights.double() / weights.double().amax())
-    mean, covariance = _style_moments(style)
-    turned = _monge_map(covariance, wanted.to(mean)).T
+    colors = (COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)
+    wanted_mean, wanted = color_moments(colors, weights.double() / weights.double().amax())
+    mean, covariance = style_moments(style)
+    rotated = _monge_map(covariance, wanted.to(mean)).T
 
-    def match(picture: Tensor) -> Tensor:
-        matched = (picture.reshape(-1, 3).double() - mean) @ turned + wanted_mean.to(mean)
-        return matched.clamp(0, 1).to(picture.dtype).reshape(picture.shape)
+    def match(image: Tensor) -> Tensor:
+        matched = (image.reshape(-1, 3).double() - mean) @ rotated + wanted_mean.to(mean)
+        return matched.clamp(0, 1).to(image.dtype).reshape(image.shape)
 
     return style.map(match)
-
-
-def _style_moments(style: Style) -> tuple[Tensor, Tensor]:
-    """Return mean [3] and covariance [3, 3] of a style's pixels, float64."""
-    found = []
-    for picture in style.images:
-        pixels = picture.reshape(-1, 3).double()
-        found.append(_moments(pixels, torch.ones(len(pixels), dtype=torch.float64, device=pixels.device)))
-    return mixed_moments(found, style.weights)
 
 
 def luminance_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
@@ -125,16 +117,16 @@ def in_luminance_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
     wanted = _luminance_moments(luminance((COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)), weights.double())
     own = _style_luminance(style)
 
-    def match(picture: Tensor) -> Tensor:
-        matched = _matched(luminance(picture.double()), own, wanted)
-        return matched.to(picture.dtype)[..., None].expand(picture.shape).contiguous()
+    def match(image: Tensor) -> Tensor:
+        matched = _matched(luminance(image.double()), own, wanted)
+        return matched.to(image.dtype)[..., None].expand(image.shape).contiguous()
 
     return style.map(match)
 
 
 def _style_luminance(style: Style) -> tuple[Tensor, Tensor]:
     """Return mean and deviation of the luminance of a style's pixels."""
-    found = [luminance(picture.reshape(-1, 3).double()) for picture in style.images]
+    found = [luminance(image.reshape(-1, 3).double()) for image in style.images]
     parts = [_luminance_moments(values, torch.ones_like(values)) for values in found]
     if len(parts) == 1:
         return parts[0]
@@ -145,10 +137,10 @@ def _style_luminance(style: Style) -> tuple[Tensor, Tensor]:
 
 def _luminance_moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return weighted mean and deviation of values [n]."""
-    share = weights / weights.amax()
-    share = share / share.sum()
-    mean = (share * values).sum()
-    return mean, (share * (values - mean).square()).sum().sqrt()
+    fraction = weights / weights.amax()
+    fraction = fraction / fraction.sum()
+    mean = (fraction * values).sum()
+    return mean, (fraction * (values - mean).square()).sum().sqrt()
 
 
 def _matched(values: Tensor, own: tuple[Tensor, Tensor], wanted: tuple[Tensor, Tensor]) -> Tensor:
@@ -159,14 +151,6 @@ def _matched(values: Tensor, own: tuple[Tensor, Tensor], wanted: tuple[Tensor, T
     return ((values - mean) * factor + wanted_mean).clamp(0, 1)
 
 
-def _moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weighted mean [3] and covariance [3, 3] of colors [n, 3]."""
-    total = weights.sum()
-    mean = (weights[:, None] * colors).sum(dim=0) / total
-    centered = colors - mean
-    return mean, (weights[:, None] * centered).T @ centered / total
-
-
 def _monge_map(source: Tensor, target: Tensor) -> Tensor:
     """Return the symmetric A [3, 3] with A source A = target, in the directions in which the source varies."""
     values, vectors = torch.linalg.eigh(source)
@@ -175,12 +159,5 @@ def _monge_map(source: Tensor, target: Tensor) -> Tensor:
     inverse = torch.where(varies, 1 / torch.where(varies, roots, 1.0), 0.0)
     root = vectors * roots @ vectors.T
     inverse_root = vectors * inverse @ vectors.T
-    matrix: Tensor = inverse_root @ _square_root(root @ target @ root) @ inverse_root
+    matrix: Tensor = inverse_root @ square_root(root @ target @ root) @ inverse_root
     return matrix
-
-
-def _square_root(matrix: Tensor) -> Tensor:
-    """Return the square root of a symmetric matrix that is positive semidefinite up to rounding."""
-    values, vectors = torch.linalg.eigh(matrix)
-    root: Tensor = vectors * values.clamp_min(0).sqrt() @ vectors.T
-    return root

@@ -251,6 +251,12 @@ class DecisionsOf(FeatureNetwork):
         yield
         del self.other.forward
 
+    def beside(self, evaluate: Callable[[FeatureNetwork], SosResult]) -> tuple[SosResult, SosResult]:
+        """Return the results of a function by the other network, and by this one with the same decisions."""
+        with self.listening():
+            found = evaluate(self.other)
+        return found, evaluate(self)
+
     def rounding_of(self, layer: str) -> float:
         """Return the rounding error of the other network.
 
@@ -293,36 +299,39 @@ def compare_losses(
     style = resize_area(style, style_size((style.shape[0], style.shape[1]), (image.shape[0], image.shape[1])))
     single = FeatureNetwork(vgg16())
     double = DecisionsOf(vgg16(), single)
-    with double.listening():
-        found = _evaluate(single, image, style, content, content_weight, coverage)
-    expected = _evaluate(double, image, style, content, content_weight, coverage)
-    assert found.image_gradient is not None
-    assert expected.image_gradient is not None
+
+    def evaluated(network: FeatureNetwork) -> SosResult:
+        return evaluate(SosLoss(network, content_weight=content_weight), image, Style.of(style), content, coverage)
+
+    found, expected = double.beside(evaluated)
     loss = expected.loss
     if untiled:
         loss, _ = sos_reference(vgg16(), image, style, content, content_weight=content_weight, coverage=coverage)
     # The floor of 1 is far below any visible loss. It only prevents a division by zero for a perfect match.
-    error = abs(found.loss - loss) / max(abs(loss), 1.0)
-    if not bool(torch.isfinite(found.image_gradient).all()):
-        error = math.inf
-    norm = float(expected.image_gradient.norm())
-    off = float((found.image_gradient.double() - expected.image_gradient).norm())
-    error = max(error, off / max(norm, 1e-3))
+    error = max(abs(found.loss - loss) / max(abs(loss), 1.0), gradient_error(found, expected))
     return CaseResult(error, bound, f"loss {found.loss:.3g}, {double.flips} ReLU and pool decisions flipped")
 
 
-def _evaluate(
-    network: FeatureNetwork,
-    image: Tensor,
-    style: Tensor,
-    content: Tensor,
-    content_weight: float,
-    coverage: Tensor | None,
-) -> SosResult:
-    loss = SosLoss(network, content_weight=content_weight)
-    targets = loss.targets.of_style(Style.of(style.to(network.dtype)), (image.shape[0], image.shape[1]))
-    view = loss.targets.of_view(content.to(network.dtype), coverage)
-    return loss.evaluate(image.to(network.dtype), targets, view)
+def evaluate(loss: SosLoss, image: Tensor, style: Style, content: Tensor, coverage: Tensor | None) -> SosResult:
+    """Return loss and gradient of an image [H, W, 3], in the precision of the loss's network."""
+    dtype = loss.network.dtype
+    targets = loss.targets.of_style(style.map(lambda own: own.to(dtype)), (image.shape[0], image.shape[1]))
+    return loss.evaluate(image.to(dtype), targets, loss.targets.of_view(content.to(dtype), coverage))
+
+
+def gradient_error(found: SosResult, exact: SosResult) -> float:
+    """Return the relative error of a pixel gradient; infinity if the gradient is not finite."""
+    assert found.image_gradient is not None
+    assert exact.image_gradient is not None
+    if not bool(torch.isfinite(found.image_gradient).all()):
+        return math.inf
+    error = float((found.image_gradient.double() - exact.image_gradient).norm())
+    return error / max(float(exact.image_gradient.norm()), 1e-3)
+
+
+def flat(red: float, green: float, blue: float, height: int, width: int) -> Tensor:
+    """Return an image [height, width, 3] float32 of one color."""
+    return torch.tensor([red, green, blue], dtype=torch.float32).expand(height, width, 3).clone()
 
 
 def texture(height: int, width: int, seed: int = 0) -> Tensor:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from sgsst_core.bench.stability.case import Case, CaseResult, Group, ordinary, repeated
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import InvalidInputError
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
@@ -124,7 +125,7 @@ def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
     """Check a .splat file: positions and sizes are read exactly, all other values up to the rounding of a byte."""
     scene = make()
     sizes = scene.scales.exp().numpy().astype("<f4")
-    colors = (0.5 + 0.28209479177387814 * scene.sh_dc.double()).clamp(0, 1)
+    colors = (COLOR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp(0, 1)
     opacity = torch.sigmoid(scene.opacities.double())[:, None]
     quats = torch.nn.functional.normalize(scene.quats.double(), dim=1)
     rgba = (torch.cat([colors, opacity], 1) * 255).round().to(torch.uint8).numpy()
@@ -140,7 +141,7 @@ def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
             found = read_scene(path).scene
         except InvalidInputError as error:
             return CaseResult(math.inf, 0.0, f"was refused: {error}")
-    shown = 0.5 + 0.28209479177387814 * found.sh_dc.double()
+    shown = COLOR_OFFSET + SH_C0 * found.sh_dc.double()
     wrong = float((shown - colors).abs().max()) * 255
     wrong = max(wrong, float((torch.sigmoid(found.opacities.double())[:, None] - opacity).abs().max()) * 255)
     same = torch.equal(found.means, scene.means) and bool(

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from sgsst_core.bench.stability.case import (
     Case,
@@ -69,27 +68,23 @@ def _rendered(make: Callable[[], Scene], full: bool) -> CaseResult:
     return compare_rasterizers(among_ordinary(make()), camera())
 
 
-def _columns(scene: Scene, **columns: Tensor) -> Scene:
-    return replace(scene, **columns)
-
-
 def _quaternions() -> Scene:
     """Return Gaussians with quaternions of length 0 (never drawn), denormal, tiny and huge lengths."""
     lengths = torch.tensor([0.0, 1e-45, 1e-30, 1e-4, 1.0, 1e4, 1e19, 1.9e38])
-    return _columns(repeated(8), quats=torch.tensor([0.5, 0.5, -0.5, 0.7]) * lengths[:, None])
+    return replace(repeated(8), quats=torch.tensor([0.5, 0.5, -0.5, 0.7]) * lengths[:, None])
 
 
 def _scales() -> Scene:
     """Return Gaussians with scales of 0 (underflow in float64), 1e-20, 1e10, 1e30, or float64 overflow (not drawn)."""
     logarithms = torch.tensor([-3e38, -1000.0, math.log(1e-20), math.log(1e10), math.log(1e30), 300.0, 1e5, 3e38])
-    return _columns(repeated(8), scales=logarithms[:, None].expand(8, 3).clone(), opacities=torch.full((8,), -2.0))
+    return replace(repeated(8), scales=logarithms[:, None].expand(8, 3).clone(), opacities=torch.full((8,), -2.0))
 
 
 def _flat_or_thin() -> Scene:
     """Return discs and needles with zero extent along their short axes."""
     none, some = -200.0, -1.0
     axes = [[none, some, some], [some, none, some], [some, some, none], [none, none, some], [some, none, none]]
-    return _columns(ordinary(5, seed=3), scales=torch.tensor(axes))
+    return replace(ordinary(5, seed=3), scales=torch.tensor(axes))
 
 
 def _opacities_at_the_cut() -> Scene:
@@ -101,26 +96,26 @@ def _opacities_at_the_cut() -> Scene:
     values = [np.nextafter(cut, np.float32(-9)), cut, np.nextafter(cut, np.float32(9)), cut + np.float32(1e-3)]
     # Centered on a pixel of `camera()`, whose principal point is (19.8, 13.8): x = 4 (20.5 - 19.8) / 30.
     scene = repeated(4, mean=(4 * 0.7 / 30, 4 * 0.7 / 33, 4.0))
-    return _columns(scene, opacities=torch.tensor(np.array(values)))
+    return replace(scene, opacities=torch.tensor(np.array(values)))
 
 
 def _logits() -> Scene:
     """Return Gaussians with opacities of almost or exactly 0 and 1, up to the largest float32 logits."""
-    return _columns(ordinary(8, seed=4), opacities=torch.tensor([-3e38, -1e4, -100.0, -17.0, 17.0, 100.0, 1e4, 3e38]))
+    return replace(ordinary(8, seed=4), opacities=torch.tensor([-3e38, -1e4, -100.0, -17.0, 17.0, 100.0, 1e4, 3e38]))
 
 
 def _depths() -> Scene:
     """Return Gaussians at, near and behind the camera's plane, none of them beyond the near plane."""
     scene = repeated(7, scale=0.5)
     depths = torch.tensor([0.0, -0.0, 1e-38, -1e-38, 1e-6, -1e-6, -4.0])
-    return _columns(scene, means=torch.stack([torch.zeros(7), torch.zeros(7), depths], dim=1))
+    return replace(scene, means=torch.stack([torch.zeros(7), torch.zeros(7), depths], dim=1))
 
 
 def _off_screen() -> Scene:
     """Return Gaussians centered up to a million pixels outside the view, whose footprints reach into it."""
     means = torch.tensor([[-20.0, 0, 4], [20, 1, 4], [0, -15, 4], [0, 1e3, 4], [-1.3e5, 0, 4]])
     sizes = torch.tensor([6.0, 6.0, 5.0, 400.0, 5e4]).log()
-    return _columns(repeated(5, logit=-1.0), means=means, scales=sizes[:, None].expand(5, 3).clone())
+    return replace(repeated(5, logit=-1.0), means=means, scales=sizes[:, None].expand(5, 3).clone())
 
 
 def _stacked(count: int, logit: float) -> Scene:
@@ -131,7 +126,7 @@ def _stacked(count: int, logit: float) -> Scene:
 def _sub_pixel() -> Scene:
     """Return thousands of Gaussians much smaller than a pixel."""
     scene = ordinary(3000, seed=7)
-    return _columns(scene, scales=torch.full((3000, 3), math.log(1e-6)))
+    return replace(scene, scales=torch.full((3000, 3), math.log(1e-6)))
 
 
 def _grazing() -> Scene:
@@ -141,7 +136,7 @@ def _grazing() -> Scene:
     """
     scene = ordinary(60, seed=8)
     depths = torch.full((60,), NEAR * 1.001)
-    return _columns(scene, means=torch.stack([scene.means[:, 0] * 5, scene.means[:, 1] * 5, depths], dim=1))
+    return replace(scene, means=torch.stack([scene.means[:, 0] * 5, scene.means[:, 1] * 5, depths], dim=1))
 
 
 _SCENES: dict[str, Callable[[], Scene]] = {

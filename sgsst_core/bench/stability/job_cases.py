@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.bench.stability.case import Case, CaseResult, repeated, texture, vgg16
+from sgsst_core.bench.stability.case import Case, CaseResult, flat, repeated, texture, vgg16
 from sgsst_core.bench.stability.situations import (
     Situation,
     colored,
@@ -56,7 +56,7 @@ def _refused(situation: Callable[[], Situation], full: bool) -> CaseResult:
 
 
 def _flat(red: float, green: float, blue: float, height: int = 12, width: int = 16) -> Tensor:
-    return torch.tensor([red, green, blue], dtype=torch.float32).expand(height, width, 3).clone()
+    return flat(red, green, blue, height, width)
 
 
 def _gray(scene: Scene) -> Scene:

@@ -15,8 +15,6 @@ from torch import Tensor
 from sgsst_core.bench.stability.case import Case, CaseResult, compare_losses, texture, vgg16
 from sgsst_core.constants import ALPHA_MIN, COLOR_OFFSET, SH_C0, TRANSMITTANCE_MIN
 from sgsst_core.errors import DivergedError
-from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
@@ -45,13 +43,6 @@ def cases() -> list[Case]:
         ("stopped and resumed in the middle", "values against an uninterrupted run", _resumed),
     ]
     return [Case(name, "stiff optimization", measure, measured) for name, measure, measured in found]
-
-
-class _OnShallowLayers(Stylizer):
-    """Stylizer on the first two style layers, whose fast steps test the optimizer rather than the network."""
-
-    def _network(self, weights: BackboneWeights) -> FeatureNetwork:
-        return FeatureNetwork(weights, STYLE_LAYERS[:2])
 
 
 def _camera() -> Camera:
@@ -83,18 +74,17 @@ def _walls(*walls: tuple[float, int]) -> Scene:
     )
 
 
-def _stylizer(scene: Scene, steps: int, *, shallow: bool = True, **values: Any) -> Stylizer:
-    values |= {"content_weight": 0} if shallow else {}
+def _stylizer(scene: Scene, steps: int, *, content: bool = False, **values: Any) -> Stylizer:
+    values |= {} if content else {"content_weight": 0}
     settings = make_settings(steps_coarse=0, steps_sos=steps, memory_limit=1 << 30, **values)
-    kind = _OnShallowLayers if shallow else Stylizer
-    return kind.planned(scene, [_camera()], _style(), settings, weights=vgg16())
+    return Stylizer.planned(scene, [_camera()], _style(), settings, weights=vgg16())
 
 
 def _style() -> Tensor:
     return texture(48, 40, 9)
 
 
-def _last_picture(stylizer: Stylizer) -> Tensor:
+def _last_image(stylizer: Stylizer) -> Tensor:
     return stylizer.job.views.render(0, stylizer.job.views.colors(0, stylizer.sh_dc.detach()))
 
 
@@ -102,7 +92,7 @@ def _at_the_end(stylizer: Stylizer, note: str) -> CaseResult:
     if not bool(torch.isfinite(stylizer.sh_dc).all()):
         return CaseResult(math.inf, 0.0, "colors are not finite")
     content = stylizer.job.view_targets.content(0)
-    result = compare_losses(_last_picture(stylizer), _style(), content)
+    result = compare_losses(_last_image(stylizer), _style(), content)
     return CaseResult(result.error, result.bound, note)
 
 
@@ -150,9 +140,7 @@ def _adam(full: bool) -> CaseResult:
 
 
 def _large_steps(full: bool) -> CaseResult:
-    stylizer = _stylizer(
-        _walls((2.0, 5)), 1000 if full else 100, learning_rate=5.0, learning_rate_end=1.0, content_weight=0
-    )
+    stylizer = _stylizer(_walls((2.0, 5)), 1000 if full else 100, learning_rate=5.0, learning_rate_end=1.0)
     run(stylizer)
     colors = COLOR_OFFSET + SH_C0 * stylizer.sh_dc.detach()
     stuck = float((colors <= 0).float().mean())
@@ -169,16 +157,16 @@ def _unbalanced(weight: float, full: bool) -> CaseResult:
 
 
 def _far_colors(full: bool) -> CaseResult:
-    stylizer = _stylizer(_walls((2.0, 5)), 4, shallow=False)
+    stylizer = _stylizer(_walls((2.0, 5)), 4, content=True)
     with torch.no_grad():
         stylizer.sh_dc.mul_(1e3 / SH_C0)
     run(stylizer)
-    return _at_the_end(stylizer, f"colors up to {float(_last_picture(stylizer).max()):.0f}")
+    return _at_the_end(stylizer, f"colors up to {float(_last_image(stylizer).max()):.0f}")
 
 
 def _diverged(full: bool) -> CaseResult:
     """Check that divergence raises an error, and leaves the colors unchanged instead of NaN."""
-    stylizer = _stylizer(_walls((2.0, 5)), 3, shallow=False)
+    stylizer = _stylizer(_walls((2.0, 5)), 3, content=True)
     with torch.no_grad():
         stylizer.sh_dc.copy_(stylizer.sh_dc.abs() * 1e8)
     before = stylizer.sh_dc.detach().clone()
@@ -207,7 +195,7 @@ def _many_steps(full: bool) -> CaseResult:
 
 
 def _resumed(full: bool) -> CaseResult:
-    whole, first, second = (_stylizer(_walls((2.0, 5)), 8, shallow=False) for _ in range(3))
+    whole, first, second = (_stylizer(_walls((2.0, 5)), 8, content=True) for _ in range(3))
     run(whole)
     for _ in range(3):
         first.run_step()

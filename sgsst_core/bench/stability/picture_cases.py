@@ -9,8 +9,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from sgsst_core.bench.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, texture
+from sgsst_core.bench.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, flat, texture, vgg16
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
+from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.sos_reference import style_loss_reference
 from sgsst_core.loss.statistics_terms import style_loss
 from sgsst_core.loss.targets import LayerTarget
@@ -49,8 +51,7 @@ def cases() -> list[Case]:
     ]
 
 
-def _constant(red: float, green: float, blue: float, height: int = _HEIGHT, width: int = _WIDTH) -> Tensor:
-    return torch.tensor([red, green, blue]).expand(height, width, 3).clone()
+_constant = partial(flat, height=_HEIGHT, width=_WIDTH)
 
 
 def _checkerboard() -> Tensor:
@@ -99,10 +100,6 @@ def _small_style(side: int, full: bool) -> CaseResult:
 
 def _long_style(full: bool) -> CaseResult:
     """Check the targets of a style image 200 times as long as wide, scaled to the view's shorter side."""
-    from sgsst_core.bench.stability.case import vgg16
-    from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
-    from sgsst_core.loss.sos import SosLoss
-
     size = (50, 60) if full else (16, 20)
     style = texture(10000, 50, 5)
     single, double = (

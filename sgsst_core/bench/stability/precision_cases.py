@@ -163,7 +163,7 @@ def _statistics_of_tiles(full: bool) -> CaseResult:
     features, target = _features()
     parts = {
         f"{tiles} tile{'s' * (tiles > 1)}": [
-            layer_statistics(features[place]) for place in _split(features.shape[0], features.shape[1], tiles)
+            layer_statistics(features[index]) for index in _split(features.shape[0], features.shape[1], tiles)
         ]
         for tiles in (1, 2, 7, 64)
     }
@@ -172,7 +172,7 @@ def _statistics_of_tiles(full: bool) -> CaseResult:
 
 def _order_of_tiles(full: bool) -> CaseResult:
     features, target = _features()
-    parts = [layer_statistics(features[place]) for place in _split(features.shape[0], features.shape[1], 64)]
+    parts = [layer_statistics(features[index]) for index in _split(features.shape[0], features.shape[1], 64)]
     shuffled = [parts[i] for i in torch.randperm(64, generator=torch.Generator().manual_seed(0)).tolist()]
     return _agreement(features, {"as they come": parts, "backwards": parts[::-1], "shuffled": shuffled}, target)
 

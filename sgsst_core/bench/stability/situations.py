@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.bench.stability.case import CaseResult, DecisionsOf, camera, ordinary
+from sgsst_core.bench.stability.case import CaseResult, DecisionsOf, camera, evaluate, gradient_error, ordinary
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
@@ -27,7 +27,6 @@ from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
-from sgsst_core.style import Style
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.optimizer import constrained
@@ -144,13 +143,13 @@ def strain(situation: Situation) -> CaseResult:
         SgsstError: If the situation is refused.
     """
     jobs = [make(situation) for _ in range(2)]
-    begun = jobs[0].sh_dc.detach().clone()
+    start = jobs[0].sh_dc.detach().clone()
     before = mean_loss(jobs[0].evaluate(jobs[0].job.evaluation_views), jobs[0].job.loss.weights)
     for job in jobs:
         run(job)
     job = jobs[0]
     after = mean_loss(job.evaluate(job.job.evaluation_views), job.job.loss.weights)
-    colors, moved = job.stylized(), _moved(job, begun)
+    colors, moved = job.stylized(), _moved(job, start)
     judged = job.job.plan.training_background == "background"  # other backgrounds change the loss of the steps
     most = job.job.total_steps * job.job.settings.learning_rate * LONGEST_STEP
     broken = [
@@ -159,7 +158,7 @@ def strain(situation: Situation) -> CaseResult:
             "colors are not finite": bool(torch.isfinite(colors).all()) and math.isfinite(moved),
             "the loss is not finite": math.isfinite(before) and math.isfinite(after),
             f"colors moved by {moved:.3g} in {job.job.total_steps} steps": moved
-            <= most + 1e-5 * float(begun.abs().max()),
+            <= most + 1e-5 * float(start.abs().max()),
             "another run has other bits": torch.equal(colors, jobs[1].stylized()),
             f"the loss rose from {before:.6g} to {after:.6g}": not (situation.falls and judged)
             or after <= max((1 + RISE) * before, NO_LOSS),
@@ -171,12 +170,12 @@ def strain(situation: Situation) -> CaseResult:
     return CaseResult(math.inf if broken else error, bound, note)
 
 
-def _moved(job: Stylizer, begun: Tensor) -> float:
+def _moved(job: Stylizer, start: Tensor) -> float:
     """Return the largest change of a coefficient, ignoring the clamping of initial colors to their bounds."""
     found = job.sh_dc.detach()
-    chroma_of = begun if job.job.settings.preserve_colors == "luminance" else None
-    within = constrained(begun, chroma_of, bounded=job.job.settings.bounded)
-    return float(torch.minimum((found - begun).abs(), (found - within).abs()).max())
+    chroma_of = start if job.job.settings.preserve_colors == "luminance" else None
+    within = constrained(start, chroma_of, bounded=job.job.settings.bounded)
+    return float(torch.minimum((found - start).abs(), (found - within).abs()).max())
 
 
 def reference_error(job: Stylizer) -> tuple[float, float, int]:
@@ -193,25 +192,23 @@ def reference_error(job: Stylizer) -> tuple[float, float, int]:
         Relative error, allowed error, and number of flipped ReLU and pool decisions.
     """
     index = job.job.views.covered[0]
-    picture = job.job.views.render(index, job.job.views.colors(index, job.sh_dc.detach()))
+    image = job.job.views.render(index, job.job.views.colors(index, job.sh_dc.detach()))
     content = job.job.view_targets.content(index)
     coverage = job.job.view_targets.coverage(index)[0] if job.job.view_targets.weighted else None
     double = DecisionsOf(job.job.weights, job.job.network)
-    given, weight = (picture, content, coverage), job.job.settings.content_weight
+    given, weight = (image, content, coverage), job.job.settings.content_weight
     found, exact = _evaluate_both(job, double, *given, weight)
     uncertain = _rounding_of_content(job, exact, content)
     if uncertain > _MOST_UNCERTAIN and _content_is_rounding(job, found, exact, content):
         uncertain, weight = 0.0, 0.0
         found, exact = _evaluate_both(job, double, *given, weight)
-    assert found.image_gradient is not None
-    assert exact.image_gradient is not None
-    if not bool(torch.isfinite(found.image_gradient).all()):
+    gradient = gradient_error(found, exact)
+    if not math.isfinite(gradient):
         return math.inf, REFERENCE_BOUND, double.flips
     rounding = nearest_weight(job.job.loss.style_loss, job.job.loss.network.unit) * _ROUNDING_OF_COSINES
     error = max(abs(found.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
     if job.job.loss.style_loss == "sos":
-        off = float((found.image_gradient.double() - exact.image_gradient).norm())
-        error = max(error, off / max(float(exact.image_gradient.norm()), 1e-3))
+        error = max(error, gradient)
         uncertain = max(uncertain, _rounding_of_features(job, exact, given, weight))
     return error, max(REFERENCE_BOUND, min(uncertain, _MOST_UNCERTAIN)), double.flips
 
@@ -226,10 +223,7 @@ def _rounding_of_features(
     """
     rounded = _Rounded(job.job.weights, job.job.network)
     _, found = _evaluate_both(job, rounded, *given, content_weight)
-    assert found.image_gradient is not None
-    assert exact.image_gradient is not None
-    off = float((found.image_gradient - exact.image_gradient).norm())
-    return _SAFETY * off / max(float(exact.image_gradient.norm()), 1e-3)
+    return _SAFETY * gradient_error(found, exact)
 
 
 class _Rounded(DecisionsOf):
@@ -277,35 +271,23 @@ def _content_is_rounding(job: Stylizer, found: SosResult, exact: SosResult, cont
 def _evaluate_both(
     job: Stylizer,
     double: DecisionsOf,
-    picture: Tensor,
+    image: Tensor,
     content: Tensor,
     coverage: Tensor | None,
     content_weight: float,
 ) -> tuple[SosResult, SosResult]:
     """Return the loss of an image by the job's network, and in float64 with the same ReLU and pool decisions."""
-    with double.listening():
-        found = _evaluate(job, job.job.network, picture, content, coverage, content_weight)
-    return found, _evaluate(job, double, picture, content, coverage, content_weight)
-
-
-def _evaluate(
-    job: Stylizer,
-    network: FeatureNetwork,
-    picture: Tensor,
-    content: Tensor,
-    coverage: Tensor | None,
-    content_weight: float,
-) -> SosResult:
-    """Return the job's loss of an image by a given network."""
     settings = job.job.settings
-    loss = SosLoss(
-        network,
-        content_weight=content_weight,
-        style_loss=settings.style_loss,
-        coarsest=settings.coarsest_side,
-        style_scale=settings.style_scale,
-        scales=job.job.loss.weights,
-    )
-    style = job.job.style.map(lambda own: own.to(network.dtype))
-    targets = loss.targets.of_style(Style.of(style), (picture.shape[0], picture.shape[1]))
-    return loss.evaluate(picture.to(network.dtype), targets, loss.targets.of_view(content.to(network.dtype), coverage))
+
+    def evaluated(network: FeatureNetwork) -> SosResult:
+        loss = SosLoss(
+            network,
+            content_weight=content_weight,
+            style_loss=settings.style_loss,
+            coarsest=settings.coarsest_side,
+            style_scale=settings.style_scale,
+            scales=job.job.loss.weights,
+        )
+        return evaluate(loss, image, job.job.style, content, coverage)
+
+    return double.beside(evaluated)

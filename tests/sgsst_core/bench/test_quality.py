@@ -68,7 +68,7 @@ def test_pictures_are_written(quality: Quality, tmp_path: Path) -> None:
     assert Image.open(tmp_path / "q.png").width > 600
     sheet = Image.open(tmp_path / "q.jpg")
     assert sheet.height > 4 * 300  # style and four rows
-    on_white = quality.judge.pictures(torch.zeros_like(wall().sh_dc), quality.judge.cameras[0])[1]
+    on_white = quality.judge.renders(torch.zeros_like(wall().sh_dc), quality.judge.cameras[0])[1]
     assert on_white.shape == (72, 96, 3)
 
 
