@@ -41,8 +41,6 @@ _BAND_PIXELS = 1 << 20
 #: Number of Gaussians whose depths are computed at a time.
 _GAUSSIANS = 1 << 18
 
-ImageSource = Callable[[int], Tensor]
-
 
 @dataclass(frozen=True)
 class PairConsistency:
@@ -100,44 +98,26 @@ class DepthMap:
 
 
 def consistency(
-    images: ImageSource,
-    cameras: Sequence[Camera],
-    rasterizer: Rasterizer,
-    scene: Scene,
     gap: int,
+    pairs: Sequence[tuple[int, int]],
+    image: Callable[[int], Tensor],
+    warp: Callable[[int, int], Warp],
     lpips: Lpips | None = None,
-    *,
-    at_most: int | None = None,
 ) -> Consistency:
-    """Compute the consistency of a scene's images over all pairs of views (i, i + gap).
+    """Compute the consistency of pairs of views.
 
     Args:
-        images: Function that returns the image [H, W, 3] of a view, given its index. Images are clamped to 0 to 1, as
-            on screen.
-        cameras: Camera of each view; cameras adjacent in the list are close in space.
-        rasterizer: Rasterizer of the scene's geometry.
-        scene: Scene whose geometry determines where views overlap.
-        gap: Index difference of two compared views: `SHORT_RANGE`, `LONG_RANGE` or any other, at least 1.
+        gap: Index difference of the views of a pair.
+        pairs: Indices of the views of each pair.
+        image: Function that returns the image [H, W, 3] of a view as a screen shows it (`shown`).
+        warp: Function that returns the warp of a pair's second view into the first one.
         lpips: LPIPS network; None skips LPIPS.
-        at_most: Maximum number of pairs, evenly spread over the list; None compares all.
-
-    Returns:
-        One entry per pair; no entries if there are at most `gap` views.
-
-    Raises:
-        SettingsError: If `gap` or `at_most` is below 1.
-        ValueError: If an image does not have its camera's size, or contains NaN or infinity.
     """
-    views: dict[int, tuple[Tensor, DepthMap]] = {}
     results = []
-    # Pairs are visited chain by chain (0, gap, 2 gap, ..., then 1, 1 + gap, ...). Each pair shares a view with the
-    # previous pair, so every view is rendered once and only two views are in memory, regardless of the gap.
-    for i, j in sorted(view_pairs(len(cameras), gap, at_most), key=lambda pair: (pair[0] % gap, pair[0])):
-        views = {k: views.get(k) or _image_and_depth(images(k), cameras[k], rasterizer, scene) for k in (i, j)}
-        (image, depth), (other, other_depth) = views[i], views[j]
-        warped, valid = warp(other, other_depth, cameras[j], depth, cameras[i])
-        results.append(compare(i, j, image, warped, valid, lpips))
-    return Consistency(gap, sorted(results, key=lambda pair: pair.first))
+    for first, second in pairs:
+        warped, valid = warp(first, second).apply(image(second))
+        results.append(compare(first, second, image(first), warped, valid, lpips))
+    return Consistency(gap, results)
 
 
 def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[int, int]]:
@@ -266,23 +246,6 @@ def find_warp(
     return Warp((camera.height, camera.width), torch.cat(pixels), torch.cat(sources, dim=1), torch.cat(weights, dim=1))
 
 
-def warp(
-    image: Tensor,  # [H', W', 3] of the other view
-    other_depth: DepthMap,
-    other: Camera,
-    depth: DepthMap,
-    camera: Camera,
-    *,
-    tolerance: float = DEPTH_TOLERANCE,
-) -> tuple[Tensor, Tensor]:
-    """Warp another view's image into the view of `camera`; see `find_warp`.
-
-    Returns the warped image [H, W, 3] in the dtype of `image`, which is 0 at invalid pixels, and the mask [H, W] bool
-    of valid pixels.
-    """
-    return find_warp(other_depth, other, depth, camera, tolerance=tolerance).apply(image)
-
-
 def _around(
     depth: DepthMap,
     x: Tensor,  # [P] float64, pixels, in 0..W
@@ -344,11 +307,6 @@ def compare(
         distances = lpips.distance(image, filled).map
         distance = float(distances[valid.to(distances.device)].mean(dtype=torch.float64))
     return PairConsistency(first, second, compared, rmse, distance)
-
-
-def _image_and_depth(image: Tensor, camera: Camera, rasterizer: Rasterizer, scene: Scene) -> tuple[Tensor, DepthMap]:
-    """Return the image and the depth map of a view."""
-    return shown(image, camera, rasterizer.device), expected_depth(scene, camera, rasterizer)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

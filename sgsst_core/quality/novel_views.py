@@ -23,7 +23,7 @@ from sgsst_core.quality.consistency import (
     SHORT_RANGE,
     Consistency,
     Warp,
-    compare,
+    consistency,
     expected_depth,
     find_warp,
     shown,
@@ -184,11 +184,10 @@ class NovelViews:
     def _consistency(self, gap: int, image: Callable[[int], Tensor]) -> Consistency | None:
         if not self.pairs[gap]:
             return None
-        results = []
-        for i, j in self.pairs[gap]:
-            warped, valid = self._warps.get((i, j), partial(self._warp, i, j)).apply(image(j))
-            results.append(compare(i, j, image(i), warped, valid, self.lpips))
-        return Consistency(gap, results)
+        return consistency(gap, self.pairs[gap], image, self._cached_warp, self.lpips)
+
+    def _cached_warp(self, first: int, second: int) -> Warp:
+        return self._warps.get((first, second), partial(self._warp, first, second))
 
     def _warp(self, i: int, j: int) -> Warp:
         """Compute the warp of view j into view i."""

@@ -25,7 +25,7 @@ from sgsst_core.report.history import (
     history_of,
     joined,
     log_limits,
-    moment_places,
+    moment_positions,
     novel_view_moments,
     thinned,
 )
@@ -74,7 +74,7 @@ def draw_loss(figure: Figure, against: Against, history: History, moments: Seque
         lines.append(("mean", history.mean_relative, INK))
     for label, values, color in lines:
         draw_line(axes, history, against, values, color, label)
-    x, gram = moment_places(moments, against), column([moment.get("gram_relative") for moment in moments])
+    x, gram = moment_positions(moments, against), column([moment.get("gram_relative") for moment in moments])
     shown = drawable(x) & drawable(gram)
     label = "Gram distance, novel views"
     draw_points(axes, x[shown], gram[shown], marker="D", linestyle="", color=INK, markerfacecolor="none", label=label)
@@ -109,7 +109,7 @@ def scale_name(scale: int) -> str:
 def draw_line(axes: Axes, history: History, against: Against, values: Floats, color: str, label: str) -> None:
     """Draw the running mean of values [steps] over one round of views, phase by phase, with their range shaded."""
     for _, part in history.phases:
-        line = thinned(history.x[against][part], values[part], history.round_length, history.place_width(against))
+        line = thinned(history.x[against][part], values[part], history.round_length, history.bin_width(against))
         if not len(line.x):
             continue
         axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.18, linewidth=0.7)

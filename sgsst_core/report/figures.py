@@ -30,10 +30,11 @@ from sgsst_core.report.history import (
     Against,
     History,
     column,
+    consistency_at,
     drawable,
     history_of,
     log_limits,
-    moment_places,
+    moment_positions,
     novel_view_moments,
     thinned,
 )
@@ -108,7 +109,7 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
 
 
 def _consistency(moments: Sequence[dict[str, Any]], reach: str, metric: str) -> list[float | None]:
-    found = [((moment.get("consistency") or {}).get(reach) or {}).get(metric) for moment in moments]
+    found = [consistency_at(moment, reach).get(metric) for moment in moments]
     return [value if value is None or math.isfinite(value) else None for value in found]
 
 
@@ -161,7 +162,7 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
 
 def _draw_consistency(figure: Figure, against: Against, history: History, moments: Sequence[dict[str, Any]]) -> None:
     metrics = [metric for metric in _METRICS if any(_known(_consistency(moments, reach, metric)) for reach in _REACHES)]
-    x = moment_places(moments, against)
+    x = moment_positions(moments, against)
     panels = figure.subplots(1, len(metrics), squeeze=False)[0]
     for axes, metric in zip(panels, metrics, strict=True):
         for reach, color in _REACHES.items():
@@ -198,7 +199,7 @@ def _draw_memory(figure: Figure, against: Against, history: History, predicted: 
         shown.append((history.device_memory, predicted.get("device_bytes"), " on the GPU", color_of(1), color_of(1)))
     for memory, peak, where, color, dashed in shown:
         # Memory is not averaged over a round: what matters is the maximum in each bin.
-        line = thinned(history.x[against], memory / 1e9, 1, history.place_width(against))
+        line = thinned(history.x[against], memory / 1e9, 1, history.bin_width(against))
         marker = "o" if len(line.x) == 1 else None
         axes.plot(line.x, line.high, color=color, marker=marker, label=f"measured{where}")
         if peak is not None and math.isfinite(peak):
@@ -212,6 +213,6 @@ def _draw_memory(figure: Figure, against: Against, history: History, predicted: 
 
 
 def _reach_name(moments: Sequence[dict[str, Any]], reach: str) -> str:
-    gaps = [((moment.get("consistency") or {}).get(reach) or {}).get("gap") for moment in moments]
+    gaps = [consistency_at(moment, reach).get("gap") for moment in moments]
     gap = next((gap for gap in gaps if gap is not None), None)
     return f"{reach} range" if gap is None else f"{reach} range ({gap} view{'s' if gap > 1 else ''} apart)"

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 Against = Literal["seconds", "steps"]
 AGAINST: tuple[Against, ...] = ("seconds", "steps")
 #: Number of bins of an x axis, each narrower than a typographic point. Steps in the same bin are drawn as one point.
-PLACES = 300
+BINS = 300
 #: Range of values on logarithmic axes. matplotlib searches for ticks some decades beyond it, which must fit float64
 #: too.
 _LEAST, _MOST = 1e-200, 1e200
@@ -67,10 +67,10 @@ class History:
     device_memory: Floats
     round_length: int
 
-    def place_width(self, against: Against) -> float:
+    def bin_width(self, against: Against) -> float:
         """Return the width of an axis's bins, as a difference of natural logarithms."""
         low, high = self.limits[against]
-        return (math.log(high) - math.log(low)) / PLACES
+        return (math.log(high) - math.log(low)) / BINS
 
 
 def history_of(report: dict[str, Any]) -> History:
@@ -89,7 +89,8 @@ def history_of(report: dict[str, Any]) -> History:
     return History(
         x=x,
         limits={
-            against: log_limits(np.append(x[against], moment_places(moments, against)), X_MARGIN) for against in AGAINST
+            against: log_limits(np.append(x[against], moment_positions(moments, against)), X_MARGIN)
+            for against in AGAINST
         },
         phases=_phases([record["stage"] for record in records]),
         terms={scale: {term: _of_scale(records, scale, term) for term in terms} for scale in scales},
@@ -116,7 +117,12 @@ def novel_view_moments(report: dict[str, Any]) -> list[dict[str, Any]]:
     return (report.get("novel_views") or {}).get("moments") or []
 
 
-def moment_places(moments: Sequence[dict[str, Any]], against: Against) -> Floats:
+def consistency_at(moment: dict[str, Any], reach: str) -> dict[str, Any]:
+    """Return a moment's consistency at a range, "short" or "long"; empty if it has none."""
+    return (moment.get("consistency") or {}).get(reach) or {}
+
+
+def moment_positions(moments: Sequence[dict[str, Any]], against: Against) -> Floats:
     """Return the x positions [n] of measurements."""
     return column([moment.get("seconds" if against == "seconds" else "step") for moment in moments])
 

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.report.figures import draw_figures
-from sgsst_core.report.history import AGAINST, PLACES
+from sgsst_core.report.history import AGAINST, BINS
 from sgsst_core.report.palette import ON_DARK, PAGE
 from sgsst_core.report.tables import (
     approximation_table,
@@ -31,7 +31,7 @@ from sgsst_core.stylizing.state import BEFORE_STEPS
 #: Maximum number of list members shown in the collapsed section, followed by their total number.
 _LIST = 40
 #: Fields of a report that have a section of their own on the page.
-_PLACED = ("history", "novel_views", "approximations", "bought", "findings", "plan", "seconds_by_part")
+_SECTIONS = ("history", "novel_views", "approximations", "bought", "findings", "plan", "seconds_by_part")
 _STOPPED = {
     "finished": "all planned steps are done",
     "max-seconds": "stopped at the time limit",
@@ -89,7 +89,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         colors=PAGE,
         on_dark=ON_DARK,
         against=AGAINST,
-        places=PLACES,
+        bins=BINS,
         round_length=report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"]),
         # All text in the figures is constant or escaped by the XML writer, so the SVGs are safe as markup.
         figures=[(figure, {against: Markup(figure.svg[against]) for against in AGAINST}) for figure in figures],
@@ -225,7 +225,7 @@ def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:
 
 def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return all fields without a section of their own, as (field, [(name, value)])."""
-    fields = {field: value for field, value in report.items() if field not in _PLACED}
+    fields = {field: value for field, value in report.items() if field not in _SECTIONS}
     if report.get("novel_views"):
         fields["novel_views"] = {
             name: value for name, value in report["novel_views"].items() if name not in ("moments", "judged")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sgsst_core.report.history import consistency_at, novel_view_moments
 from sgsst_core.report.wording import NOTHING, byte_count, duration, number, percent
 
 
@@ -40,7 +41,7 @@ def loss_table(report: dict[str, Any]) -> Table:
 
 def novel_views_table(report: dict[str, Any]) -> Table | None:
     """Return all measurements of novel views, without empty columns; None if there are none."""
-    moments = (report.get("novel_views") or {}).get("moments") or []
+    moments = novel_view_moments(report)
     if not moments:
         return None
     scales = sorted({scale for moment in moments for scale in moment.get("gram") or {}}, key=int)
@@ -52,7 +53,7 @@ def novel_views_table(report: dict[str, Any]) -> Table | None:
     for scale in scales:
         columns[f"scale {scale}, absolute"] = [number((moment.get("gram") or {}).get(scale)) for moment in moments]
     for reach in ("short", "long"):
-        found = [(moment.get("consistency") or {}).get(reach) or {} for moment in moments]
+        found = [consistency_at(moment, reach) for moment in moments]
         columns[f"RMSE, {reach} range"] = [number(entry.get("rmse")) for entry in found]
         columns[f"LPIPS, {reach} range"] = [number(entry.get("lpips")) for entry in found]
         columns[f"compared, {reach} range"] = [percent(entry.get("compared")) for entry in found]

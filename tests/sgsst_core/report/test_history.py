@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from sgsst_core.report.history import PLACES, running_mean, thinned
+from sgsst_core.report.history import BINS, running_mean, thinned
 
 
 def test_running_mean_is_geometric_and_centered() -> None:
@@ -20,13 +20,13 @@ def test_thinning_keeps_range_and_mean() -> None:
     random = np.random.default_rng(1)
     x = np.arange(1.0, 20_001.0)
     values = np.exp(random.normal(size=len(x)))
-    line = thinned(x, values, 25, math.log(2e4) / PLACES)
-    assert len(line.x) <= PLACES + 1
+    line = thinned(x, values, 25, math.log(2e4) / BINS)
+    assert len(line.x) <= BINS + 1
     assert (np.diff(line.x) > 0).all()
     assert line.low.min() == values.min()
     assert line.high.max() == values.max()
     assert ((line.low <= line.high) & (line.x >= 1) & (line.x <= 2e4)).all()
-    places = np.floor(np.log(x) / (math.log(2e4) / PLACES))
+    places = np.floor(np.log(x) / (math.log(2e4) / BINS))
     smooth = running_mean(values, 25)
     wanted = [math.exp(np.log(smooth[places == place]).mean()) for place in np.unique(places)]
     np.testing.assert_allclose(line.mean, wanted, rtol=1e-10)

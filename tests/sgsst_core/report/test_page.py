@@ -18,7 +18,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.terms import TERMS
 from sgsst_core.report.document import Sources, build_report
 from sgsst_core.report.figures import draw_figures
-from sgsst_core.report.history import PLACES
+from sgsst_core.report.history import BINS
 from sgsst_core.report.page import render_page, write_page
 from sgsst_core.report.palette import COLORS, GRID, INK, ON_DARK
 from sgsst_core.settings import make_settings
@@ -510,7 +510,7 @@ def test_long_history_stays_small() -> None:
     page = parsed(report)
     assert len(page.html.encode()) < 1_500_000  # leaves as much again for the sheet
     points = [attributes.get("d") or "" for tag, attributes in page.elements if tag == "path"]
-    assert max(path.count("L") for path in points) < 2 * PLACES + 10
+    assert max(path.count("L") for path in points) < 2 * BINS + 10
 
 
 def test_page_of_a_real_job(tiny_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
