@@ -15,7 +15,6 @@ import argparse
 import json
 import math
 import multiprocessing
-import resource
 import statistics
 import tempfile
 from collections.abc import Callable
@@ -24,8 +23,9 @@ from pathlib import Path
 import torch
 from scipy.spatial import cKDTree
 
+from benchmarks.gpu.inputs import surface_scene
 from benchmarks.machine import write_result
-from benchmarks.rasterizer import DATA, generated_scene, timed
+from benchmarks.rasterizer import DATA, timed
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene, write_scene
@@ -35,6 +35,7 @@ from sgsst_core.planning.probe import soft_image
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections, intersections_of_subset
+from sgsst_core.report.machine import peak_memory
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_colors
@@ -67,9 +68,7 @@ def small_scene() -> tuple[Scene, list[Camera], str]:
     """Return the scene to copy Gaussians from, its cameras and its name."""
     if _PLUSH.is_dir():
         return read_scene(_PLUSH / "point_cloud.ply").scene, read_cameras(_PLUSH / "cameras.json"), "plush"
-    scene = generated_scene(50_000)
-    harmonics = 0.1 * torch.randn(len(scene), 15, 3, generator=torch.Generator().manual_seed(1))
-    scene = Scene(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, harmonics)
+    scene = surface_scene(50_000, degree=3)
     return scene, orbit(scene, 24, width=990, height=742), "generated"
 
 
@@ -183,7 +182,7 @@ def measure(count: int, views: int, parts: list[str], folder: Path | None) -> di
         figures |= measure_first_step(scene, cameras)
     if "unseen" in parts:
         figures |= measure_unseen(scene, cameras)
-    figures["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
+    figures["peak_gb"] = peak_memory() / 1e9
     return figures
 
 

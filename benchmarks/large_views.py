@@ -13,27 +13,19 @@ import json
 import subprocess
 import sys
 import time
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.cameras import read_views
+from benchmarks.inputs import input_parser, read_inputs, with_size
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.files.images import load_image
-from sgsst_core.files.scene_file import read_scene
 from sgsst_core.report.machine import peak_memory
-from sgsst_core.scene.camera import Camera
 
 
 def main() -> None:
     """Measure, print and store all sizes; with --size, measure one size and print its row as JSON after each step."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("cameras")
-    parser.add_argument("style", type=Path)
+    parser = input_parser(__doc__)
     parser.add_argument("--sizes", nargs="+", default=["5187x3361", "8192x5460"], metavar="WIDTHxHEIGHT")
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--memory", type=float, default=10.0, help="GB to plan with")
@@ -75,8 +67,8 @@ def _in_a_process(size: str, limit: float | None) -> list[dict[str, Any]]:
 def _measure(arguments: argparse.Namespace) -> None:
     """Run steps on one view; the first step prepares the view."""
     width, height = (int(side) for side in arguments.size.split("x"))
-    scene = read_scene(arguments.scene).scene
-    view = _of_size(read_views(arguments.cameras, scene, 1, width)[0], width, height)
+    scene, cameras, style = read_inputs(arguments, 1, width)
+    view = with_size(cameras[0], width, height)
     settings = make_settings(
         "standard",
         steps_coarse=0,
@@ -86,7 +78,7 @@ def _measure(arguments: argparse.Namespace) -> None:
         precision=arguments.precision,
     )
     started = time.perf_counter()
-    stylizer = Stylizer.planned(scene, [view], load_image(arguments.style), settings)
+    stylizer = Stylizer.planned(scene, [view], style, settings)
     planning = time.perf_counter() - started
     prediction = stylizer.job.plan.prediction
     assert prediction is not None
@@ -112,20 +104,6 @@ def _measure(arguments: argparse.Namespace) -> None:
             "losses": [record.loss for record in stylizer.history],
         }
         print(json.dumps(row), flush=True)
-
-
-def _of_size(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera at another size, with its focal length scaled by width and its principal point centered."""
-    factor = width / camera.width
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * factor,
-        fy=camera.fy * factor,
-        cx=width / 2,
-        cy=height / 2,
-    )
 
 
 def _print(row: dict[str, Any]) -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.cameras import read_views
+from benchmarks.inputs import read_views
 from benchmarks.machine import write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Sequence
+import socket
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -55,9 +55,11 @@ def add_pair(name: str, pair: str, description: dict[str, Any], rows: dict[str, 
     write_result(name, {"pairs": pairs})
 
 
-def print_row(name: str, row: dict[str, Any], columns: Sequence[str]) -> None:
-    """Print the figures of one row in columns; missing figures stay blank."""
-    print(f"{name:28}", *(f"{row[column]:9.3f}" if column in row else " " * 9 for column in columns), flush=True)
+def free_address() -> str:
+    """Return an address on this machine whose port is free, as HOST:PORT."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{listener.getsockname()[1]}"
 
 
 def _processor() -> str:

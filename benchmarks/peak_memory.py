@@ -6,7 +6,6 @@ python -m benchmarks.peak_memory [--memory 5] [--width 5187] [--height 3361] [--
 from __future__ import annotations
 
 import argparse
-import resource
 
 from benchmarks.machine import write_result
 from benchmarks.pictures import picture
@@ -14,6 +13,7 @@ from sgsst_core.budget import device_peak, forget_device_peak
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork, use_whole_float32
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.report.machine import peak_memory
 from sgsst_core.style import Style
 from sgsst_core.timing import Timer
 
@@ -37,7 +37,7 @@ def main() -> None:
     with timer("gradient"):
         result = loss.evaluate(picture("astronaut", *size), targets, view)
     seconds = timer.read()["gradient"]
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
+    peak = peak_memory() / 1e9
     on_device = device_peak(network.device)
     gpu = f" and {on_device / 1e9:.2f} GB of the GPU's memory" if on_device is not None else ""
     tiles = len(loss.divider.tiles(size))

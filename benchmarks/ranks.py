@@ -1,6 +1,6 @@
 """Speedup of two single-threaded ranks over one, on all scales of a view.
 
-python -m benchmarks.ranks SCENE.ply CAMERAS STYLE [--ranks 2] [--sizes 1280x720,2048x2048] [--rounds 3]
+python -m benchmarks.ranks SCENE.ply CAMERAS|orbit:N STYLE [--ranks 2] [--sizes 1280x720,2048x2048] [--rounds 3]
 
 Ranks are gloo processes on this machine; iterations on one and on all ranks take turns. Also reported are the limit of
 the speedup due to halos, the fraction of an iteration in which ranks wait for each other or for data, and the speedup
@@ -13,27 +13,23 @@ import argparse
 import math
 import multiprocessing
 import resource
-import socket
 import statistics
-from dataclasses import replace
 from datetime import timedelta
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.machine import write_result
+from benchmarks.inputs import input_parser, read_inputs, with_size
+from benchmarks.machine import free_address, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.features.partition import Rectangle, computed_twice
-from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.images import load_image
-from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide, loads
 from sgsst_core.planning.cost import IterationWork, pieces_of
 from sgsst_core.planning.facts import Link
 from sgsst_core.planning.probe import probe_link
-from sgsst_core.scene.camera import Camera, spread
+from sgsst_core.report.machine import peak_memory
+from sgsst_core.scene.camera import Camera
 from worker.ranks.process_group import process_group
 
 NETWORK = ("vgg_forward", "vgg_backward", "statistics")
@@ -42,19 +38,14 @@ RASTER = ("render", "raster_backward")
 
 def main() -> None:
     """Measure, print and store."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("cameras", type=Path)
-    parser.add_argument("style", type=Path)
+    parser = input_parser(__doc__)
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--sizes", default="1280x720,2048x2048")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--name", default="ranks", help="of the results file")
     parser.add_argument("--memory", type=float, default=16.0, help="GB to plan with")
     arguments = parser.parse_args()
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{listener.getsockname()[1]}"
+    address = free_address()
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=run_rank, args=(rank, address, arguments)) for rank in range(1, arguments.ranks)]
     for process in others:
@@ -67,9 +58,7 @@ def main() -> None:
 def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
     """Run one rank's part of the comparison; rank 0 prints and stores the figures."""
     torch.set_num_threads(1)
-    scene = read_scene(arguments.scene).scene
-    camera = spread(read_cameras(arguments.cameras), 1)[0]
-    style = load_image(arguments.style)
+    scene, (camera,), style = read_inputs(arguments, 1, 1280)
     results = []
     # A long timeout, because the other ranks wait while one runs alone.
     with process_group(rank, arguments.ranks, address, timeout=timedelta(hours=1)) as collectives:
@@ -85,12 +74,6 @@ def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
     if rank == 0:
         link_figures = {"bandwidth_gb_s": link.bandwidth / 1e9, "latency_us": link.latency * 1e6}
         write_result(arguments.name, {"scene": arguments.scene.parent.name, "link": link_figures, "views": results})
-
-
-def with_size(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera at another size, with the same horizontal field of view."""
-    focal = camera.fx * width / camera.width
-    return replace(camera, width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
 
 
 def make(collectives: Collectives, scene: Any, view: Camera, style: Any, arguments: argparse.Namespace) -> Stylizer:
@@ -124,7 +107,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
                     sent = record.sent or sent
     waiting = collectives.all_gather([step["communication"] / step["total"] for step in steps["together"]])
     kernel = collectives.all_gather([step["processor_system"] for step in steps["together"]])
-    peak = collectives.all_gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
+    peak = collectives.all_gather(peak_memory() / 1e9)
     if alone is None:
         return {}
     loss = alone.job.loss

@@ -13,13 +13,14 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from benchmarks.gpu.inputs import surface_scene
+from benchmarks.inputs import with_size
 from benchmarks.machine import write_result
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene
@@ -34,38 +35,6 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 
 WIDTH, HEIGHT = 1280, 720
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scenes"
-
-
-def generated_scene(count: int = 100_000) -> Scene:
-    """Return Gaussians around a sphere, for use without a real scene."""
-    generator = torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    means = torch.nn.functional.normalize(normal(count, 3)) + 0.05 * normal(count, 3)
-    return Scene(
-        means=means,
-        quats=normal(count, 4),
-        scales=-4.5 + 0.7 * normal(count, 3),
-        opacities=-0.5 + 2 * normal(count),
-        sh_dc=normal(count, 3),
-        sh_rest=torch.zeros(count, 0, 3),
-    )
-
-
-def resized(camera: Camera) -> Camera:
-    """Return the camera at 1280 x 720, with the same horizontal field of view and a centered principal point."""
-    factor = WIDTH / camera.width
-    return replace(
-        camera,
-        width=WIDTH,
-        height=HEIGHT,
-        fx=camera.fx * factor,
-        fy=camera.fy * factor,
-        cx=WIDTH / 2,
-        cy=HEIGHT / 2,
-    )
 
 
 def timed(action: Callable[[], object]) -> float:
@@ -130,15 +99,18 @@ def scenes(arguments: argparse.Namespace) -> dict[str, tuple[Scene, Camera]]:
     if arguments.scene:
         scene = read_scene(arguments.scene).scene
         cameras = read_cameras(arguments.cameras) if arguments.cameras else orbit(scene, 8)
-        return {arguments.scene.stem: (scene, resized(cameras[0]))}
+        return {arguments.scene.stem: (scene, with_size(cameras[0], WIDTH, HEIGHT))}
     found: dict[str, tuple[Scene, Camera]] = {}
     for name in ("snowmiku_plush", "biker"):
         if (DATA / name / "point_cloud.ply").is_file():
             scene = read_scene(DATA / name / "point_cloud.ply").scene
             file = DATA / name / "cameras.json"
-            found[name] = (scene, resized((read_cameras(file) if file.is_file() else orbit(scene, 8))[0]))
-    scene = generated_scene()
-    return found or {"generated": (scene, resized(orbit(scene, 8)[0]))}
+            found[name] = (
+                scene,
+                with_size((read_cameras(file) if file.is_file() else orbit(scene, 8))[0], WIDTH, HEIGHT),
+            )
+    scene = surface_scene(100_000)
+    return found or {"generated": (scene, with_size(orbit(scene, 8)[0], WIDTH, HEIGHT))}
 
 
 def main() -> None:

@@ -9,7 +9,6 @@ figures of the other schedule are read from the result file.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 
 from torch import Tensor
 
-from benchmarks.cameras import read_views
+from benchmarks.inputs import input_parser, read_views
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
@@ -32,10 +31,7 @@ PAPER_RATE = 2.5e-3
 
 def main() -> None:
     """Run both schedules, then print and store the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("cameras", help="camera file, or orbit:N")
-    parser.add_argument("style", type=Path)
+    parser = input_parser(__doc__)
     parser.add_argument("name", help="of the result: benchmarks/results/standard_NAME.json")
     parser.add_argument("--steps-coarse", type=int, default=1000)
     parser.add_argument("--steps-sos", type=int, default=1000)
@@ -88,7 +84,7 @@ def _run(stylizer: Stylizer, own: Tensor) -> list[dict[str, Any]]:
     coarse, sos = stylizer.job.plan.steps_coarse, stylizer.job.settings.steps_sos
     marks = {int(coarse * mark) for mark in MARKS} | {coarse + int(sos * mark) for mark in MARKS}
     points, seconds = [], 0.0
-    while stylizer.step < stylizer.job.total_steps:
+    for _ in range(stylizer.job.total_steps):
         before = time.process_time()
         stylizer.run_step()
         seconds += time.process_time() - before

@@ -13,13 +13,12 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.machine import add_pair, print_row
+from benchmarks.judged import compare_rows, judged, write_sheet
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
@@ -27,14 +26,13 @@ from sgsst_core.orbit.cameras import orbit
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.contact_sheet import write_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.evaluation import mean_loss
 
 WAYS = ("background", "background+warm", "random", "random+warm", "palette", "palette+warm")
-#: Number of judged views, and of views per row on the contact sheet.
-JUDGED, SHOWN = 6, 3
+#: Number of judged views.
+JUDGED = 6
 COLUMNS = ("style", "color_distance", "background_sensitivity", "content", "saturated", "loss", "seconds")
 
 
@@ -52,30 +50,26 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=80)
     parser.add_argument("--up", default="0,-1,0")
     parser.add_argument("--settings", default="{}", help="JSON, on top of the standard preset's")
-    parser.add_argument("--out", type=Path, help="folder for a sheet of pictures and the colors")
+    parser.add_argument("--out", type=Path, help="folder for a contact sheet and the colors")
     arguments = parser.parse_args()
     scene, style = read_scene(arguments.scene).scene, load_image(arguments.style)
     up = [float(part) for part in arguments.up.split(",")]
     ring = orbit(scene, 2 * arguments.views, width=arguments.width, height=arguments.height, up=up)
     judge = _judge(scene, style, ring[1::2])
-    ways = {"unstylized": _row(judge, scene.sh_dc)}
-    colors = {"unstylized": scene.sh_dc}
-    print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
-    print_row("unstylized", ways["unstylized"], COLUMNS)
     description = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
     description |= {"size": [arguments.width, arguments.height], "steps": arguments.steps}
     base = {"precision": "bfloat16", "steps_coarse": 0, "steps_sos": arguments.steps, "early_stop": False}
-    for way in arguments.ways.split(","):
-        rows = []
-        for seed in arguments.seeds.split(","):
-            settings = base | _settings(way) | {"seed": int(seed)} | json.loads(arguments.settings)
-            colors[way], row = _run(judge, scene, ring[::2], style, settings)
-            rows.append(row)
-        ways[way] = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]} | {"seeds": len(rows)}
-        print_row(way, ways[way], COLUMNS)
-        add_pair("training_background", arguments.name, description, ways)
+
+    def run(way: str, seed: int) -> tuple[torch.Tensor, dict[str, float]]:
+        settings = base | _settings(way) | {"seed": seed} | json.loads(arguments.settings)
+        return _run(judge, scene, ring[::2], style, settings)
+
+    unstylized, ways = (scene.sh_dc, judged(judge, scene.sh_dc)), arguments.ways.split(",")
+    colors = compare_rows(
+        "training_background", arguments.name, description, COLUMNS, unstylized, ways, arguments.seeds, run
+    )
     if arguments.out:
-        _write_sheet(arguments.out, arguments.name, judge, style, colors)
+        write_sheet(arguments.out, arguments.name, judge, style, colors)
 
 
 def _settings(way: str) -> dict[str, Any]:
@@ -89,12 +83,6 @@ def _judge(scene: Scene, style: torch.Tensor, between: list[Camera]) -> Judge:
     return Judge(Lpips(), style, scene, make_rasterizer("cpu", scene), between[::step][:JUDGED])
 
 
-def _row(judge: Judge, sh_dc: torch.Tensor) -> dict[str, float]:
-    judgment = judge.judge(sh_dc)
-    assert judgment is not None, "no view can be judged: give larger ones"
-    return asdict(judgment)
-
-
 def _run(
     judge: Judge, scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]
 ) -> tuple[torch.Tensor, dict[str, float]]:
@@ -105,24 +93,12 @@ def _run(
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
     start = mean_loss(stylizer.start())
     before = time.process_time()
-    while stylizer.step < stylizer.job.total_steps:
+    for _ in range(stylizer.job.total_steps):
         stylizer.run_step()
     seconds = time.process_time() - before
     sh_dc = stylizer.stylized()
     loss = mean_loss(stylizer.evaluate(stylizer.job.evaluation_views)) / start
-    return sh_dc, {**_row(judge, sh_dc), "loss": loss, "seconds": seconds}
-
-
-def _write_sheet(folder: Path, name: str, judge: Judge, style: torch.Tensor, colors: dict[str, torch.Tensor]) -> None:
-    """Write the colors, and a contact sheet with one row per way: views on black, then the first view on white."""
-    folder.mkdir(parents=True, exist_ok=True)
-    cameras = judge.cameras[:SHOWN]
-    rows = []
-    for way, sh_dc in colors.items():
-        renders = [judge.renders(sh_dc, camera) for camera in cameras]
-        rows.append((way, [*(pair[0] for pair in renders), renders[0][1]]))
-    write_rows(folder / f"{name}.jpg", style, rows)
-    torch.save(colors, folder / f"{name}.pt")
+    return sh_dc, {**judged(judge, sh_dc), "loss": loss, "seconds": seconds}
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ NCCL does not support two ranks on one GPU, so tensors are exchanged by gloo. Th
 
 from __future__ import annotations
 
-import socket
 import tempfile
 from datetime import timedelta
 from pathlib import Path
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from benchmarks.gpu.inputs import network_weights, small_weights, surface_scene, texture, views
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device
+from benchmarks.machine import free_address
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -34,9 +34,7 @@ COLORS_BOUND = 1e-2
 def run(sizes: Sizes, found: Findings) -> None:
     """Compare the gradient of the first step, and the colors after some steps."""
     expected_gradient, expected = follow(ALONE, sizes)
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{listener.getsockname()[1]}"
+    address = free_address()
     with tempfile.TemporaryDirectory() as folder:
         multiprocessing.spawn(run_rank, (address, folder, sizes), nprocs=RANKS)  # type: ignore[attr-defined]
         results = [torch.load(Path(folder) / f"{rank}.pt") for rank in range(RANKS)]
