@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import hashlib
 import json
 import os
 import random
@@ -39,9 +38,9 @@ from typing import Any
 
 import httpx
 
+from benchmarks.attacked import FINISHED, Attacked
 from benchmarks.cluster_hosts import Host, Network, missing
 from benchmarks.machine import write_result
-from sgsst_core.files.scene_file import read_scene
 from tests.api.service import undisturbed
 from tests.networks import install_tiny_weights
 from tests.small_scenes import wall, write_files
@@ -52,12 +51,11 @@ SEEDS = (1, 2)
 QUEUE, TWO_RANKS_EVERY = 3, 3
 RAY_PORT, PG_PORT, S3_PORT, API_PORT = 6479, 5498, 5599, 8000
 NODES, DISPATCHERS, APIS = ("n1", "n2", "n3"), ("d1", "d2"), ("a1", "a2")
-FINISHED = ("succeeded", "failed", "canceled", "expired")
 #: Durations of faults in seconds: network cut (minimum, maximum), S3 outage, slow connection, full disk.
 CUT, AWAY, SLOW, FULL = (5.0, 60.0), 30.0, 30.0, 20.0
 DELAY, LOSS = 0.2, 0.05
-#: Time limits in seconds after the last repair: for all accepted jobs to end, and for leftover files to be deleted.
-PATIENCE, SWEEP = 900.0, 120.0
+#: Seconds after which leftover files must have been deleted.
+SWEEP = 120.0
 #: Size in bytes of a node's disk. It is small, so that a fault can fill it; scene, network and checkpoint still fit.
 NODE_DISK = 96 << 20
 
@@ -201,13 +199,11 @@ def _wait(what: str, condition: Callable[[], bool], seconds: float = 180.0) -> N
 
 
 @dataclass
-class Run:
+class Run(Attacked):
     """Cluster under fault injection, and the figures collected."""
 
-    cluster: Cluster
-    files: dict[str, Path]
-    chance: random.Random
-    accepted: dict[str, tuple[int, int]] = field(default_factory=dict)  # seed and number of ranks
+    cluster: Cluster = field(kw_only=True)
+    chance: random.Random = field(kw_only=True)
     faults: list[dict[str, Any]] = field(default_factory=list)
     unanswered: list[float] = field(default_factory=list)
     database_away: bool = False
@@ -215,50 +211,12 @@ class Run:
 
     # --- through the API -------------------------------------------------------------------------------------------
 
-    def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request to any API process that responds; retry while none does."""
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            for url in self.cluster.urls:
-                with contextlib.suppress(httpx.TransportError):
-                    answer = httpx.request(method, f"{url}{path}", timeout=15, trust_env=False, **options)
-                    if answer.status_code < 500:
-                        return answer
-            if time.monotonic() > deadline:
-                raise RuntimeError(f"{method} {path} was never answered")
-            time.sleep(0.2)
-
-    def jobs(self) -> list[dict[str, Any]]:
-        """Return all jobs."""
-        found: list[dict[str, Any]] = []
-        cursor: str | None = None
-        while True:
-            answer = self.call(
-                "GET", "/v1/jobs", params={"limit": 100, **({"cursor": cursor} if cursor else {})}
-            ).json()
-            found += answer["jobs"]
-            cursor = answer["next_cursor"]
-            if not cursor:
-                return found
-
     def fill(self) -> None:
         """Submit jobs until the queue is full."""
-        waiting = sum(job["status"] not in FINISHED for job in self.jobs())
-        for _ in range(QUEUE - waiting):
+        for _ in range(QUEUE - self.waiting()):
             number = len(self.accepted)
-            seed, ranks = SEEDS[number % len(SEEDS)], 2 if number % TWO_RANKS_EVERY == 2 else 1
-            body = {role: (path.name, path.read_bytes()) for role, path in self.files.items()}
-            parameters = {**PARAMETERS, "seed": seed, "workers": ranks}
-            answer = self.call(
-                "POST",
-                "/v1/jobs",
-                files=body,
-                data={"parameters": json.dumps(parameters)},
-                headers={"Idempotency-Key": secrets.token_hex(8)},
-            )
-            if answer.status_code != 202:
-                raise RuntimeError(f"a good job was refused: {answer.text}")
-            self.accepted[str(answer.json()["id"])] = seed, ranks
+            ranks = 2 if number % TWO_RANKS_EVERY == 2 else 1
+            self.submit(seed=SEEDS[number % len(SEEDS)], workers=ranks)
 
     def steps(self) -> tuple[int, int]:
         """Return the number of ended jobs, and the total steps of running jobs.
@@ -274,7 +232,7 @@ class Run:
         """Request a page of the job list every half second, and record for how long no API process responds."""
         while not self.over.wait(0.5):
             started = time.monotonic()
-            if not any(self._reads(url) for url in self.cluster.urls) and not self.database_away:
+            if not any(self._reads(url) for url in self.urls) and not self.database_away:
                 self.unanswered.append(time.monotonic() - started + 0.5)
 
     @staticmethod
@@ -380,32 +338,6 @@ class Run:
         cable.mend()
         return {}
 
-    # --- what became of it -----------------------------------------------------------------------------------------
-
-    def wait_for_all(self) -> dict[str, dict[str, Any]]:
-        """Wait until all accepted jobs have ended or time is up, and return the last status of each existing job."""
-        deadline = time.monotonic() + PATIENCE
-        found: dict[str, dict[str, Any]] = {}
-        while time.monotonic() < deadline:
-            for job_id in self.accepted:
-                if found.get(job_id, {}).get("status") not in FINISHED:
-                    answer = self.call("GET", f"/v1/jobs/{job_id}")
-                    if answer.status_code == 200:
-                        found[job_id] = answer.json()
-            if all(found.get(job_id, {}).get("status") in FINISHED for job_id in self.accepted):
-                break
-            time.sleep(1)
-        return found
-
-    def published(self, job_id: str) -> int:
-        """Return the number of events that announce a job's result."""
-        text = self.call("GET", f"/v1/jobs/{job_id}/events").text
-        return max(text.count('"name": "stylized.ply"'), text.count('"status": "succeeded"'))
-
-    def result(self, job_id: str) -> bytes:
-        """Download a job's PLY."""
-        return self.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
-
 
 KINDS = (
     "kill-node",
@@ -469,7 +401,7 @@ def measure(
     with Network(folder / "net") as network:
         cluster = Cluster(network, folder / "weights")
         cluster.start()
-        run = Run(cluster, files, random.Random(seed))
+        run = Run(cluster.urls, files, PARAMETERS, cluster=cluster, chance=random.Random(seed))
         reader = threading.Thread(target=run.watch_reads)
         reader.start()
         try:
@@ -513,17 +445,12 @@ def _count(run: Run, found: dict[str, dict[str, Any]], expected: dict[int, Path]
     """Return the number of lost, twice published and differing jobs, and related figures."""
     ended = [job_id for job_id in run.accepted if found.get(job_id, {}).get("status") == "succeeded"]
     different, farthest = 0, 0.0
-    before = read_scene(run.files["scene"]).scene.sh_dc
     for job_id in ended:
-        seed, ranks = run.accepted[job_id]
-        content = run.result(job_id)
-        if hashlib.sha256(content).digest() == hashlib.sha256(expected[seed].read_bytes()).digest():
-            continue
-        (folder / "result.ply").write_bytes(content)
-        result, alone = (read_scene(path).scene.sh_dc for path in (folder / "result.ply", expected[seed]))
-        distance = float((result - alone).norm() / (alone - before).norm())
-        farthest = max(farthest, distance)
-        different += ranks == 1 or distance > 0.05
+        wanted, ranks = expected[run.accepted[job_id]["seed"]], run.accepted[job_id]["workers"]
+        if run.result(job_id) != wanted.read_bytes():
+            distance = run.distance(job_id, wanted, folder)
+            farthest = max(farthest, distance)
+            different += ranks == 1 or distance > 0.05
     kinds = sorted({record["kind"] for record in run.faults})
     return {
         "faults": len(run.faults),

@@ -12,10 +12,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import hashlib
 import json
 import random
-import secrets
 import signal
 import statistics
 import sys
@@ -27,10 +25,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import httpx
-
+from benchmarks.attacked import FINISHED, PATIENCE, Attacked
 from benchmarks.machine import write_result
-from sgsst_core.files.scene_file import read_scene
 from tests.api.service import Service, undisturbed
 from tests.small_scenes import wall, write_files
 
@@ -57,51 +53,17 @@ EVERYTHING = "sgsst serve"
 EVERY = {API: 9.0, DISPATCHER: 30.0, ATTEMPT: 30.0, EVERYTHING: 120.0}
 #: Number of unfinished jobs to maintain.
 _QUEUE = 2
-_FINISHED = ("succeeded", "failed", "canceled", "expired")
-_PATIENCE = 600.0
 
 
 @dataclass
-class Run:
+class Run(Attacked):
     """Service whose processes are killed, and the figures collected."""
 
-    service: Service
-    files: dict[str, Path]
-    accepted: dict[str, int] = field(default_factory=dict)
+    service: Service = field(kw_only=True)
     kills: Counter[str] = field(default_factory=Counter)
-    resent: int = 0
     api_back: list[float] = field(default_factory=list)
     running_again: list[float] = field(default_factory=list)
     everything_back: list[float] = field(default_factory=list)
-
-    def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request, retrying while the API is down."""
-        deadline = time.monotonic() + _PATIENCE
-        while True:
-            try:
-                return httpx.request(method, f"{self.service.url}{path}", timeout=60, **options)
-            except httpx.TransportError:
-                self.resent += 1
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.02)
-
-    def submit(self, seed: int, **parameters: Any) -> str:
-        """Submit a job and return its id."""
-        body = {role: (path.name, path.read_bytes()) for role, path in self.files.items()}
-        data = {"parameters": json.dumps({**PARAMETERS, "seed": seed, **parameters})}
-        headers = {"Idempotency-Key": secrets.token_hex(8)}
-        answer = self.call("POST", "/v1/jobs", files=body, data=data, headers=headers)
-        if answer.status_code != 202:
-            raise RuntimeError(f"a good job was refused: {answer.text}")
-        job_id = str(answer.json()["id"])
-        self.accepted[job_id] = seed
-        return job_id
-
-    def jobs(self) -> list[dict[str, Any]]:
-        """Return all jobs that the service lists."""
-        found: list[dict[str, Any]] = self.call("GET", "/v1/jobs", params={"limit": 200}).json()["jobs"]
-        return found
 
     def active(self) -> dict[str, Any] | None:
         """Return the job in progress, or None."""
@@ -109,9 +71,8 @@ class Run:
 
     def fill(self) -> None:
         """Submit jobs until the queue is full."""
-        waiting = sum(job["status"] not in _FINISHED for job in self.jobs())
-        for _ in range(_QUEUE - waiting):
-            self.submit(SEEDS[len(self.accepted) % len(SEEDS)])
+        for _ in range(_QUEUE - self.waiting()):
+            self.submit(seed=SEEDS[len(self.accepted) % len(SEEDS)])
 
     def strike(self, target: str, chance: random.Random) -> None:
         """Kill one process, and measure the recovery."""
@@ -134,9 +95,9 @@ class Run:
 
     def _measure(self, before: Mapping[str, Any], struck: float) -> None:
         """Wait until an interrupted job continues to make steps, and record the time."""
-        while time.monotonic() - struck < _PATIENCE:
+        while time.monotonic() - struck < PATIENCE:
             job = self.call("GET", f"/v1/jobs/{before['id']}").json()
-            if job["status"] in _FINISHED:
+            if job["status"] in FINISHED:
                 return  # the job had finished when the dispatcher died
             if job["attempt"] > before["attempt"] and job["status"] == "running":
                 self.running_again.append(time.monotonic() - struck)
@@ -174,11 +135,11 @@ def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
     """Run a job on two ranks, kill one of them repeatedly, and return the job's id."""
     if not kills:
         return None
-    job_id = run.submit(SEEDS[0], workers=2, steps_sos=RANK_STEPS)
+    job_id = run.submit(seed=SEEDS[0], workers=2, steps_sos=RANK_STEPS)
     reached = 0
     while run.kills[RANK] < kills:
         job = run.call("GET", f"/v1/jobs/{job_id}").json()
-        if job["status"] in _FINISHED:
+        if job["status"] in FINISHED:
             break
         progress = job["progress"] or {}
         step = 0 if progress.get("stage") in ("planning", "starting") else progress.get("step") or 0
@@ -190,42 +151,10 @@ def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
     return job_id
 
 
-def wait_for_all(run: Run) -> dict[str, dict[str, Any]]:
-    """Wait until all accepted jobs have ended or time is up, and return the last status of each existing job."""
-    deadline = time.monotonic() + _PATIENCE
-    found: dict[str, dict[str, Any]] = {}
-    while time.monotonic() < deadline:
-        for job_id in run.accepted:
-            if found.get(job_id, {}).get("status") not in _FINISHED:
-                answer = run.call("GET", f"/v1/jobs/{job_id}")
-                if answer.status_code == 200:
-                    found[job_id] = answer.json()
-        if all(found.get(job_id, {}).get("status") in _FINISHED for job_id in run.accepted):
-            break
-        time.sleep(0.5)
-    return found
-
-
 def published(run: Run, job_id: str) -> int:
     """Return how often a job's result was announced or stored on disk, whichever is more."""
-    text = run.call("GET", f"/v1/jobs/{job_id}/events").text
-    told = text.count('"name": "stylized.ply"')
-    ended = text.count('"status": "succeeded"')
-    places = len(list((run.service.data / "artifacts" / job_id).rglob("stylized.ply")))
-    return max(told, ended, places)
-
-
-def sha256(run: Run, job_id: str) -> str:
-    """Download a job's result, and return its digest."""
-    return hashlib.sha256(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content).hexdigest()
-
-
-def distance(run: Run, job_id: str, one_rank: Path) -> float:
-    """Return the distance between the colors of a two-rank and a one-rank job, relative to the change by the latter."""
-    path = run.service.data / "two.ply"
-    path.write_bytes(run.call("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").content)
-    two, one, before = (read_scene(each).scene.sh_dc for each in (path, one_rank, run.files["scene"]))
-    return float((two - one).norm() / (one - before).norm())
+    stored = len(list((run.service.data / "artifacts" / job_id).rglob("stylized.ply")))
+    return max(run.published(job_id), stored)
 
 
 def spread(values: list[float]) -> dict[str, float | int | None]:
@@ -264,17 +193,17 @@ def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) ->
     for number, seed in enumerate(SEEDS):
         (folder / f"expected_{number}").mkdir()
         made = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{number}")
-        expected[seed] = hashlib.sha256(made.read_bytes()).hexdigest()
+        expected[seed] = made.read_bytes()
     (folder / "long").mkdir()
     long = {**PARAMETERS, "seed": SEEDS[0], "steps_sos": RANK_STEPS}
     one_rank = undisturbed(files, long, folder / "long") if rank_kills else None
     started = time.monotonic()
     with Service(folder / "data", **SETTINGS) as service:
-        run = Run(service, files)
+        run = Run([service.url], files, PARAMETERS, service=service)
         attack(run, kills, chance)
         attacked = time.monotonic() - started
         on_ranks = attack_ranks(run, rank_kills, chance)
-        found = wait_for_all(run)
+        found = run.wait_for_all()
         ended = [job_id for job_id in run.accepted if found.get(job_id, {}).get("status") == "succeeded"]
         known = {job["id"] for job in run.jobs()}
         attempts = Counter(each["outcome"] for job in found.values() for each in job["attempts"])
@@ -287,7 +216,7 @@ def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) ->
             "lost": len(run.accepted) - len(ended),
             "created_twice": len(known - set(run.accepted)),
             "published_twice": sum(published(run, job_id) != 1 for job_id in ended),
-            "different": sum(sha256(run, job_id) != expected[run.accepted[job_id]] for job_id in alike),
+            "different": sum(run.result(job_id) != expected[run.accepted[job_id]["seed"]] for job_id in alike),
             "attempts": dict(attempts),
             "most_attempts_of_a_job": max(len(job["attempts"]) for job in found.values()),
             "requests_sent_again": run.resent,
@@ -297,7 +226,7 @@ def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) ->
             "not_succeeded": [job.get("error") for job in found.values() if job["status"] != "succeeded"],
         }
         if one_rank is not None and on_ranks in ended:
-            figures["two_ranks_from_one"] = distance(run, on_ranks, one_rank)
+            figures["two_ranks_from_one"] = run.distance(on_ranks, one_rank, folder)
         return figures
 
 
