@@ -85,8 +85,13 @@ class Capture:
         return replace(self, photos=photos, decisions=(*decisions, *self.decisions))
 
 
-def read_capture(source: SceneRequest, scene: Scene) -> Capture:
-    """Read or generate the requested cameras, at the requested resolution.
+def read_capture(source: SceneRequest, scene: Scene, images: Path | None = None) -> Capture:
+    """Read or generate the requested cameras, at the requested resolution, still without photos.
+
+    Args:
+        source: Requested cameras.
+        scene: Scene that an orbit surrounds.
+        images: Folder of photos, for cameras whose file states no sizes.
 
     Raises:
         CameraError: If the cameras cannot be used.
@@ -96,7 +101,7 @@ def read_capture(source: SceneRequest, scene: Scene) -> Capture:
         orbit = make_orbit(scene, _orbit_request(source))
         cameras = list(orbit.cameras)
     else:
-        cameras = read_cameras(source.cameras)
+        cameras = read_cameras(source.cameras, images)
     if source.views is not None:
         cameras = spread(cameras, source.views)
     sizes = [photo_size(camera) for camera in cameras]
@@ -105,7 +110,7 @@ def read_capture(source: SceneRequest, scene: Scene) -> Capture:
     return Capture(cameras, orbit, sizes)
 
 
-def choose_axes(source: SceneRequest) -> tuple[SpzAxes, list[Decision]]:
+def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAxes, list[Decision]]:
     """Return the axes to read an SPZ scene with, and the line for the plan if the cameras decide.
 
     If neither request nor file state them, they are those under which the cameras see the scene. Without cameras, or if
@@ -118,7 +123,7 @@ def choose_axes(source: SceneRequest) -> tuple[SpzAxes, list[Decision]]:
         header = read_scene_header(source.scene)
         if not isinstance(header, SpzHeader) or header.extended or header.stated_axes is not None:
             return asked, []
-        cameras = read_cameras(source.cameras)
+        cameras = read_cameras(source.cameras, images)
         means = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene.means
     except (SceneError, CameraError):
         return asked, []

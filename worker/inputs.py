@@ -82,7 +82,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     """
     settings, images = request.settings, request.images
     source = request.source
-    axes, about_axes = collectives.broadcast(lambda: choose_axes(source))
+    axes, about_axes = collectives.broadcast(lambda: choose_axes(source, images))
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_styles(request.styles))
     scene_file, reader = read_shared_scene(
@@ -93,7 +93,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
         spz_axes=axes,
     )
     together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
-    capture = _capture_on_all_ranks(source, scene_file.scene, collectives).fitted(settings)
+    capture = _capture_on_all_ranks(source, scene_file.scene, images, collectives).fitted(settings)
     together(collectives, lambda: check_scales(settings.scales, capture.cameras, settings.coarsest_side))
     together(collectives, lambda: check_style_size(style, capture.cameras, settings.style_scale))
     found = together(collectives, lambda: capture.with_photos(images))
@@ -145,14 +145,14 @@ def load_styles(files: Sequence[StyleFile]) -> Style:
     return Style(tuple(load_image(file.path) for file in files), weights, names)
 
 
-def _capture_on_all_ranks(source: SceneRequest, scene: Scene, collectives: Collectives) -> Capture:
+def _capture_on_all_ranks(source: SceneRequest, scene: Scene, images: Path | None, collectives: Collectives) -> Capture:
     """Return the result of `read_capture`, the same on every rank.
 
     Every rank reads a camera file itself. Only rank 0 computes an orbit, since processors may round differently.
     """
     if source.cameras is None:
         return collectives.broadcast(lambda: read_capture(source, scene))
-    return together(collectives, lambda: read_capture(source, scene))
+    return together(collectives, lambda: read_capture(source, scene, images))
 
 
 def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> tuple[SceneFile, Capture]:
@@ -163,9 +163,9 @@ def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> 
         CameraError: If the cameras cannot be used.
         ImageError: If the photos cannot be used.
     """
-    axes, about_axes = choose_axes(source)
+    axes, about_axes = choose_axes(source, images)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
-    capture = read_capture(source, file.scene).with_photos(images).checked(file.scene, source.near)
+    capture = read_capture(source, file.scene, images).with_photos(images).checked(file.scene, source.near)
     return file, replace(capture, decisions=(*about_axes, *capture.decisions))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from service.errors import RefusedInputError
+from sgsst_core.files.camera_advice import advice_for_name
 from worker.region_requests import MOST_REGIONS, RegionRequest
 from worker.styles import MOST_PICTURES
 
@@ -173,8 +174,8 @@ def _check_camera_files(names: Sequence[str]) -> None:
     odd = next((name for name in names if PurePosixPath(name).suffix.lower() not in _CAMERA_SUFFIXES), None)
     if odd is not None:
         raise RefusedInputError(
-            f"The camera file {odd!r} is none of *.json, *.bin and *.txt. Send a cameras.json, a transforms.json, or "
-            "the three files of a COLMAP model, with their own names.",
+            f"The camera file {odd!r} is none of *.json, *.bin and *.txt.{advice_for_name(odd)} Send a cameras.json, a "
+            "transforms.json, or the files of a COLMAP model, with their own names.",
             "invalid-cameras",
             input="cameras",
         )

@@ -115,10 +115,10 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
                 f"At most {limits['gaussians']:,} are allowed.",
             )
     with _errors_of("cameras"):
-        if source.cameras is not None:
+        if source.cameras is not None and staged.photos is None:
             _check_frames_have_sizes(source.cameras)
     with _errors_of("scene"):
-        axes, about_axes = choose_axes(source)
+        axes, about_axes = choose_axes(source, staged.photos)
         file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
         check_sh_attenuation(file, settings.sh_attenuation)
         found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
@@ -130,7 +130,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         found["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
     with _errors_of("cameras"):
         check_choice(source)
-        capture = read_capture(source, file.scene).fitted(settings)
+        capture = read_capture(source, file.scene, staged.photos).fitted(settings)
         cameras = capture.cameras
         if len(cameras) > limits["views"]:
             raise RefusedError(
@@ -215,7 +215,7 @@ def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]
     assert format is not None
     with Path(name).open("wb") as output:
         encode_scene(output, scene, format, Path(name))
-    cameras = read_capture(source, scene).fitted(settings).cameras
+    cameras = read_capture(source, scene, staged.photos).fitted(settings).cameras
     return measure_packed(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
 
 
@@ -256,8 +256,8 @@ def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
 def _check_frames_have_sizes(path: Path) -> None:
     """Reject a transforms.json with frames that have no image size.
 
-    The size would otherwise be read from the image file. Its path may point anywhere on this machine, and the response
-    would reveal what exists there.
+    The size would otherwise be read from the image file, unless the job has photos. Its path may point anywhere on this
+    machine, and the response would reveal what exists there.
     """
     for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
         try:

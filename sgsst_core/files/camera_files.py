@@ -19,8 +19,10 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import CameraError, ImageError
+from sgsst_core.files.camera_advice import refuse_file, refuse_folder, refuse_json
 from sgsst_core.files.colmap_model import ColmapCamera, read_model
 from sgsst_core.files.images import image_size
+from sgsst_core.files.photos import PhotoFolder
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import Lens, fisheye_lens, other_lens, radial_lens
 
@@ -51,16 +53,22 @@ _COLMAP_RADIAL = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 _COLMAP_FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 
 
-def read_cameras(path: Path) -> list[Camera]:
+def read_cameras(path: Path, photos: Path | None = None) -> list[Camera]:
     """Detect the format of a camera file or folder, and read its cameras.
 
-    A folder may be a COLMAP sparse model, may hold such a model in sparse/0 or sparse, or may hold a transforms.json or
-    cameras.json. Cameras from JSON keep their order; COLMAP's images are sorted by name.
+    A folder may be a COLMAP sparse model, may hold such a model in sparse/0, sparse or another folder of sparse, or may
+    hold a transforms.json, transforms_train.json or cameras.json, or else a model in colmap/sparse. Cameras from JSON
+    keep their order; COLMAP's images are sorted by name.
 
     nerfstudio trains in a coordinate frame of its own. To match a scene exported by nerfstudio, cameras must be
     transformed by the `dataparser_transforms.json` of its training run. If that file lies beside the transforms.json,
     it is applied as in nerfstudio, along with `applied_transform` and `applied_scale`. Otherwise poses are used
     unchanged, which is correct for scenes trained in the coordinate frame of the camera file.
+
+    Args:
+        path: File or folder.
+        photos: Folder of the photos, whose sizes cameras get if the file states none. None looks for them beside the
+            file, at the paths that it states.
 
     Raises:
         CameraError: If the file is missing, its format is unknown, it holds no cameras, a camera cannot be a pinhole,
@@ -72,29 +80,42 @@ def read_cameras(path: Path) -> list[Camera]:
         (64, 48)
     """
     if path.is_dir():
-        return _read_folder(path)
+        return _read_folder(path, photos)
     if path.suffix in (".bin", ".txt") and path.name.startswith(("cameras", "images", "points3D")):
         return _read_colmap(path.parent)
     content = _load_json(path)
+    refuse_json(path, content)
     if isinstance(content, list):
         return _convert_entries(path, content, _inria_camera)
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
-        return _read_transforms(path, content)
+        return _read_transforms(path, content, photos)
     raise CameraError(f"{path}: is in no known camera format. Give {_FORMATS}.")
 
 
-def _read_folder(folder: Path) -> list[Camera]:
-    for model in (folder, folder / "sparse" / "0", folder / "sparse"):
-        if (model / "cameras.bin").is_file() or (model / "cameras.txt").is_file():
+def _read_folder(folder: Path, photos: Path | None) -> list[Camera]:
+    sparse = folder / "sparse"
+    numbered = sorted(
+        (path for path in sparse.glob("[0-9]*") if path.is_dir()), key=lambda path: (len(path.name), path)
+    )
+    for model in (folder, sparse / "0", sparse, *numbered):
+        if _has_model(model):
             return _read_colmap(model)
-    for name in ("transforms.json", "cameras.json"):
+    for name in ("transforms.json", "transforms_train.json", "cameras.json"):
         if (folder / name).is_file():
-            return read_cameras(folder / name)
+            return read_cameras(folder / name, photos)
+    if _has_model(folder / "colmap" / "sparse" / "0"):
+        return _read_colmap(folder / "colmap" / "sparse" / "0")
+    refuse_folder(folder)
     raise CameraError(f"{folder}: holds no cameras in a known format. Give {_FORMATS}.")
+
+
+def _has_model(folder: Path) -> bool:
+    return (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
 
 
 def _load_json(path: Path) -> Any:
     try:
+        refuse_file(path)
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise CameraError(f"{path}: cannot be read: {error.strerror}. Check the path, or give {_FORMATS}.") from error
@@ -127,14 +148,15 @@ def _inria_camera(where: str, entry: Mapping[str, Any]) -> Camera:
     return _camera(where, name, (width, height), (fx, fy, cx, cy), _inverse(where, pose))
 
 
-def _read_transforms(path: Path, content: Mapping[str, Any]) -> list[Camera]:
+def _read_transforms(path: Path, content: Mapping[str, Any], photos: Path | None) -> list[Camera]:
+    files = PhotoFolder(photos) if photos is not None and photos.is_dir() else None
     frame_change = _dataparser_change(path, content)
 
     def convert(where: str, frame: Mapping[str, Any]) -> Camera:
         name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
         where = f"{where} ({name!r})"
         values = {**content, **frame}  # values of the frame take precedence
-        size = _transforms_size(where, path.parent / name, values)
+        size = _transforms_size(where, path.parent / name, values, files)
         pose = np.eye(4)
         matrix = _array(where, values, "transform_matrix", (4, 4), (3, 4))
         pose[:3] = matrix[:3]
@@ -180,20 +202,27 @@ def _with_lens(camera: Camera, lens: Lens) -> Camera:
     return replace(camera, lens=lens) if lens.distorts else camera
 
 
-def _transforms_size(where: str, image: Path, values: Mapping[str, Any]) -> tuple[int, int]:
+def _transforms_size(where: str, image: Path, values: Mapping[str, Any], files: PhotoFolder | None) -> tuple[int, int]:
     """Return width and height as given in the file, or else those of the image.
 
     Blender's format omits both the sizes and the extensions of image files.
     """
     if "w" in values and "h" in values:
         return _size(where, values, "w", "h")
-    for candidate in (image, *(image.with_name(image.name + suffix) for suffix in (".png", ".jpg", ".jpeg"))):
+    if files is None:
+        candidates = [image, *(image.with_name(image.name + suffix) for suffix in (".png", ".jpg", ".jpeg"))]
+    else:
+        candidates = files.named(_name(where, values, "file_path"))
+    for candidate in candidates:
         if candidate.is_file():
             try:
                 return image_size(candidate)
             except ImageError as error:
                 raise CameraError(f"{where}: gives no size, and its image does not either: {error}") from error
-    raise CameraError(f"{where}: gives no size, and there is no image {image}. Add the sizes as 'w' and 'h'.")
+    raise CameraError(
+        f"{where}: gives no size, and there is no image {image if files is None else 'of its name among the photos'}. "
+        "Add the sizes as 'w' and 'h'."
+    )
 
 
 def _transforms_intrinsics(

@@ -42,12 +42,47 @@ class Photo:
     ambiguous: bool = False
 
 
-def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
-    """Find and check the photo of each camera. Only headers are read, so that errors occur before long work starts.
+class PhotoFolder:
+    """Image files in a folder and its subfolders, found by the names of cameras.
 
-    A camera's name matches a file with or without its extension. Leading folders of the name are dropped until a file
-    matches: "images/cam0/0001.png" matches FOLDER/images/cam0/0001.png, else FOLDER/cam0/0001.jpg, else
-    FOLDER/0001.jpg.
+    A name matches a file with or without its extension. Leading folders of the name are dropped until a file matches:
+    "images/cam0/0001.png" matches FOLDER/images/cam0/0001.png, else FOLDER/cam0/0001.jpg, else FOLDER/0001.jpg.
+
+    Args:
+        folder: Existing folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._extensions = Image.registered_extensions()
+        #: Files by every trailing part of their relative path, without extension.
+        self._index: dict[tuple[str, ...], list[Path]] = {}
+        for path in sorted(folder.rglob("*")):
+            if path.suffix.lower() in self._extensions and not path.name.startswith(".") and path.is_file():
+                parts = path.relative_to(folder).with_suffix("").parts
+                for start in range(len(parts)):
+                    self._index.setdefault(parts[start:], []).append(path)
+
+    def named(self, name: str) -> list[Path]:
+        """Return the files that match a camera's name best.
+
+        The longest matching path wins, then files outside deeper subfolders, then files with the exact extension.
+        """
+        wanted = PurePosixPath(name.replace("\\", "/"))
+        known = wanted.suffix.lower() in self._extensions
+        parts = tuple(part for part in (wanted.with_suffix("") if known else wanted).parts if part not in ("..", "/"))
+        for start in range(len(parts)):
+            found = self._index.get(parts[start:], [])
+            if found:
+                direct = [path for path in found if path.parent == self._folder.joinpath(*parts[start:-1])] or found
+                return [path for path in direct if path.suffix == wanted.suffix] or direct
+        return []
+
+
+def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
+    """Find the photo of each camera (see `PhotoFolder`), and check it.
+
+    Only headers are read, so that errors occur before long work starts.
 
     Returns:
         Photos in the order of the cameras, for `load_photo`; None for a camera without one.
@@ -58,8 +93,8 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     """
     if not folder.is_dir():
         raise ImageError(f"{folder}: is not a folder of photos. Give the folder that the cameras' names refer to.")
-    index = _index_photos(folder)
-    matches = [_matching(index, folder, camera.name) for camera in cameras]
+    files = PhotoFolder(folder)
+    matches = [files.named(camera.name) for camera in cameras]
     missing = [camera.name for camera, found in zip(cameras, matches, strict=True) if not found]
     several = [camera.name for camera, found in zip(cameras, matches, strict=True) if len(found) > 1]
     for what, names, most in (("no photo", missing, MOST_MISSING * len(cameras)), ("more than one photo", several, 0)):
@@ -87,10 +122,10 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     """
     if not folder.is_dir():
         raise ImageError(f"{folder}: is not a folder of masks. Give the folder that the cameras' names refer to.")
-    index = _index_photos(folder)
+    files = PhotoFolder(folder)
     found: list[Photo | None] = []
     for camera in cameras:
-        paths = _matching(index, folder, camera.name)
+        paths = files.named(camera.name)
         if len(paths) > 1:
             raise ImageError(f"{folder}: holds more than one mask for view {camera.name}. Leave one.")
         found.append(_fitting(paths[0], camera) if paths else None)
@@ -156,31 +191,3 @@ def _misfit(path: Path, size: tuple[int, int], camera: Camera) -> ImageError:
         f"{path}: is {size[0]} x {size[1]}, but its camera {camera.name!r} {width} x {height}, another aspect ratio. "
         "Give the photos that the cameras were computed from, neither cropped nor rotated."
     )
-
-
-def _index_photos(folder: Path) -> dict[tuple[str, ...], list[Path]]:
-    """Index all image files below a folder by every trailing part of their relative path, without extension."""
-    extensions = Image.registered_extensions()
-    index: dict[tuple[str, ...], list[Path]] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in extensions and not path.name.startswith(".") and path.is_file():
-            parts = path.relative_to(folder).with_suffix("").parts
-            for start in range(len(parts)):
-                index.setdefault(parts[start:], []).append(path)
-    return index
-
-
-def _matching(index: dict[tuple[str, ...], list[Path]], folder: Path, name: str) -> list[Path]:
-    """Return the photos that match a camera's name best.
-
-    The longest matching path wins, then files outside deeper subfolders, then files with the exact extension.
-    """
-    wanted = PurePosixPath(name.replace("\\", "/"))
-    known = wanted.suffix.lower() in Image.registered_extensions()
-    parts = tuple(part for part in (wanted.with_suffix("") if known else wanted).parts if part not in ("..", "/"))
-    for start in range(len(parts)):
-        found = index.get(parts[start:], [])
-        if found:
-            direct = [path for path in found if path.parent == folder.joinpath(*parts[start:-1])] or found
-            return [path for path in direct if path.suffix == wanted.suffix] or direct
-    return []

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
+import math
 from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import pytest
+import torch
 from httpx_sse import ServerSentEvent, connect_sse
+from PIL import Image
 
 from tests.api.service import PATIENCE, Service, wait_for
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import cameras, wall, write_files
 
 #: Region that freezes every Gaussian in view, but not those at the corners of the wall.
 IN_VIEW = {"name": "middle", "select": "sphere=0,0,3,2.5", "freeze": True}
@@ -74,6 +78,56 @@ def test_what_only_the_plan_finds_is_an_event(service: Service, files: dict[str,
         assert (last.event, last.json()["status"], last.json()["code"]) == ("problem", 422, "invalid-settings")
         plain = client.post("/v1/jobs", **request(files, regions=[IN_VIEW]))
         assert (plain.status_code, plain.json()) == (422, last.json())
+
+
+def blender(**lens: Any) -> bytes:
+    """Return a transforms_train.json of the views of `cameras`, all but one without their sizes."""
+    flip = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64).diag()
+    frames = [
+        {
+            "file_path": f"train/{view.name}",
+            "transform_matrix": (torch.linalg.inv(view.world_to_camera) @ flip).tolist(),
+        }
+        for view in cameras()
+    ]
+    frames[1] |= {"w": 64, "h": 48}
+    return json.dumps({"camera_angle_x": 2 * math.atan(0.5), **lens, "frames": frames}).encode()
+
+
+def photo(name: str) -> tuple[str, tuple[str, bytes]]:
+    file = io.BytesIO()
+    Image.linear_gradient("L").resize((128, 96)).save(file, "PNG")
+    return "photos", (name, file.getvalue())
+
+
+def test_plans_tell_what_was_done_to_cameras_and_photos(service: Service, files: dict[str, bytes]) -> None:
+    with service.client() as client:
+        asked = request({**files, "cameras": blender(k1=0.1)})
+        refused = client.post("/v1/jobs", **asked)
+        assert (refused.status_code, refused.json()["code"]) == (422, "invalid-cameras")
+        assert "gives no size. Add the sizes" in refused.json()["detail"]
+        asked["files"] += [photo("train/view_0.png"), photo("train/view_2.png")]
+        answer = client.post("/v1/jobs", **asked)
+        assert answer.status_code == 200, answer.text
+        lines = [f"{line['item']}: {line['decision']}" for line in answer.json()["plan"]["decisions"]]
+        assert "lenses: the photos are undistorted" in lines
+        assert "photos: warning: 1 of 3 views are left out" in lines
+        assert answer.json()["views"] == 2
+
+
+def test_cameras_that_do_not_fit_are_refused_at_once(service: Service, files: dict[str, bytes]) -> None:
+    panorama = blender(camera_model="EQUIRECTANGULAR", w=64, h=32)
+    with service.client() as client:
+        for name, content, detail in (
+            ("transforms.json", panorama, "which has no pinhole part"),
+            ("cameras.xml", b"<?xml version='1.0'?>", "It may be cameras of Metashape."),
+            ("reconstruction.json", b'[{"cameras": {}, "shots": {}}]', "export_colmap"),
+        ):
+            asked = request(files)
+            asked["files"][1] = ("cameras", (name, content))
+            answer = client.post("/v1/jobs", **asked)
+            assert (answer.status_code, answer.json()["code"]) == (422, "invalid-cameras")
+            assert detail in answer.json()["detail"]
 
 
 def test_nobody_plans_for_who_has_left(service: Service, files: dict[str, bytes]) -> None:

@@ -1,0 +1,204 @@
+"""Tests that camera files of many tools give the same three cameras, and that others name the way out.
+
+The files in `captures` have the form in which each tool writes them; those of `colmap4_rig` are written by COLMAP.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from sgsst_core.errors import CameraError
+from sgsst_core.files.camera_advice import advice_for_name
+from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.photos import check_photos
+from sgsst_core.scene.camera import Camera
+from tests.sgsst_core.files.test_camera_files import HEIGHT, WIDTH, views
+
+CAPTURES = Path(__file__).parent / "captures"
+#: nerfstudio's axes: x, z, -y of COLMAP's world.
+NERFSTUDIO = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+
+
+def assert_close(found: list[Camera], expected: list[Camera], world: torch.Tensor | None = None) -> None:
+    """Compare cameras, in a world that is rotated by a matrix [3, 3]."""
+    assert len(found) == len(expected)
+    for a, b in zip(found, expected, strict=True):
+        assert (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == pytest.approx((b.width, b.height, b.fx, b.fy, b.cx, b.cy))
+        pose = b.world_to_camera.clone()
+        if world is not None:
+            pose[:3, :3] = pose[:3, :3] @ world.T
+        assert torch.allclose(a.world_to_camera, pose, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("tool", "models"),
+    [
+        ("inria", [None, None, None]),
+        ("opensplat", [None, None, None]),
+        ("lichtfeld", [None, None, None]),
+        ("polycam", [None, None, None]),
+        ("record3d", [None, None, None]),
+        ("metashape", [None, None, None]),
+        ("colmap4_rig", ["SIMPLE_RADIAL"] * 3),
+        ("realityscan", ["FULL_OPENCV"] * 3),
+        ("frames", ["OPENCV_FISHEYE", None, "OPENCV"]),
+    ],
+)
+def test_folders_of_many_tools_hold_the_same_cameras(tool: str, models: list[str | None]) -> None:
+    found = read_cameras(CAPTURES / tool)
+    assert_close(found, views())
+    assert [view.lens and view.lens.model for view in found] == models
+
+
+def test_nerfstudio_has_axes_of_its_own() -> None:
+    found = read_cameras(CAPTURES / "nerfstudio")
+    assert_close(found, views(), NERFSTUDIO)
+    assert {view.lens and view.lens.coefficients[:4] for view in found} == {(0.05, -0.01, 0.001, -0.0005)}
+
+
+def test_cameras_of_a_nerfstudio_training_run_show_the_trained_scene() -> None:
+    """The training frame is scale * (T0 x), where `transform` is T0 times `applied_transform`."""
+    stored = json.loads((CAPTURES / "nerfstudio_trained" / "dataparser_transforms.json").read_text())
+    transform = torch.tensor(stored["transform"], dtype=torch.float64)
+    points = torch.randn(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    trained = stored["scale"] * (points @ transform[:, :3].T + transform[:, 3])
+    for view, expected in zip(read_cameras(CAPTURES / "nerfstudio_trained"), views(), strict=True):
+        local = trained @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+        original = points @ expected.world_to_camera[:3, :3].T + expected.world_to_camera[:3, 3]
+        assert torch.allclose(local, stored["scale"] * original, atol=1e-9)
+
+
+def photos_of_blender(folder: Path) -> Path:
+    for view in views():
+        path = folder / "train" / view.name
+        path.parent.mkdir(exist_ok=True)
+        Image.new("RGBA", (WIDTH, HEIGHT)).save(path)
+    return folder
+
+
+def test_blender_folders_have_their_sizes_from_photos(tmp_path: Path) -> None:
+    elsewhere = photos_of_blender(tmp_path)
+    assert_close(read_cameras(CAPTURES / "blender", elsewhere), views())
+    assert_close(read_cameras(CAPTURES / "blender", elsewhere / "train"), views())
+    with pytest.raises(CameraError, match="gives no size, and there is no image of its name among the photos"):
+        read_cameras(CAPTURES / "blender", tmp_path_without_photos(tmp_path))
+    beside = tmp_path / "beside"
+    shutil.copytree(CAPTURES / "blender", beside)
+    photos_of_blender(beside)
+    assert_close(read_cameras(beside), views())
+    assert [photo and photo.path.parent.name for photo in check_photos(beside, read_cameras(beside))] == ["train"] * 3
+
+
+def tmp_path_without_photos(folder: Path) -> Path:
+    (folder / "empty").mkdir()
+    return folder / "empty"
+
+
+def test_sizes_are_never_looked_up_outside_of_the_photos(tmp_path: Path) -> None:
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "secret.png")
+    (tmp_path / "photos").mkdir()
+    content = json.loads((CAPTURES / "blender" / "transforms_train.json").read_text())
+    for name in ("../secret.png", str(tmp_path / "secret.png")):
+        content["frames"] = [content["frames"][0] | {"file_path": name}]
+        file = tmp_path / "photos" / "transforms.json"
+        file.write_text(json.dumps(content))
+        assert read_cameras(file)[0].width == WIDTH
+        with pytest.raises(CameraError, match="no image of its name among the photos"):
+            read_cameras(file, tmp_path / "photos")
+
+
+def test_photos_reduced_by_2_belong_to_cameras_of_the_full_size(tmp_path: Path) -> None:
+    (tmp_path / "images_2").mkdir()
+    for view in views():
+        Image.new("RGB", (WIDTH // 2, HEIGHT // 2)).save(tmp_path / "images_2" / view.name)
+    for capture in ("frames", "metashape"):
+        cameras = read_cameras(CAPTURES / capture)
+        for folder in (tmp_path, tmp_path / "images_2"):
+            found = check_photos(folder, cameras)
+            assert [photo and photo.size for photo in found] == [(WIDTH // 2, HEIGHT // 2)] * 3
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse/1", "sparse", "colmap/sparse/0", "."])
+def test_layouts_of_colmap_projects(tmp_path: Path, place: str) -> None:
+    shutil.copytree(CAPTURES / "metashape" / "sparse" / "0", tmp_path / "project" / place)
+    for name in ("points3D.txt", "points3D.bin"):
+        (tmp_path / "project" / place / name).unlink(missing_ok=True)
+    assert_close(read_cameras(tmp_path / "project"), views())
+
+
+def test_the_first_model_and_the_own_transforms_of_a_project_come_first(tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    shutil.copytree(CAPTURES / "metashape" / "sparse" / "0", project / "colmap" / "sparse" / "0")
+    shutil.copy(CAPTURES / "nerfstudio" / "transforms.json", project)
+    assert_close(read_cameras(project), views(), NERFSTUDIO)
+    for model in ("10", "2", "1"):
+        shutil.copytree(CAPTURES / "colmap4_rig" / "sparse" / "0", project / "sparse" / model)
+    shutil.copytree(CAPTURES / "realityscan" / "sparse" / "1", project / "sparse" / "1", dirs_exist_ok=True)
+    assert [view.name for view in read_cameras(project)] == [f"cam{index}/0001.jpg" for index in range(3)]
+    shutil.rmtree(project / "sparse" / "1")
+    (project / "sparse" / "2" / "cameras.bin").unlink()
+    (project / "sparse" / "2" / "images.bin").unlink()
+    shutil.copytree(CAPTURES / "metashape" / "sparse" / "0", project / "sparse" / "2", dirs_exist_ok=True)
+    assert [view.name for view in read_cameras(project)] == [view.name for view in views()]
+
+
+def test_a_rig_without_points_is_read(tmp_path: Path) -> None:
+    names = {path.name for path in (CAPTURES / "colmap4_rig" / "sparse" / "0").iterdir()}
+    assert names == {"cameras.bin", "images.bin", "rigs.bin", "frames.bin"}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("cameras.xml", '<?xml version="1.0"?>\n<document version="2.0.0">\n <chunk label="1">', "Metashape.*--xml"),
+        ("cameras.csv", "\ufeff#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2\na.jpg,1,2,3", "RealityCapture.*--csv"),
+        ("bundle.out", "# Bundle file v0.3\n3 100\n", "a Bundler file.*automatic_reconstructor"),
+        ("database.db", "SQLite format 3\0", "database of COLMAP, which has no poses.*sparse/0"),
+        ("scan.r3d", "PK\3\4", "data of Record3D.*ns-process-data record3d"),
+        ("metadata.json", '{"w": 1920, "h": 1440, "K": [1], "poses": [[0, 0, 0, 1, 0, 0, 0]]}', "data of Record3D"),
+        ("1.json", '{"t_00": 1, "t_01": 0, "t_23": 4, "fx": 500}', "raw data of Polycam"),
+        ("reconstruction.json", '[{"cameras": {}, "shots": {}, "points": {}}]', "OpenSfM.*export_colmap"),
+        ("sfm_data.json", '{"sfm_data_version": "0.3", "views": []}', "OpenMVG.*openMVG2Colmap"),
+        ("transforms_train.json", '[{"file_path": "a.png", "transform": []}]', "`ns-export cameras`.*no focal"),
+    ],
+)  # fmt: skip
+def test_other_formats_name_the_way_out(tmp_path: Path, name: str, content: str, message: str) -> None:
+    path = tmp_path / name
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(CameraError, match=rf"{name}: is .*{message}"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("keyframes/corrected_cameras/1.json", "raw data of Polycam"),
+        ("EXR_RGBD/metadata.json", "data of Record3D"),
+        ("opensfm/reconstruction.json", "OpenSfM"),
+        ("sfm_data.json", "OpenMVG"),
+        ("bundle.out", "Bundler"),
+    ],
+)
+def test_folders_of_other_tools_name_the_way_out(tmp_path: Path, name: str, message: str) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("{}")
+    with pytest.raises(CameraError, match=message):
+        read_cameras(tmp_path)
+
+
+def test_names_alone_suggest_a_format() -> None:
+    assert advice_for_name("My Export.CSV").startswith(" It may be cameras of RealityCapture. ")
+    assert advice_for_name("cameras.zip") == ""
+
+
+def test_a_pinhole_of_a_frame_overrides_the_lens_of_the_file() -> None:
+    pinhole = read_cameras(CAPTURES / "frames")[1]
+    assert pinhole == replace(pinhole, lens=None)
