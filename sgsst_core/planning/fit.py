@@ -27,10 +27,15 @@ from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 _LITTLE_SHOWN, _MUCH_UNCOVERED = 0.25, 0.1
 #: Cameras that together see less than half of the scene are refused if a typical view is nearly empty.
 _NEARLY_NOTHING, _MOSTLY_UNCOVERED, _HALF = 0.01, 0.4, 0.5
-#: PSNR in dB below which photos are reported. Right photos reach 26 in every view; cropped by 10 %, they have 20.
-_UNLIKE_PSNR = 21.0
-#: Gaussians, cameras and pixels that are looked at.
-_GAUSSIANS, _CAMERAS, _VIEWS, _SIDE, _PHOTO_SIDE = 20_000, 200, 8, 128, 256
+#: PSNR in dB below which photos are reported. Right photos have 26 to 31; cropped by 10 %, 20.
+_UNLIKE_PSNR = 22.0
+#: Gaussians, cameras and rendered views that are looked at.
+_GAUSSIANS, _CAMERAS, _VIEWS = 20_000, 200, 4
+#: Longer side in pixels of rendered views, and of those that are compared. Comparing averages of pixels matters: small
+#: Gaussians are wider and brighter in small renders.
+_SIDE, _COMPARED_SIDE = 256, 128
+#: Coverage of pixels that are compared, and least fraction of them in a view. A scan has no background, its photos do.
+_COVERED, _LEAST_COMPARED = 0.98, 0.02
 #: Added to squared errors, so that equal images have a finite PSNR.
 _TINY = 1e-12
 
@@ -115,15 +120,16 @@ def compare_photos(
     doubtful = [index for index, photo in enumerate(photos) if photo.ambiguous]
     if doubtful:
         some = spread(doubtful, _VIEWS)
-        stored = mean(likeness.psnr(photos[index], cameras[index]) for index in some)
-        turned = mean(likeness.psnr(replace(photos[index], oriented=True), cameras[index]) for index in some)
+        stored = mean(likeness.psnr(photos[index], cameras[index]) or 0.0 for index in some)
+        turned = mean(likeness.psnr(replace(photos[index], oriented=True), cameras[index]) or 0.0 for index in some)
         if turned > stored:
             photos = [replace(photo, oriented=True) if photo.ambiguous else photo for photo in photos]
         used = f"the EXIF orientation of {len(doubtful)} photos is {'applied' if turned > stored else 'ignored'}"
         reason = f"PSNR against renders is {max(stored, turned):.1f} dB so, and {min(stored, turned):.1f} dB otherwise"
         decisions.append(Decision("photos", used, reason))
     pairs = spread(list(zip(photos, cameras, strict=True)), _VIEWS)
-    found = median(likeness.psnr(photo, camera) for photo, camera in pairs)
+    values = [likeness.psnr(photo, camera) for photo, camera in pairs]
+    found = median([value for value in values if value is not None] or [math.inf])
     if found < _UNLIKE_PSNR:
         decisions.append(
             Decision(
@@ -144,13 +150,26 @@ class _Likeness:
         self._scene, self._rasterizer = scene, make_rasterizer("cpu", scene, near=near)
         self._renders: dict[str, tuple[Tensor, Tensor]] = {}
 
-    def psnr(self, photo: Photo, camera: Camera) -> float:
-        """Return the PSNR in dB of a photo against the render of its view."""
-        view = resized(camera, min(camera.side, _PHOTO_SIDE))
+    def psnr(self, photo: Photo, camera: Camera) -> float | None:
+        """Return the PSNR in dB of a photo against its view's render; None if the scene covers too little of it."""
+        view = resized(camera, min(camera.side, _SIDE))
         if view.name not in self._renders:
             colors = view_colors(self._scene.sh_dc, rest_colors(self._scene.sh_rest, self._scene.means, view))
-            self._renders[view.name] = self._rasterizer.render(colors, view), self._rasterizer.coverage(view)
-        return fitted_psnr(load_photo(photo, view), *self._renders[view.name])
+            coverage = self._rasterizer.coverage(view)[..., None]
+            self._renders[view.name] = _averaged(self._rasterizer.render(colors, view)), _averaged(coverage)[..., 0]
+        render, coverage = self._renders[view.name]
+        compared = coverage > _COVERED
+        if float(compared.double().mean()) < _LEAST_COMPARED:
+            return None
+        return fitted_psnr(_averaged(load_photo(photo, view)), render, compared)
+
+
+def _averaged(image: Tensor) -> Tensor:
+    """Return an image [H, W, C] reduced to about `_COMPARED_SIDE` pixels, by averages of squares of pixels."""
+    factor = max(1, max(image.shape[:2]) // _COMPARED_SIDE)
+    if factor == 1 or min(image.shape[:2]) < factor:
+        return image
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0)
 
 
 def fitted_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:
@@ -159,7 +178,7 @@ def fitted_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:
     Args:
         photo: Image [H, W, 3].
         render: Image of the same size.
-        weight: Weight of each pixel, [H, W]; such as its coverage, because a scan has no background.
+        weight: Weight of each pixel, [H, W].
     """
     w = weight.double().flatten()[:, None]
     x, y = photo.double().flatten(0, 1), render.double().flatten(0, 1)
