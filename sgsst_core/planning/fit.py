@@ -93,8 +93,8 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
         return []
     text = f"a typical view has {shown.typical:.1%} of the Gaussians in its frame and {uncovered:.0%} uncovered pixels"
     advice = (
-        "use the cameras of the scene's own training run and world; a scene exported by nerfstudio needs its "
-        "dataparser_transforms.json beside transforms.json"
+        "use the cameras of the scene's own training run and world. With nerfstudio, put the run's "
+        "dataparser_transforms.json beside transforms.json; for a scene trained on COLMAP's model, give that model"
     )
     if shown.typical < _NEARLY_NOTHING and shown.together < _HALF and uncovered > _MOSTLY_UNCOVERED:
         raise CameraError(

@@ -8,6 +8,7 @@ which COLMAP and nerfstudio share.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -118,27 +119,35 @@ def undistorted(camera: Camera) -> Camera:
             f"Camera {camera.name!r}: photos of the camera model {lens.model} cannot be undistorted here. Undistort "
             "them with `colmap image_undistorter` and give its cameras and images, or leave the photos out."
         )
-    low, high = 0.0, 1.0
-    if _fills(camera, lens, high):
-        low = high
-    while high - low > 1e-4:
-        middle = (low + high) / 2
-        low, high = (middle, high) if _fills(camera, lens, middle) else (low, middle)
-    if low < _LEAST_FRAME:
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    scale = _largest_scale(lens, (camera.width, camera.height), intrinsics)
+    if scale < _LEAST_FRAME:
         raise CameraError(
             f"Camera {camera.name!r}: its distortion ({lens.model} {', '.join(f'{k:g}' for k in lens.coefficients)}) "
             "leaves no image. Check the coefficients, or leave the photos out."
         )
-    width, height = (max(1, int(side * low)) for side in (camera.width, camera.height))
+    width, height = (max(1, int(side * scale)) for side in (camera.width, camera.height))
     x, y = width / camera.width, height / camera.height
     return replace(camera, width=width, height=height, cx=camera.cx * x, cy=camera.cy * y)
 
 
-def _fills(camera: Camera, lens: Lens, scale: float) -> bool:
+@functools.lru_cache(maxsize=1024)  # most cameras of a capture share their lens
+def _largest_scale(lens: Lens, size: tuple[int, int], intrinsics: tuple[float, float, float, float]) -> float:
+    """Return the largest factor, at most 1, by which a frame has to be reduced to lie inside the photo."""
+    low, high = 0.0, 1.0
+    if _fills(lens, size, intrinsics, high):
+        return high
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        low, high = (middle, high) if _fills(lens, size, intrinsics, middle) else (low, middle)
+    return low
+
+
+def _fills(lens: Lens, size: tuple[int, int], intrinsics: tuple[float, float, float, float], scale: float) -> bool:
     """Return whether a frame reduced by a factor lies inside the photo, which maps to it without folds."""
-    across = torch.linspace(0, 1, _NODES, dtype=torch.float64)
-    x = scale * (across * camera.width - camera.cx) / camera.fx
-    y = scale * (across * camera.height - camera.cy) / camera.fy
+    fx, fy, cx, cy = intrinsics
+    along = torch.linspace(0, 1, _NODES, dtype=torch.float64)
+    x, y = scale * (along * size[0] - cx) / fx, scale * (along * size[1] - cy) / fy
     u, v = lens.positions(*torch.meshgrid(x, y, indexing="xy"))
     right, down = (u.diff(dim=1)[:-1], v.diff(dim=1)[:-1]), (u.diff(dim=0)[:, :-1], v.diff(dim=0)[:, :-1])
     upright = right[0] * down[1] - right[1] * down[0] > 0
