@@ -244,6 +244,23 @@ def test_plan_tells_what_would_be_left_out(files: Files, capsys: pytest.CaptureF
     assert "position weights" in capsys.readouterr().out
 
 
+def test_plan_and_check_report_lenses(files: Files, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    capture = Path(__file__).parents[2] / "sgsst_core" / "files" / "captures" / "nerfstudio"
+    write_scene(files.ply, replace(ball(), means=ball().means - torch.tensor([0.0, 0.0, 3.0])))
+    for name in ("img_0", "img_1", "img_2"):
+        Image.new("RGB", (160, 120)).save(tmp_path / f"{name}.png")
+    command = [str(files.ply), "--cameras", str(capture), "--resolution", "80"]
+    plan = ["plan", *command, "--style", str(files.style), "--backbone", "vgg16", "--out", str(tmp_path / "plan.json")]
+    assert main(["check", *command]) == 0
+    assert "views: lenses" in capsys.readouterr().out
+    assert main(plan) == 0
+    assert "only the pinhole part" in capsys.readouterr().out
+    assert main([*plan, "--images", str(tmp_path)]) == 0
+    items = [(line["item"], line["decision"]) for line in json.loads((tmp_path / "plan.json").read_text())["decisions"]]
+    assert ("lenses", "the photos are undistorted") in items
+    assert ("photos", "3 are resized to their views") in items
+
+
 def test_plan_replaces_none_of_its_inputs(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
     for out in (files.ply, files.cameras, files.ply.parent):
