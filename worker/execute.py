@@ -16,9 +16,9 @@ from sgsst_core.files.json_files import write_json
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
+from sgsst_core.quality.compression import CompressionLoss, measure_compression
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
-from sgsst_core.quality.packed import PackedLoss, measure_packed
 from sgsst_core.report.charts import write_loss_chart
 from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import bought, build_report, plan_json, sent_json
@@ -56,7 +56,7 @@ class Result:
     after: Evaluation
     bought: dict[str, Any] | None = None
     report_error: str | None = None
-    packed: PackedLoss | None = None
+    packed: CompressionLoss | None = None
     weights: ScaleWeights = EVEN
 
     @property
@@ -202,7 +202,7 @@ def _only_colors_change(job: Job) -> bool:
     return file.retained is None and file.copies is None and not (attenuation and file.scene.sh_degree)
 
 
-def _write_packed(job: Job) -> PackedLoss | None:
+def _write_packed(job: Job) -> CompressionLoss | None:
     """Write the stylized scene in a compressed format beside the PLY, and measure the loss of quality."""
     path, format, stylizer = job.outputs.packed, job.outputs.packed_format, job.stylizer
     if path is None or format is None:
@@ -210,11 +210,13 @@ def _write_packed(job: Job) -> PackedLoss | None:
     scene = replace(stylizer.job.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
     write_scene(path, scene, format)
     settings = stylizer.job.settings
-    return measure_packed(path, scene, stylizer.job.views.cameras, background=settings.background, near=settings.near)
+    return measure_compression(
+        path, scene, stylizer.job.views.cameras, background=settings.background, near=settings.near
+    )
 
 
 def _write_reports(
-    job: Job, stopped: Stopped, before: Evaluation, after: Evaluation, packed: PackedLoss | None
+    job: Job, stopped: Stopped, before: Evaluation, after: Evaluation, packed: CompressionLoss | None
 ) -> Exception | None:
     """Write the reports beside the PLY. Return an error instead of raising it, because the PLY is already written."""
     stylizer, outputs = job.stylizer, job.outputs

@@ -43,7 +43,7 @@ from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import PlanningProgress, ShowPlanning
-from sgsst_core.quality.packed import measure_packed
+from sgsst_core.quality.compression import measure_compression
 from sgsst_core.regions.definition import Regions
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
@@ -208,7 +208,7 @@ def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]
     """Compress a job's result, staged in place of its scene, into a file whose suffix determines the format.
 
     Returns:
-        Loss of the compression: `PackedLoss` as JSON.
+        Loss of the compression: `CompressionLoss` as JSON.
     """
     source, settings = scene_request(staged, parameters), parameters.settings()
     scene, format = read_scene(source.scene).scene, format_of_name(name)
@@ -216,7 +216,7 @@ def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]
     with Path(name).open("wb") as output:
         encode_scene(output, scene, format, Path(name))
     cameras = read_capture(source, scene, staged.photos).fitted(settings).cameras
-    return measure_packed(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
+    return measure_compression(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
 
 
 WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], dict[str, Any]]] = {

@@ -44,7 +44,7 @@ MOMENTS = (1, 2, 4, 8, 16, 32)
 PHASE_1 = 0.15
 #: Function that returns the phases of a variant, given the number of scales. A phase is (name, scale counted from the
 #: coarsest or None for all scales, fraction of the time).
-Shares = Callable[[int], list[tuple[str, int | None, float]]]
+Fractions = Callable[[int], list[tuple[str, int | None, float]]]
 
 
 def _two_phases(scales: int) -> list[tuple[str, int | None, float]]:
@@ -74,13 +74,13 @@ class Variant:
     Attributes:
         name: Name for `--variants`.
         what: Human-readable description.
-        shares: Function that returns the phases of the variant.
+        fractions: Function that returns the phases of the variant.
         settings: Settings that override the standard preset.
     """
 
     name: str
     what: str
-    shares: Shares = _two_phases
+    fractions: Fractions = _two_phases
     settings: dict[str, Any] = field(default_factory=dict)
 
 
@@ -146,20 +146,20 @@ class _TimedStylizer(Stylizer):
     """Stylizer whose phases and learning rate follow the clock instead of the step count."""
 
     budget: float
-    shares: list[tuple[str, int | None, float]]
+    fractions: list[tuple[str, int | None, float]]
 
     @property
     def phase(self) -> Phase:
         """Phase at the elapsed optimization time."""
         end = 0.0
-        for stage, scale, fraction in self.shares[:-1]:
+        for stage, scale, fraction in self.fractions[:-1]:
             end += fraction * self.budget
             if self.seconds < end:
                 return Phase(stage, 1, scale)
-        stage, scale, _ = self.shares[-1]
+        stage, scale, _ = self.fractions[-1]
         return Phase(stage, 1, scale)
 
-    def share_done(self) -> float:
+    def fraction_done(self) -> float:
         """Return the elapsed fraction of the time budget."""
         return min(self.seconds / self.budget, 1.0)
 
@@ -205,7 +205,7 @@ def error_time(
     exact = Float32Reference(Stylizer.planned(scene, cameras, style, base, weights=weights), style_loss="sos")
     views = exact.views.covered
     start = exact.evaluate(views, scene.sh_dc)
-    running = [_begin(variant, seconds, (scene, cameras, style), base, weights) for variant in variants]
+    running = [_prepared(variant, seconds, (scene, cameras, style), base, weights) for variant in variants]
     for part in range(1, SLICES + 1):
         for curve, stylizer in running:
             if stylizer is None:
@@ -221,7 +221,7 @@ def error_time(
     return [replace(curve, sh_dc=stylizer.stylized() if stylizer else None) for curve, stylizer in running]
 
 
-def _begin(
+def _prepared(
     variant: Variant,
     seconds: float,
     inputs: tuple[Scene, Sequence[Camera], Tensor],
@@ -239,7 +239,7 @@ def _begin(
     if reason:
         return Curve(variant, [], left_out=reason), None
     stylizer.budget = seconds
-    stylizer.shares = variant.shares(max(len(stylizer.job.scales(index)) for index in stylizer.job.views.covered))
+    stylizer.fractions = variant.fractions(max(len(stylizer.job.scales(index)) for index in stylizer.job.views.covered))
     return Curve(variant, [], preparation=_prepare(stylizer)), stylizer
 
 
@@ -248,7 +248,7 @@ def _prepare(stylizer: _TimedStylizer) -> float:
     started = time.perf_counter()
     for index in stylizer.job.views.covered:
         chosen = stylizer.job.scales(index)
-        phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.shares]
+        phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.fractions]
         stylizer.job.style_targets(stylizer.job.views.cameras[index])
         scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
         stylizer.job.view_targets.target(index, scales, stylizer.behind(index))
@@ -343,8 +343,8 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], scale: int | None) -> Floa
         for curve in curves
     ]
     for index, curve in enumerate(curves):
-        look = {"marker": _MARKERS[index % len(_MARKERS)], "color": color_of(index), "label": curve.variant.name}
-        draw_points(axes, seconds[index], losses[index], markersize=4, linewidth=1, **look)
+        options = {"marker": _MARKERS[index % len(_MARKERS)], "color": color_of(index), "label": curve.variant.name}
+        draw_points(axes, seconds[index], losses[index], markersize=4, linewidth=1, **options)
     set_log_x(axes, log_limits(joined(seconds), X_MARGIN), "seconds of optimization")
     axes.set_title("mean of the scales" if scale is None else scale_name(scale))
     return joined(losses)

@@ -168,7 +168,7 @@ def fetch_network_weights(
     target = weights_file(folder, name)
     if source is None and all(_sound(folder, part) for part in _parts(name)):
         return target
-    _make_room(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
+    _require_space(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
     if source is not None:
         digest = sources.file_digest(source)
         _install(folder, _convert(name, source), _KNOWN_SOURCES.get(digest, source.name), digest)
@@ -204,7 +204,7 @@ def _convert(name: str, file: Path) -> dict[str, dict[str, Tensor]]:
     return {name: sources.read_state_dict(name, file)}
 
 
-def _make_room(folder: Path, needed: int) -> None:
+def _require_space(folder: Path, needed: int) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(folder).free

@@ -11,12 +11,12 @@ from torch import Tensor
 
 #: If a view shows more than this fraction of all Gaussians, the whole gradient is sent: gathering and scattering values
 #: would take more time than sending fewer values saves.
-DENSE_SHARE = 0.7
+DENSE_FRACTION = 0.7
 
 
 def gaussians_sent(shown: float, gaussians: int) -> float:
     """Return the number of Gaussians whose gradients are sent for a view that shows `shown` of them."""
-    return shown if shown <= DENSE_SHARE * gaussians else gaussians
+    return shown if shown <= DENSE_FRACTION * gaussians else gaussians
 
 
 class ShownGaussians:
@@ -37,7 +37,7 @@ class ShownGaussians:
         self.total = len(mask)
         self.count = int(mask.sum())
         whole = torch.nn.functional.pad(mask.to(torch.uint8), (0, -self.total % 8))
-        self._bits = (whole.view(-1, 8) << _places(mask.device)).sum(dim=1, dtype=torch.uint8)
+        self._bits = (whole.view(-1, 8) << _bit_positions(mask.device)).sum(dim=1, dtype=torch.uint8)
 
     @staticmethod
     def nbytes(gaussians: int) -> int:
@@ -58,10 +58,10 @@ class ShownGaussians:
 
     def _device_indices(self) -> Tensor:
         """Compute `indices` on any device without synchronizing with it."""
-        mask = (self._bits[:, None] >> _places(self._bits.device)).bitwise_and_(1).view(-1)[: self.total]
+        mask = (self._bits[:, None] >> _bit_positions(self._bits.device)).bitwise_and_(1).view(-1)[: self.total]
         return torch.nonzero_static(mask, size=self.count)[:, 0]
 
 
-def _places(device: torch.device) -> Tensor:
+def _bit_positions(device: torch.device) -> Tensor:
     """Return the positions of the bits in a byte."""
     return torch.arange(8, dtype=torch.uint8, device=device)

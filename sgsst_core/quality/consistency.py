@@ -33,7 +33,7 @@ COVERED = 0.9
 DEPTH_TOLERANCE = 0.02
 #: Maximum interpolation weight of invalid source pixels (outside the view, uncovered, or on another surface) in a valid
 #: pixel. It tolerates the rounding of positions at pixel centers, and is invisible in 8-bit images.
-_FOREIGN_SHARE = 1e-3
+_FOREIGN_FRACTION = 1e-3
 #: Fraction of comparable pixels below which a pair has no RMSE or LPIPS.
 MINIMUM_COMPARED = 0.01
 #: Number of pixels warped at a time. Each takes memory for about twenty values.
@@ -239,7 +239,7 @@ def find_warp(
         found = depth.known[band] & (z > 0) & (x >= 0) & (x <= other.width) & (y >= 0) & (y <= other.height)
         source, weight = _around(other_depth, x[found], y[found], z[found], tolerance)
         fraction = weight.sum(dim=0)
-        agrees = fraction > 1 - _FOREIGN_SHARE
+        agrees = fraction > 1 - _FOREIGN_FRACTION
         pixels.append(found.view(-1).nonzero()[agrees, 0] + top * camera.width)
         sources.append(source[:, agrees])
         weights.append(weight[:, agrees] / fraction[agrees])

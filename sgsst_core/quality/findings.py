@@ -119,7 +119,7 @@ def scene_findings(file: SceneFile) -> list[Finding]:
 
 #: Function that checks a slice of n Gaussians. For each question, it returns a mask [n] bool of extreme Gaussians and
 #: the checked values [n] of all Gaussians.
-_Look = Callable[[slice], Sequence[tuple[Tensor, Tensor]]]
+_Check = Callable[[slice], Sequence[tuple[Tensor, Tensor]]]
 
 
 @dataclass(frozen=True)
@@ -138,12 +138,12 @@ class _Scene:
         self.file, self.scene = file, file.scene
         self.center, self.extent = scene_extent(file.scene)
 
-    def ask(self, look: _Look, *questions: _Question, subject: Subject = "scene") -> list[Finding]:
+    def ask(self, check: _Check, *questions: _Question, subject: Subject = "scene") -> list[Finding]:
         """Check the scene slice by slice; return one finding per question with at least one extreme Gaussian."""
         counts = [0] * len(questions)
         worst = [(-math.inf, -1, math.nan)] * len(questions)  # (value to compare, Gaussian, value)
         for part in _parts(len(self.scene)):
-            for number, (extreme, value) in enumerate(look(part)):
+            for number, (extreme, value) in enumerate(check(part)):
                 count = int(extreme.sum())
                 if count:
                     counts[number] += count
@@ -163,17 +163,17 @@ class _Scene:
         return index if self.file.retained is None else int(np.flatnonzero(self.file.retained)[index])
 
     def invalid(self) -> list[Finding]:
-        kept = self.file.retained
-        if kept is None:
+        retained = self.file.retained
+        if retained is None:
             return []
-        first = int(np.flatnonzero(~kept)[0])
+        first = int(np.flatnonzero(~retained)[0])
         done = "stylize rejects the scene; --drop-invalid drops these Gaussians, from the result too"
         return [
             Finding(
                 "scene",
                 "NaN or infinite values, or no rotation",
                 self.file.dropped,
-                len(kept),
+                len(retained),
                 f"first: Gaussian {first}",
                 done,
             )
@@ -182,19 +182,19 @@ class _Scene:
     def rotations(self) -> list[Finding]:
         low, high = QUATERNION_LENGTHS
 
-        def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+        def check(part: slice) -> list[tuple[Tensor, Tensor]]:
             length = self.scene.quats[part].double().norm(dim=1)
             return [(length < low, length), (length > high, length)]
 
         normalized = "normalized in float64, like all quaternions"
         return self.ask(
-            look,
+            check,
             _Question(f"quaternion shorter than {low:g}", normalized, largest=False),
             _Question(f"quaternion longer than {high:g}", normalized),
         )
 
     def sizes(self) -> list[Finding]:
-        def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+        def check(part: slice) -> list[tuple[Tensor, Tensor]]:
             logarithms = self.scene.scales[part].double().sort(dim=1).values
             longest, middle = logarithms[:, 2], logarithms[:, 1]
             drawn = longest <= OVERFLOW_SCALE
@@ -208,7 +208,7 @@ class _Scene:
             ]
 
         return self.ask(
-            look,
+            check,
             _Question("size that overflows (value: its logarithm)", "never drawn"),
             _Question(
                 "longer than the scene's extent (value: ratio)",
@@ -226,12 +226,12 @@ class _Scene:
         )
 
     def opacities(self) -> list[Finding]:
-        def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+        def check(part: slice) -> list[tuple[Tensor, Tensor]]:
             opacity = self.scene.opacities[part].double().sigmoid()
             return [(opacity < ALPHA_MIN, opacity), (opacity > ALPHA_MAX, opacity)]
 
         return self.ask(
-            look,
+            check,
             _Question("opacity below 1/255", "neither drawn nor optimized", largest=False),
             _Question(f"opacity above {ALPHA_MAX:g}", f"drawn with opacity {ALPHA_MAX:g}, as in training"),
         )
@@ -417,12 +417,12 @@ def _uncovered(fractions: list[float], cameras: Sequence[Camera]) -> list[Findin
 def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
     """Report Gaussians that are hardly or never seen, given their total blend weights [N]."""
 
-    def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
         weights = blend_weights[part]
         return [(weights == 0, weights), ((weights > 0) & (weights < HARDLY_SEEN), weights)]
 
     return _Scene(file).ask(
-        look,
+        check,
         _Question(
             "in no view",
             "neither drawn nor optimized; their colors follow their neighbors' at the end (preset paper: unchanged)",
@@ -459,19 +459,19 @@ def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
     return found
 
 
-def _large_coefficients(values: Tensor | StoredHarmonics) -> _Look:
+def _large_coefficients(values: Tensor | StoredHarmonics) -> _Check:
     """Return a check for large SH coefficients in values [N, K, 3]."""
     if isinstance(values, StoredHarmonics):
         sizes = values.largest()
         return lambda part: [(sizes[part] > LARGE_COEFFICIENT, sizes[part])]
     held = values
 
-    def look(part: slice) -> list[tuple[Tensor, Tensor]]:
+    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
         lowest, highest = held[part].flatten(1).aminmax(dim=1)
         size = torch.maximum(-lowest, highest)
         return [(size > LARGE_COEFFICIENT, size)]
 
-    return look
+    return check
 
 
 def _parts(count: int) -> list[slice]:

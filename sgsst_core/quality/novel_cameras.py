@@ -22,7 +22,7 @@ from sgsst_core.scene.gaussians import Scene, sampled
 JUMP = 4.0
 #: Rotation between two cameras beyond which they are not neighbors: about the field of view of a photo. A view halfway
 #: between such cameras may show nothing that either of them sees.
-LARGEST_TURN = math.radians(60)
+LARGEST_ROTATION = math.radians(60)
 #: Maximum factor by which the median depth and the coverage of a novel view may lie outside the range of its neighbors'
 #: values. They exceed it inside an object or behind a wall. On the chord between two cameras of a 60-degree arc, they
 #: change by at most a third.
@@ -39,9 +39,9 @@ _COSINE_ROUNDING = 1e-6
 def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
     """Return the pairs of neighboring cameras between which novel cameras are placed.
 
-    Adjacent cameras of the list are paired. If most of them are not neighbors (see `JUMP` and `LARGEST_TURN`), the list
-    is assumed not to be in capture order, and a greedy walk to the nearest remaining camera replaces it. Pairs with the
-    same pose are omitted. The result is empty for fewer than two cameras.
+    Adjacent cameras of the list are paired. If most of them are not neighbors (see `JUMP` and `LARGEST_ROTATION`), the
+    list is assumed not to be in capture order, and a greedy walk to the nearest remaining camera replaces it. Pairs
+    with the same pose are omitted. The result is empty for fewer than two cameras.
     """
     if len(cameras) < 2:
         return []
@@ -56,7 +56,7 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
             (cameras[i], cameras[j])
             for i, j in itertools.pairwise(order)
             if float((centers[i] - centers[j]).norm()) <= reach
-            and bool(_similarly_turned(rotations[i], rotations[j]))
+            and bool(_similarly_rotated(rotations[i], rotations[j]))
             and not torch.allclose(cameras[i].world_to_camera, cameras[j].world_to_camera)
         ]
 
@@ -78,17 +78,17 @@ def _walk(centers: Tensor, rotations: Tensor) -> list[int]:
     order = [0]
     while bool(left.any()):
         here = order[-1]
-        similar = left & _similarly_turned(rotations, rotations[here])
+        similar = left & _similarly_rotated(rotations, rotations[here])
         candidates = (similar if bool(similar.any()) else left).nonzero()[:, 0]
         order.append(int(candidates[(centers[candidates] - centers[here]).norm(dim=1).argmin()]))
         left[order[-1]] = False
     return order
 
 
-def _similarly_turned(rotations: Tensor, rotation: Tensor) -> Tensor:
-    """Return whether rotations [..., 3, 3] differ from a given one by at most `LARGEST_TURN`, as [...] bool."""
+def _similarly_rotated(rotations: Tensor, rotation: Tensor) -> Tensor:
+    """Return whether rotations [..., 3, 3] differ from a given one by at most `LARGEST_ROTATION`, as [...] bool."""
     cosine = ((rotations * rotation).sum(dim=(-2, -1)) - 1) / 2  # trace(A B^T) = 1 + 2 cos(angle)
-    return cosine >= math.cos(LARGEST_TURN) - _COSINE_ROUNDING
+    return cosine >= math.cos(LARGEST_ROTATION) - _COSINE_ROUNDING
 
 
 @dataclass(frozen=True)

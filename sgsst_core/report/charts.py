@@ -117,13 +117,13 @@ def draw_line(axes: Axes, history: History, against: Against, values: Floats, co
         label = "_"  # one legend entry for all phases: matplotlib skips labels that start with an underscore
 
 
-def draw_points(axes: Axes, x: Floats, values: Floats, **look: Any) -> None:
+def draw_points(axes: Axes, x: Floats, values: Floats, **options: Any) -> None:
     """Draw points [n] that may lie on the border of the axes; do nothing if `x` is empty.
 
     matplotlib's layout would extend an empty, unclipped line to the corner of the figure.
     """
     if len(x):
-        axes.plot(x, values, clip_on=False, **look)
+        axes.plot(x, values, clip_on=False, **options)
 
 
 def mark_phases(axes: Axes, history: History, against: Against) -> None:

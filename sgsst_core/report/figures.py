@@ -168,8 +168,8 @@ def _draw_consistency(figure: Figure, against: Against, history: History, moment
         for reach, color in _REACHES.items():
             values = column(_consistency(moments, reach, metric))
             shown = drawable(x) & np.isfinite(values)
-            look = {"marker": "o", "markersize": 4, "color": color, "label": _reach_name(moments, reach)}
-            draw_points(axes, x[shown], values[shown], **look)
+            options = {"marker": "o", "markersize": 4, "color": color, "label": _reach_name(moments, reach)}
+            draw_points(axes, x[shown], values[shown], **options)
             if moments[0].get("step") == 0 and np.isfinite(values[0]):
                 axes.axhline(values[0], color=color, linestyle="--", linewidth=1)
         axes.set_title(_METRICS[metric])

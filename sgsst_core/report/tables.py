@@ -126,12 +126,12 @@ def prediction_table(report: dict[str, Any]) -> Table:
     ]
     if predicted.get("measuring") and measured.get("measuring") is not None:
         rows.append(_beside("measuring, total", predicted["measuring"], measured["measuring"], duration))
-        planned = _share(predicted["measuring"], predicted["job"] - predicted["measuring"])
+        planned = _fraction(predicted["measuring"], predicted["job"] - predicted["measuring"])
         rows.append(
             _beside(
                 "measuring, relative to the steps' time",
                 planned,
-                _share(measured["measuring"], report["seconds"]),
+                _fraction(measured["measuring"], report["seconds"]),
                 percent,
             )
         )
@@ -147,7 +147,7 @@ def prediction_table(report: dict[str, Any]) -> Table:
     return Table(columns, rows)
 
 
-def _share(part: float, whole: float) -> float | None:
+def _fraction(part: float, whole: float) -> float | None:
     """Return a part as a fraction of the whole; None if the whole is 0."""
     return part / whole if whole else None
 

@@ -18,7 +18,7 @@ class PhotosAhead:
     Photos are loaded into pinned memory, so that a copy is just another entry in the device's stream. This memory is
     not overwritten before the copy is done: PyTorch marks pinned memory with an event at each such copy, and reuses it
     only once the device has reached that event. At most one photo is prefetched at a time, and the thread exists only
-    between `begin` and `end`.
+    between `start` and `stop`.
 
     The thread may allocate pinned memory while a graph is being captured, which invalidates the capture, unless the
     capture is restricted to its own thread (`capture_error_mode="thread_local"`).
@@ -35,7 +35,7 @@ class PhotosAhead:
         self._thread: ThreadPoolExecutor | None = None
         self._next: tuple[int, Future[Tensor]] | None = None
 
-    def begin(self, index: int) -> None:
+    def start(self, index: int) -> None:
         """Start reading a photo in the thread; a different prefetched photo is discarded."""
         if self._next is not None:
             if self._next[0] == index:
@@ -57,8 +57,8 @@ class PhotosAhead:
             return self._copied(photo.result())
         return self._copied(self._pinned(index))
 
-    def end(self) -> None:
-        """Stop the thread, and discard what it has read. `begin` starts a new one."""
+    def stop(self) -> None:
+        """Stop the thread, and discard what it has read. `start` starts a new one."""
         if self._thread is not None:
             self._thread.shutdown(cancel_futures=True)
         self._thread = self._next = None

@@ -56,7 +56,7 @@ def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
 def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
     """Return the axes [3, 3] of each round and the maps along them, given samples [n, 3] of both distributions."""
     found: list[tuple[Tensor, list[_Map]]] = []
-    for axes in _turns():
+    for axes in _round_axes():
         axes = axes.to(source.device)
         along = zip((source @ axes).unbind(1), (wanted @ axes).unbind(1), strict=True)
         found.append((axes, [_along(values, others) for values, others in along]))
@@ -98,7 +98,7 @@ def _drawn(weights: Tensor) -> Tensor:
     return torch.searchsorted(running, steps).clamp_max(len(weights) - 1)
 
 
-def _turns() -> Iterator[Tensor]:
+def _round_axes() -> Iterator[Tensor]:
     """Yield the axes [3, 3] of each round as columns: red, green and blue first, then evenly distributed rotations."""
     yield torch.eye(3, dtype=torch.float64)
     for number in range(ROUNDS - 1):

@@ -164,7 +164,7 @@ class StylizationJob:
         return ends_with_transfer(self.settings, warm=self.plan.warm_start)
 
     @property
-    def keeps_chroma(self) -> bool:
+    def preserves_chroma(self) -> bool:
         """Whether only luminance changes."""
         return self.settings.preserve_colors == "luminance"
 

@@ -91,19 +91,19 @@ class JobStyles:
         targets = [loss.targets.of_style(style, view_size) for style in self.each]
         return combined(targets, weights)
 
-    def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, keep_chroma: bool = False) -> Tensor:
+    def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, preserve_chroma: bool = False) -> Tensor:
         """Transfer to each Gaussian the colors of its region's style; see `warm_start`.
 
         Args:
             sh_dc: [n, 3], colors of some of the scene's Gaussians.
             weights: [n] float64, total blend weights.
             rows: [N] bool, mask of these Gaussians.
-            keep_chroma: Whether to change luminance only.
+            preserve_chroma: Whether to change luminance only.
 
         Returns:
             [n, 3].
         """
-        transfer = luminance_start if keep_chroma else warm_start
+        transfer = luminance_start if preserve_chroma else warm_start
         if not self.each:
             return transfer(sh_dc, weights, self.own)
         assert self.regions is not None

@@ -112,7 +112,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     try:
         return _iterate(stylizer, callbacks or Callbacks())
     finally:
-        stylizer.job.view_targets.end_look_ahead()
+        stylizer.job.view_targets.end_prefetch()
 
 
 def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:

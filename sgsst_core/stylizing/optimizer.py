@@ -34,7 +34,7 @@ class ColorOptimizer:
         chroma_of: [n, 3], colors whose chroma is preserved: the optimized quantity is then each color's difference from
             them in luminance. None to let colors change freely.
         bounded: Whether to project colors to 0..1 after each step (`scene.screen`).
-        kept: [n, 1] bool, frozen colors, whose gradients are 0; None if there are none.
+        frozen: [n, 1] bool, frozen colors, whose gradients are 0; None if there are none.
     """
 
     def __init__(
@@ -44,10 +44,10 @@ class ColorOptimizer:
         chroma_of: Tensor | None = None,
         *,
         bounded: bool = False,
-        kept: Tensor | None = None,
+        frozen: Tensor | None = None,
     ) -> None:
         self._chroma_of = chroma_of
-        self._bounded, self._kept = bounded, kept
+        self._bounded, self._frozen = bounded, frozen
         self._colors = colors.requires_grad_()
         self._unit = unit
         self._fused = colors.is_cuda
@@ -111,8 +111,8 @@ class ColorOptimizer:
             return
         found = constrained(self._colors, self._chroma_of, bounded=self._bounded)
         unchanged = ~(largest <= LARGEST_GRADIENT)
-        if self._kept is not None:
-            unchanged = unchanged | self._kept
+        if self._frozen is not None:
+            unchanged = unchanged | self._frozen
         self._colors.copy_(torch.where(unchanged, self._colors, found))
 
     def moments(self) -> tuple[Tensor, Tensor]:

@@ -23,7 +23,7 @@ def transferred_colors(job: StylizationJob, colors: Tensor | None = None) -> Ten
     seen = job.plan.seen
     colors = job.scene.sh_dc[seen] if colors is None else colors
     weights = job.plan.survey.total_blend_weights[seen]
-    transferred = job.styles.transferred(colors, weights, seen, keep_chroma=job.keeps_chroma)
+    transferred = job.styles.transferred(colors, weights, seen, preserve_chroma=job.preserves_chroma)
     # `result_colors` derives colors that no view determines from those of their neighbors.
     return torch.where(job.plan.optimized[seen][:, None], transferred, colors)
 
@@ -50,16 +50,16 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
         change = neighbors_change(job.scene.means, change, weights)
     else:
         change = neighbors_change_by_region(job.scene.means, change, weights, regions)[unseen]
-    change = change.mean(dim=1, keepdim=True) if job.keeps_chroma else change
+    change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
     original = job.scene.sh_dc[unseen]
-    chroma_of = original if job.keeps_chroma else None
+    chroma_of = original if job.preserves_chroma else None
     colors[unseen] = constrained(original + change, chroma_of, bounded=job.settings.bounded)
     return colors
 
 
 def _transferred_last(job: StylizationJob, optimized: Tensor) -> Tensor:
     transferred = transferred_colors(job, optimized)
-    if not job.keeps_chroma:
+    if not job.preserves_chroma:
         return transferred
     bounded = constrained(transferred, job.scene.sh_dc[job.plan.seen], bounded=job.settings.bounded)
     return torch.where(transferred != optimized, bounded, optimized)  # frozen colors remain bit-identical

@@ -80,9 +80,9 @@ class Stylizer:
         self._optimizer = ColorOptimizer(
             self.sh_dc,
             job.network.unit,
-            views.scene.sh_dc.to(device) if job.keeps_chroma else None,
+            views.scene.sh_dc.to(device) if job.preserves_chroma else None,
             bounded=settings.bounded,
-            kept=self._frozen,
+            frozen=self._frozen,
         )
         self._order = ViewOrder(views.covered, settings.seed)
         #: Number of steps before a resume whose blend weights have yet to be cached again.
@@ -133,7 +133,7 @@ class Stylizer:
         """Phase of the next step; the last phase if all steps are done."""
         return phase_at(self.job.schedule, self.step)
 
-    def share_done(self) -> float:
+    def fraction_done(self) -> float:
         """Return the completed fraction of the schedule, 0 to 1, which determines the learning rate."""
         return self.step / max(self.job.total_steps - 1, 1)
 
@@ -170,7 +170,7 @@ class Stylizer:
         self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
         gradient, results, cost = self._mean_gradient(views, phase)
         with self.job.timer("optimizer"):
-            largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(self.share_done()))
+            largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(self.fraction_done()))
         with self.job.timer("communication"):
             self.job.team.check_drift(self.step + 1, self.sh_dc)
         terms = self._read(largest, results)
@@ -211,7 +211,7 @@ class Stylizer:
             with self.job.timer("prepare", whole=True):
                 self.cache_weights(index)
                 target = self.job.view_targets.target(index, scales, behind)
-                self._look_ahead(own_views[place + 1 :], phase)
+                self._prefetch(own_views[place + 1 :], phase)
                 style = self.job.style_targets(self.job.views.cameras[index])
             assert target.division is not None
             cost += target.division.cost(self.job.group.rank, self.job.network.halo)
@@ -269,7 +269,7 @@ class Stylizer:
             self.job.loss.divider.speeds = speeds
             self.job.view_targets.forget_division()
 
-    def _look_ahead(self, left: Sequence[int], phase: Phase) -> None:
+    def _prefetch(self, left: Sequence[int], phase: Phase) -> None:
         """Announce the view that this group processes next, so that its data can be read while the device works.
 
         The queue is only inspected, not refilled: a new round is drawn only when it is needed, because checkpoints
@@ -285,7 +285,7 @@ class Stylizer:
             index, phase = self._order.left[-1 - self.job.team.own_group], phase_at(self.job.schedule, self.step + 1)
         else:
             return
-        self.job.view_targets.look_ahead(index, phase.scales(self.job.scales(index)))
+        self.job.view_targets.prefetch(index, phase.scales(self.job.scales(index)))
 
     @property
     def coming(self) -> list[int]:

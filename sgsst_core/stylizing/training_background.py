@@ -39,12 +39,12 @@ def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style:
         return None
     red, green, blue = _uniform(seed, step, view)
     if kind == "palette":
-        pixels = _drawn_picture(style, green).reshape(-1, 3)
+        pixels = _drawn_image(style, green).reshape(-1, 3)
         red, green, blue = pixels[int(red * len(pixels))].tolist()
     return red, green, blue
 
 
-def _drawn_picture(style: Style, number: float) -> Tensor:
+def _drawn_image(style: Style, number: float) -> Tensor:
     """Return the image of a mixture that a random number in [0, 1) selects, with probabilities equal to the weights."""
     for image, weight in zip(style.images, style.weights, strict=True):
         number -= weight

@@ -31,7 +31,7 @@ class ViewTargets:
         loss: Loss that prepares the targets, of the same ranks that render the views.
         weighted: Whether statistics are weighted by rendered coverage.
         photos: Function that loads the content image [H, W, 3] of a view by its index; None for unstylized renders.
-            With a GPU it is also called in a thread, see `look_ahead`.
+            With a GPU it is also called in a thread, see `prefetch`.
         memory: Memory budget in bytes for everything that is cached about views. A quarter of it is for colors
             (`Views`), a quarter for coverage, and the rest for content and region maps.
         cache_content: Whether to cache content features that fit; False recomputes them at each visit, for comparison.
@@ -138,15 +138,15 @@ class ViewTargets:
         """
         return put_behind(image.to(self.loss.network.device), self.coverage(index)[scale], color, self._background)
 
-    def look_ahead(self, index: int, scales: Sequence[int]) -> None:
+    def prefetch(self, index: int, scales: Sequence[int]) -> None:
         """Start reading, on a GPU, the photo of the view whose target is requested next, if it will be needed."""
         if self._ahead is not None and self._needs_content(index, scales):
-            self._ahead.begin(index)
+            self._ahead.start(index)
 
-    def end_look_ahead(self) -> None:
-        """Stop prefetching until the next call of `look_ahead`."""
+    def end_prefetch(self) -> None:
+        """Stop prefetching until the next call of `prefetch`."""
         if self._ahead is not None:
-            self._ahead.end()
+            self._ahead.stop()
 
     def forget_division(self) -> None:
         """Clear the caches that depend on the division of work, because it is about to change."""

@@ -22,7 +22,7 @@ def test_stays_within_its_bound(case: Case) -> None:
 
 def test_the_cut_offs_are_met_to_the_ulp() -> None:
     """The fast projection and the reference both skip an opacity one ulp below 1/255, and draw one an ulp above."""
-    scene = gaussians._opacities_at_the_cut()
+    scene = gaussians._opacities_at_the_cutoff()
     for index, visible in ((0, 0), (2, 1), (3, 1)):
         one = scene.subset(torch.tensor([index]))
         assert len(project(one, camera()).gaussians) == visible

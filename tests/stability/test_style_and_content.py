@@ -5,20 +5,20 @@ from __future__ import annotations
 import pytest
 
 from sgsst_core.bench.stability import Case
-from sgsst_core.bench.stability import picture_cases as pictures
+from sgsst_core.bench.stability import image_cases as images
 from tests.stability.hard_cases import check
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
 
 
-@pytest.mark.parametrize("case", pictures.cases(), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", images.cases(), ids=lambda case: case.name)
 def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 
 
 def test_the_one_pass_variance_fails_where_ours_does_not() -> None:
     """Show that the case is hard: the usual one-pass formula gives NaN where ours stays within its bound."""
-    result = pictures._ratio(4, False)
+    result = images._ratio(4, False)
     assert result.passed
     lost = int(result.note.split("NaN in ")[1].split()[0])
     assert lost > 0

@@ -6,11 +6,11 @@ If the input must be rejected, the case checks that it is.
 
 from __future__ import annotations
 
-from sgsst_core.bench.stability import form_cases as forms
+from sgsst_core.bench.stability import format_cases as formats
 from sgsst_core.bench.stability import gaussian_cases as gaussians
+from sgsst_core.bench.stability import image_cases as images
 from sgsst_core.bench.stability import job_cases as jobs
 from sgsst_core.bench.stability import optimization_cases as optimization
-from sgsst_core.bench.stability import picture_cases as pictures
 from sgsst_core.bench.stability import precision_cases as precision
 from sgsst_core.bench.stability import view_cases as views
 from sgsst_core.bench.stability.case import Case, CaseResult, Group, Measurement, measure
@@ -18,7 +18,7 @@ from sgsst_core.bench.stability.case import Case, CaseResult, Group, Measurement
 __all__ = ["Case", "CaseResult", "Group", "Measurement", "all_cases", "measure"]
 
 
-_GROUPS = (gaussians, views, pictures, optimization, precision, jobs, forms)
+_GROUPS = (gaussians, views, images, optimization, precision, jobs, formats)
 
 
 def all_cases() -> list[Case]:

@@ -35,7 +35,7 @@ Group = Literal[
 #: Error bound of float32 images and coverage against float64, relative to the brightest color.
 IMAGE_BOUND = 1e-4
 #: Distance to a cutoff within which float32 and float64 may decide differently. Such a discontinuity is not an error.
-CLOSE_TO_CUT = 2e-5
+CLOSE_TO_CUTOFF = 2e-5
 #: Largest jump at a cutoff, relative to the color: the contribution of a Gaussian just above ALPHA_MIN, or of one that
 #: reduces a transmittance of up to 1e-2 to its cutoff.
 LARGEST_STEP = 1e-2
@@ -161,7 +161,7 @@ def compare_rasterizers(
     near: float = NEAR,
     colors: Tensor | None = None,
     expected_scene: Scene | None = None,
-    keep: Tensor | None = None,
+    rows: Tensor | None = None,
 ) -> CaseResult:
     """Return the largest error of `fast_rasterizers` against the float64 reference.
 
@@ -173,22 +173,22 @@ def compare_rasterizers(
         view: Camera to render with.
         near: Distance of the near plane in world units.
         colors: Colors [N, 3]; None for random colors in 0 to 2.
-        expected_scene: Scene that the reference renders: the rows `keep` of `scene`, whose other rows must contribute
-            nothing. None for `scene`.
-        keep: Mask [N] bool of the rows in `expected_scene`; None for all.
+        expected_scene: Scene that the reference renders: only the rows `rows` of `scene`, whose other rows must
+            contribute nothing. None for `scene`.
+        rows: Mask [N] bool of the rows in `expected_scene`; None for all.
     """
     generator = torch.Generator().manual_seed(5)
     if colors is None:
         colors = 2 * torch.rand(len(scene), 3, generator=generator)
     pixels = torch.randn(view.height, view.width, 3, generator=generator)
-    kept = torch.ones(len(scene), dtype=torch.bool) if keep is None else keep
+    rows = torch.ones(len(scene), dtype=torch.bool) if rows is None else rows
     reference = ReferenceRasterizer(expected_scene or scene, near=near)
-    band = reference.near_cutoff(view, CLOSE_TO_CUT)
+    band = reference.near_cutoff(view, CLOSE_TO_CUTOFF)
     brightest = max(float(colors.abs().max()) if len(colors) else 0.0, 1.0)
-    image, coverage = reference.render(colors[kept], view), reference.coverage(view)
+    image, coverage = reference.render(colors[rows], view), reference.coverage(view)
     pixels[band] = 0
     gradient = torch.zeros(len(scene), 3, dtype=torch.float64)
-    gradient[kept] = reference.color_gradient(pixels, view)
+    gradient[rows] = reference.color_gradient(pixels, view)
     error, flipped = 0.0, 0
     for name in fast_rasterizers():
         fast = make_rasterizer(name, scene, near=near)
@@ -347,6 +347,6 @@ def texture(height: int, width: int, seed: int = 0) -> Tensor:
 
 def without(scene: Scene, rows: Tensor) -> tuple[Scene, Tensor]:
     """Remove rows ([N] bool) from a scene; return the new scene, and the mask [N] bool of the remaining rows."""
-    kept = ~rows
-    columns = {name: getattr(scene, name)[kept] for name in Scene.__dataclass_fields__}
-    return replace(scene, **columns), kept
+    others = ~rows
+    columns = {name: getattr(scene, name)[others] for name in Scene.__dataclass_fields__}
+    return replace(scene, **columns), others

@@ -87,13 +87,18 @@ def _flat_or_thin() -> Scene:
     return replace(ordinary(5, seed=3), scales=torch.tensor(axes))
 
 
-def _opacities_at_the_cut() -> Scene:
+def _opacities_at_the_cutoff() -> Scene:
     """Return Gaussians whose opacity is 1/255, a float32 neighbor of it, or slightly larger.
 
     Their alpha reaches the cutoff of 1/255 at one pixel center at most.
     """
-    cut = np.float32(math.log(ALPHA_MIN / (1 - ALPHA_MIN)))
-    values = [np.nextafter(cut, np.float32(-9)), cut, np.nextafter(cut, np.float32(9)), cut + np.float32(1e-3)]
+    cutoff = np.float32(math.log(ALPHA_MIN / (1 - ALPHA_MIN)))
+    values = [
+        np.nextafter(cutoff, np.float32(-9)),
+        cutoff,
+        np.nextafter(cutoff, np.float32(9)),
+        cutoff + np.float32(1e-3),
+    ]
     # Centered on a pixel of `camera()`, whose principal point is (19.8, 13.8): x = 4 (20.5 - 19.8) / 30.
     scene = repeated(4, mean=(4 * 0.7 / 30, 4 * 0.7 / 33, 4.0))
     return replace(scene, opacities=torch.tensor(np.array(values)))
@@ -143,7 +148,7 @@ _SCENES: dict[str, Callable[[], Scene]] = {
     "quaternions of length 0, 1e-45 to 1.9e38": _quaternions,
     "scales of 0, 1e-20, 1e10, 1e30 and beyond float64": _scales,
     "axes without any extent": _flat_or_thin,
-    "opacities of 1/255 and one ulp to either side": _opacities_at_the_cut,
+    "opacities of 1/255 and one ulp to either side": _opacities_at_the_cutoff,
     "logits to +-3e38": _logits,
     "depth 0, +-1e-38, +-1e-6; a center at the camera": _depths,
     "centers off screen with a footprint on it": _off_screen,
@@ -168,13 +173,13 @@ def _invalid_in_file(name: str, value: str, full: bool) -> CaseResult:
             read_scene(path)
             return CaseResult(math.inf, 0.0, "the file was not refused")
         except SceneError:
-            kept = read_scene(path, drop_invalid=True).scene
+            found = read_scene(path, drop_invalid=True).scene
     rows = torch.zeros(60, dtype=torch.bool)
     rows[7] = True
     expected, _ = without(scene, rows)
-    if not torch.equal(kept.means, expected.means):
+    if not torch.equal(found.means, expected.means):
         return CaseResult(math.inf, 0.0, "another Gaussian was left out")
-    return replace(compare_rasterizers(kept, camera()), note="refused; --drop-invalid leaves it out")
+    return replace(compare_rasterizers(found, camera()), note="refused; --drop-invalid leaves it out")
 
 
 def _invalid_in_memory(name: str, value: str, full: bool) -> CaseResult:
@@ -183,9 +188,9 @@ def _invalid_in_memory(name: str, value: str, full: bool) -> CaseResult:
     getattr(scene, name)[7] = float(value)
     rows = torch.zeros(60, dtype=torch.bool)
     rows[7] = True
-    expected, kept = without(scene, rows)
+    expected, others = without(scene, rows)
     return replace(
-        compare_rasterizers(scene, camera(), expected_scene=expected, keep=kept), note="the Gaussian is left out"
+        compare_rasterizers(scene, camera(), expected_scene=expected, rows=others), note="the Gaussian is left out"
     )
 
 

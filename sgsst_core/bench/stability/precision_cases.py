@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from sgsst_core.bench.stability.case import CLOSE_TO_CUT, Case, CaseResult, camera, ordinary, texture, vgg16
+from sgsst_core.bench.stability.case import CLOSE_TO_CUTOFF, Case, CaseResult, camera, ordinary, texture, vgg16
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.statistics import (
     LayerStatistics,
@@ -61,16 +61,16 @@ def _long_sum(full: bool) -> CaseResult:
     generator = torch.Generator().manual_seed(0)
     channels = torch.linspace(1, 300, 64)
     found, exact = LayerStatistics.zero(64), LayerStatistics.zero(64)
-    in_turn = np.float32(0)
+    one_by_one = np.float32(0)
     for _ in range(67 if full else 3):
         features = channels * (1 + torch.randn((512, 512, 64), generator=generator)).relu_()
         found = merge(found, layer_statistics(features))
         exact = merge(exact, layer_statistics_reference(features))
         squares = features[..., -1].square().numpy().reshape(-1)
-        in_turn = np.cumsum(np.concatenate([[in_turn], squares]), dtype=np.float32)[-1]
+        one_by_one = np.cumsum(np.concatenate([[one_by_one], squares]), dtype=np.float32)[-1]
     pairs = [(found.gram(), exact.gram()), (found.std(), exact.std()), (found.mean, exact.mean)]
     error = max(float(((own - wanted).abs() / wanted).max()) for own, wanted in pairs)
-    off = abs(float(in_turn) / float(exact.count * exact.gram()[-1, -1]) - 1)
+    off = abs(float(one_by_one) / float(exact.count * exact.gram()[-1, -1]) - 1)
     return CaseResult(
         error, 1e-6, f"{int(exact.count):,} positions; float32 added one after the other is off by {off:.1e}"
     )
@@ -118,7 +118,7 @@ def _half_weights(full: bool) -> CaseResult:
     scene = replace(scene, opacities=torch.linspace(-5.5, 6.0, 1500)[torch.randperm(1500)])
     colors = 2 * torch.rand(1500, 3, generator=torch.Generator().manual_seed(1))
     reference = ReferenceRasterizer(scene)
-    image, band = reference.render(colors, view), reference.near_cutoff(view, CLOSE_TO_CUT)
+    image, band = reference.render(colors, view), reference.near_cutoff(view, CLOSE_TO_CUTOFF)
     found = CachedRasterizer(scene, precision="half").render(colors, view).double()
     off = ((found - image).abs() / image.clamp_min(1e-3))[~band]
     return CaseResult(

@@ -48,8 +48,8 @@ STEPS, LEARNING_RATE = 4, 0.02
 _CHANNELS = 8
 #: Rounding error of float32 features, relative to their size.
 _FEATURE_ROUNDING = 2**-20
-#: Factor for rounding a float64 number x from 53 bits to 20 bits, by adding and subtracting _CUT * x.
-_CUT = 2.0**33
+#: Factor for rounding a float64 number x from 53 bits to 20 bits, by adding and subtracting _ROUNDING * x.
+_ROUNDING = 2.0**33
 #: Safety factor for the gradient's change due to rounded features. The change in float32 is up to 8 times as large,
 #: because float32 also rounds sums, and rounds sums of equal numbers the same way each time.
 _SAFETY = 8.0
@@ -237,7 +237,7 @@ class _Rounded(DecisionsOf):
 
     def _convolve(self, x: Tensor, step: Any) -> Tensor:
         features = super()._convolve(x, step)
-        large = features * _CUT
+        large = features * _ROUNDING
         return (features + large) - large
 
 

@@ -19,7 +19,7 @@ from sgsst_core.errors import WeightsError
 from sgsst_core.features import network_sources as sources
 from sgsst_core.features.network_weights import (
     BackboneWeights,
-    _make_room,
+    _require_space,
     cache_folder,
     fetch_network_weights,
     list_network_weights,
@@ -349,7 +349,7 @@ def test_unreachable_download_says_how_to_do_without(tmp_path: Path) -> None:
 
 def test_full_disk_and_closed_folder_are_noticed_before_the_download(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="MB free"):
-        _make_room(tmp_path, 1 << 60)
+        _require_space(tmp_path, 1 << 60)
     (tmp_path / "file").touch()
     with pytest.raises(WeightsError, match="SGSST_CACHE"):
         fetch_network_weights("vgg19", folder=tmp_path / "file" / "cache")

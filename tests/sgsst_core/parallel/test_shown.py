@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sgsst_core.parallel.shown import DENSE_SHARE, ShownGaussians, gaussians_sent
+from sgsst_core.parallel.shown import DENSE_FRACTION, ShownGaussians, gaussians_sent
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
@@ -21,7 +21,7 @@ def test_a_set_holds_what_its_mask_says(gaussians: int, share: float) -> None:
 
 def test_a_gradient_travels_whole_where_nearly_all_are_shown() -> None:
     assert gaussians_sent(300, 1000) == 300
-    assert gaussians_sent(DENSE_SHARE * 1000 + 1, 1000) == 1000
+    assert gaussians_sent(DENSE_FRACTION * 1000 + 1, 1000) == 1000
     assert gaussians_sent(2000, 1000) == 1000, "a survey counts pruned ones too"
     mask = torch.arange(1000) < 600
     assert ShownGaussians(mask).sparse

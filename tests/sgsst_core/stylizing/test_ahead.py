@@ -133,7 +133,7 @@ def test_a_step_reads_the_next_photo_and_waits_once(
             large = {line: size for line, size in counts.copies.items() if size > SCALARS}
             assert list(large.values()) == [PHOTO_BYTES], large  # the photo, and nothing else
         assert len(stylizer.state().queue) == -(step + 1) % VIEWS  # the queue was read, not refilled
-    stylizer.job.view_targets.end_look_ahead()
+    stylizer.job.view_targets.end_prefetch()
     assert photos.asked == drawn() == [record.view for record in stylizer.history]
     assert photos.here == drawn()[::VIEWS]  # only the first of a round is unknown in advance; the thread reads the rest
     assert not threads()
@@ -152,7 +152,7 @@ def test_losses_are_those_of_photos_read_when_they_are_needed(
     options: dict[str, Any] = {"steps_sos": steps, "views_per_step": views_per_step}
     photos, plain = Photos(tmp_path), Photos(tmp_path)
     stylizer, expected = make(tiny_weights, photos, **options), make(tiny_weights, plain, **options)
-    monkeypatch.setattr(expected.job.views, "look_ahead", lambda *_: None)
+    monkeypatch.setattr(expected.job.views, "prefetch", lambda *_: None)
     assert run(stylizer) == run(expected) == "finished"
     assert [record.loss for record in stylizer.history] == [record.loss for record in expected.history]
     assert torch.equal(stylizer.stylized(), expected.stylized())
@@ -189,34 +189,34 @@ def test_on_a_cpu_there_is_no_thread(tiny_weights: BackboneWeights, tmp_path: Pa
 def test_photos_come_out_as_they_were_read(counts: Counts, tmp_path: Path) -> None:
     photos = Photos(tmp_path, side=160)  # CUDA transfers up to 64 KB without waiting, pinned or not
     ahead = PhotosAhead(photos, DEVICE)
-    ahead.begin(1)
-    ahead.begin(1)  # already under way
+    ahead.start(1)
+    ahead.start(1)  # already under way
     assert torch.equal(on_host(ahead(2)), photos.read(2))  # out of order
     assert torch.equal(on_host(ahead(1)), photos.read(1))
     assert sorted(photos.asked) == [1, 2]
     assert photos.here == [2]
     assert not counts.waits
     assert counts.copies.total() == 2 * 160 * 160 * 3 * 4
-    ahead.end()
+    ahead.stop()
     assert not threads()
 
 
 def test_a_photo_that_nobody_asks_for_is_given_up_with_its_error(counts: Counts, tmp_path: Path) -> None:
     photos = Photos(tmp_path, broken=0)
     ahead = PhotosAhead(photos, DEVICE)
-    ahead.begin(0)
+    ahead.start(0)
     photos.wait_for(1)
-    ahead.begin(1)
+    ahead.start(1)
     assert on_host(ahead(1)).shape == (SIDE, SIDE, 3)
     with pytest.raises(ImageError):
         ahead(0)
-    ahead.begin(0)
+    ahead.start(0)
     with pytest.raises(ImageError):
         ahead(0)
     assert photos.asked == [0, 1, 0, 0]
-    ahead.begin(2)
-    ahead.end()
+    ahead.start(2)
+    ahead.stop()
     assert not threads()
-    ahead.begin(2)  # another thread
+    ahead.start(2)  # another thread
     assert on_host(ahead(2)).shape == (SIDE, SIDE, 3)
-    ahead.end()
+    ahead.stop()

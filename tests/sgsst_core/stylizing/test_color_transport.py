@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.stylizing import color_transport
-from sgsst_core.stylizing.color_transport import _drawn, _rounds, _through, _through_compiled, _turns, transported
+from sgsst_core.stylizing.color_transport import _drawn, _round_axes, _rounds, _through, _through_compiled, transported
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def plain(moved: Array, weight: Array, wanted: Array) -> Array:
     Along each direction, a value is replaced by the target value at the same cumulative weight.
     """
     moved = moved.copy()
-    for axes in (turn.numpy() for turn in _turns()):
+    for axes in (turn.numpy() for turn in _round_axes()):
         turned, targets = moved @ axes, np.sort(wanted @ axes, axis=0)
         for axis in range(3):
             order = np.argsort(turned[:, axis])
@@ -56,7 +56,7 @@ def distance(first: Tensor, second: Tensor) -> float:
 
 
 def test_turns_are_turns_and_all_differ() -> None:
-    turns = list(_turns())
+    turns = list(_round_axes())
     assert len(turns) == color_transport.ROUNDS
     for turn in turns:
         torch.testing.assert_close(turn @ turn.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)

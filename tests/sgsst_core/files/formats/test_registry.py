@@ -19,7 +19,7 @@ from sgsst_core.files.formats.splat import SPLAT
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
-from sgsst_core.quality.packed import measure_packed
+from sgsst_core.quality.compression import measure_compression
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.scene.stored_harmonics import held
@@ -92,7 +92,7 @@ def test_real_scene_loses_little(shared_data: Path, tmp_path: Path, format: Scen
     scene = read_scene(next(folder.glob("*.ply"))).scene
     path = tmp_path / "plush"
     write_scene(path, scene, format)
-    loss = measure_packed(path, scene, read_cameras(folder / "cameras.json"), near=0.01)
+    loss = measure_compression(path, scene, read_cameras(folder / "cameras.json"), near=0.01)
     assert loss.psnr is not None
     assert loss.psnr > bound
     assert loss.size < 3e6
@@ -103,7 +103,7 @@ def test_compressed_scene_renders_nearly_the_same(tmp_path: Path, format: SceneF
     scene = replace(cloud(2000, degree=3), opacities=torch.full((2000,), 2.0))
     path = tmp_path / f"scene.{format.name}"
     write_scene(path, scene, format)
-    loss = measure_packed(path, scene, [camera(), camera(140, 90)], near=0.01)
+    loss = measure_compression(path, scene, [camera(), camera(140, 90)], near=0.01)
     assert loss.psnr is None or loss.psnr > 40
     assert loss.as_dict() == {
         "name": path.name,
@@ -127,7 +127,7 @@ def test_loss_is_the_psnr_of_renders(tmp_path: Path) -> None:
         for each in (scene, back)
     )
     expected = -10 * torch.log10((first.double() - second.double()).square().mean())
-    assert measure_packed(path, scene, [view], near=0.01).psnr == pytest.approx(float(expected))
+    assert measure_compression(path, scene, [view], near=0.01).psnr == pytest.approx(float(expected))
 
 
 def test_suffix_names_the_format() -> None:

@@ -19,12 +19,12 @@ _VIEWS, _SIDE = 3, 256
 
 
 @dataclass(frozen=True)
-class PackedLoss:
+class CompressionLoss:
     """Quality loss of a compressed file relative to the original scene.
 
     Attributes:
         name: Name of the file.
-        form: Format of the file.
+        format: Format of the file.
         size: Size in bytes.
         views: Names of the compared views.
         psnr: PSNR in dB of these views against those of the original scene, with colors clamped to 0 to 1; None if all
@@ -32,7 +32,7 @@ class PackedLoss:
     """
 
     name: str
-    form: str
+    format: str
     size: int
     views: list[str]
     psnr: float | None
@@ -40,23 +40,23 @@ class PackedLoss:
     def as_dict(self) -> dict[str, Any]:
         """Return the values for the JSON report."""
         psnr = None if self.psnr is None else round(self.psnr, 2)
-        return {"name": self.name, "format": self.form, "bytes": self.size, "views": self.views, "psnr_db": psnr}
+        return {"name": self.name, "format": self.format, "bytes": self.size, "views": self.views, "psnr_db": psnr}
 
     @property
     def text(self) -> str:
         """One-line description of the result."""
         psnr = "renders identical to" if self.psnr is None else f"{self.psnr:.1f} dB PSNR against"
-        return f"{self.form}, {self.size / 1e6:.1f} MB, {psnr} the PLY"
+        return f"{self.format}, {self.size / 1e6:.1f} MB, {psnr} the PLY"
 
 
-def measure_packed(
+def measure_compression(
     path: Path,
     scene: Scene,
     cameras: Sequence[Camera],
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     near: float,
-) -> PackedLoss:
+) -> CompressionLoss:
     """Read a compressed file back, and compare small CPU renders of some views with the original scene.
 
     Args:
@@ -81,4 +81,4 @@ def measure_packed(
         squares += float((first.double() - second.double()).square().sum())
         values += first.numel()
     loss = psnr(squares / values) if squares else None
-    return PackedLoss(path.name, back.format, path.stat().st_size, [camera.name for camera in chosen], loss)
+    return CompressionLoss(path.name, back.format, path.stat().st_size, [camera.name for camera in chosen], loss)

@@ -31,7 +31,7 @@ _CAMERAS = "cameras that are not finite, or do not face the object"
 def cases() -> list[Case]:
     """Return all cases of this group."""
     found = [
-        Case(f"{name}, as {format.name}", _GROUP, _AGAIN, partial(_packed, make, format))
+        Case(f"{name}, as {format.name}", _GROUP, _AGAIN, partial(_compressed, make, format))
         for format in (COMPRESSED_PLY, SPZ)
         for name, make in _SCENES.items()
     ]
@@ -79,7 +79,7 @@ _SCENES: dict[str, Callable[[], Scene]] = {
 }
 
 
-def _packed(make: Callable[[], Scene], format: SceneFormat, full: bool) -> CaseResult:
+def _compressed(make: Callable[[], Scene], format: SceneFormat, full: bool) -> CaseResult:
     """Check that a compressed file is finite and complete, and that writing it again keeps its quantized values."""
     scene = make()
     with tempfile.TemporaryDirectory() as folder:
@@ -129,10 +129,10 @@ def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
     opacity = torch.sigmoid(scene.opacities.double())[:, None]
     quats = torch.nn.functional.normalize(scene.quats.double(), dim=1)
     rgba = (torch.cat([colors, opacity], 1) * 255).round().to(torch.uint8).numpy()
-    turned = (quats * 128 + 128).round().clamp(0, 255).to(torch.uint8).numpy()
+    rotated = (quats * 128 + 128).round().clamp(0, 255).to(torch.uint8).numpy()
     rows = [
         position.astype("<f4").tobytes() + size.tobytes() + color.tobytes() + quat.tobytes()
-        for position, size, color, quat in zip(scene.means.numpy(), sizes, rgba, turned, strict=True)
+        for position, size, color, quat in zip(scene.means.numpy(), sizes, rgba, rotated, strict=True)
     ]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.splat"

@@ -25,11 +25,9 @@ _HEIGHT, _WIDTH = 32, 40
 def cases() -> list[Case]:
     """Return all cases of this group."""
     found = [
-        Case(f"style: {name}", "style and content", _LOSS, partial(_style, make)) for name, make in _PICTURES.items()
+        Case(f"style: {name}", "style and content", _LOSS, partial(_style, make)) for name, make in _IMAGES.items()
     ]
-    found += [
-        Case(f"view: {name}", "style and content", _LOSS, partial(_view, make)) for name, make in _PICTURES.items()
-    ]
+    found += [Case(f"view: {name}", "style and content", _LOSS, partial(_view, make)) for name, make in _IMAGES.items()]
     return [
         *found,
         Case("style and view: the same constant", "style and content", _LOSS, _equal_constants),
@@ -64,7 +62,7 @@ def _contrast() -> Tensor:
     return 200 * (texture(_HEIGHT, _WIDTH, 4) > 0.5).float() - 100
 
 
-_PICTURES: dict[str, Callable[[], Tensor]] = {
+_IMAGES: dict[str, Callable[[], Tensor]] = {
     "black": partial(_constant, 0.0, 0.0, 0.0),
     "white": partial(_constant, 1.0, 1.0, 1.0),
     "constant gray": partial(_constant, 0.4, 0.4, 0.4),

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from sgsst_core.bench.stability import Case
-from sgsst_core.bench.stability import form_cases as forms
+from sgsst_core.bench.stability import format_cases as formats
 from tests.stability.hard_cases import check
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.mark.parametrize("case", forms.cases(), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", formats.cases(), ids=lambda case: case.name)
 def test_stays_within_its_bound(case: Case) -> None:
     check(case)
