@@ -15,17 +15,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.atomic import atomic_path
 from sgsst_core.quality.exact import Float32Reference
-from sgsst_core.report.charts import RELATIVE_LOSS, STYLE, draw_legend, draw_points, scale_name, set_log_x, set_log_y
+from sgsst_core.report.charts import (
+    RELATIVE_LOSS,
+    draw_legend,
+    draw_points,
+    png_chart,
+    scale_name,
+    set_log_x,
+    set_log_y,
+)
 from sgsst_core.report.history import X_MARGIN, Floats, column, joined, log_limits
 from sgsst_core.report.palette import INK, color_of
 from sgsst_core.scene.camera import Camera
@@ -314,8 +319,7 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
     """
     shown = [curve for curve in curves if curve.points]
     scales = sorted({scale for curve in shown for point in curve.points for scale in point.by_scale})
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(5.2 * (1 + len(scales)), 4.8), dpi=110, layout="constrained")
+    with png_chart(path, (5.2 * (1 + len(scales)), 4.8)) as figure:
         panels = figure.subplots(1, 1 + len(scales), sharey=True, squeeze=False)[0]
         losses = [_draw_curves(axes, shown, scale) for axes, scale in zip(panels, (None, *scales), strict=True)]
         for axes in panels:
@@ -325,8 +329,6 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
         panels[0].set_ylabel(RELATIVE_LOSS)
         draw_legend(figure, in_row=7)
         figure.suptitle(f"{title} (dashed: Pareto front)")
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png")
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], scale: int | None) -> Floats:

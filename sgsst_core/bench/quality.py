@@ -12,9 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from sgsst_core.bench.error_time import Curve, Point, Variant, error_time
@@ -22,13 +20,12 @@ from sgsst_core.bench.error_time import as_dict as curves_as_dict
 from sgsst_core.budget import measuring_memory
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.atomic import atomic_path
 from sgsst_core.quality.consistency import Consistency
 from sgsst_core.quality.exact import ExactLoss, rasterizer_beside
 from sgsst_core.quality.judge import Judge, Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViewMoment, NovelViews
-from sgsst_core.report.charts import STYLE
+from sgsst_core.report.charts import png_chart
 from sgsst_core.report.contact_sheet import write_rows
 from sgsst_core.report.palette import INK, color_of
 from sgsst_core.scene.camera import Camera
@@ -204,8 +201,7 @@ def write_plot(path: Path, quality: Quality, title: str) -> None:
     Raises:
         OutputError: If the file cannot be written.
     """
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7, 5), dpi=110, layout="constrained")
+    with png_chart(path, (7, 5)) as figure:
         axes = figure.subplots()
         for index, outcome in enumerate(quality.outcomes):
             point = (outcome.judgment.content, outcome.judgment.style)
@@ -217,8 +213,6 @@ def write_plot(path: Path, quality: Quality, title: str) -> None:
         axes.set_ylabel("distance to the style (AlexNet's Gram matrices)")
         axes.margins(0.15)
         figure.suptitle(f"{title} (dashed: Pareto front)")
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png")
 
 
 def write_sheet(path: Path, quality: Quality) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -93,10 +94,21 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
     Raises:
         OutputError: If the file cannot be written.
     """
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(8, 4.8), dpi=120, layout="constrained")
+    with png_chart(path, (8, 4.8), dpi=120) as figure:
         draw_loss(figure, "seconds", history_of(report), novel_view_moments(report))
         figure.axes[0].set_ylabel(RELATIVE_LOSS)
+
+
+@contextmanager
+def png_chart(path: Path, size: tuple[float, float], dpi: int = 110) -> Iterator[Figure]:
+    """Provide a figure of a size in inches to a `with` block, and write it as a PNG afterwards.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=size, dpi=dpi, layout="constrained")
+        yield figure
         with atomic_path(path) as temporary:
             figure.savefig(temporary, format="png")
 
