@@ -114,10 +114,7 @@ class ViewTargets:
             return self._ahead(index)
         if self.photos is not None:
             return self.photos(index)
-        views = self.views
-        colors = views.colors(index, views.scene.sh_dc.to(views.rasterizer.device))
-        # The result is cached over many steps, so it must not depend on which blend weights are cached.
-        return views.render(index, colors, views.rasterizer.repeatable)
+        return self.views.unstylized(index)
 
     def coverage(self, index: int) -> list[Tensor]:
         """Return the coverage [H >> k, W >> k] of a view at powers of two, on the network's device.

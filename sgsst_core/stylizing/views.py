@@ -68,6 +68,7 @@ class Views:
         shown = memory // 16 if collectives.size > 1 else 0
         self._shown: Cache[int, ShownGaussians] = Cache(shown)
         self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4 - shown)
+        self._sh_dc = scene.sh_dc.to(rasterizer.device)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -84,6 +85,13 @@ class Views:
         rows = self.own_rows(index, lambda camera, band: chosen.render(colors, camera, band), 3)
         with self.timer("communication"):
             return self.gathered(index, rows)
+
+    def unstylized(self, index: int) -> Tensor:
+        """Return the image [h, w, 3] of a view of the unstylized scene.
+
+        It does not depend on which blend weights are cached, because it is cached itself over many steps.
+        """
+        return self.render(index, self.colors(index, self._sh_dc), self.rasterizer.repeatable)
 
     def own_rows(self, index: int, make: Callable[[Camera, Rows], Tensor], *shape: int) -> Tensor:
         """Return this rank's band of a view, [h, w, *shape], from a function of camera and band.
