@@ -33,8 +33,6 @@ ROTATION_TOLERANCE = 1e-3
 QUATERNION_TOLERANCE = 0.01
 
 _FORMATS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
-#: Change of camera axes from OpenGL (x right, y up, z backward) to those of `Camera`.
-_OPENGL = np.diag([1.0, -1.0, -1.0])
 #: Distortion coefficients of transforms.json: those of a fisheye, and the others in OpenCV's order.
 _FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
 _RADIAL_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -161,7 +159,7 @@ def _read_transforms(path: Path, content: Mapping[str, Any], photos: Path | None
         matrix = _array(where, values, "transform_matrix", (4, 4), (3, 4))
         pose[:3] = matrix[:3]
         pose = frame_change(pose)
-        pose[:3, :3] = pose[:3, :3] @ _OPENGL
+        pose[:3, 1:3] *= -1  # from OpenGL's axes (x right, y up, z backward) to those of `Camera`
         model = _transforms_model(where, values)
         pinhole = _transforms_intrinsics(where, values, size)
         camera = _camera(where, name, size, pinhole, _inverse(where, pose))

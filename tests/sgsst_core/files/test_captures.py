@@ -5,7 +5,9 @@ The files in `captures` have the form in which each tool writes them; those of `
 
 from __future__ import annotations
 
+import contextlib
 import json
+import random
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +21,7 @@ from sgsst_core.files.camera_advice import advice_for_name
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.photos import check_photos
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.lens import undistorted
 from tests.sgsst_core.files.test_camera_files import HEIGHT, WIDTH, views
 
 CAPTURES = Path(__file__).parent / "captures"
@@ -78,7 +81,7 @@ def test_cameras_of_a_nerfstudio_training_run_show_the_trained_scene() -> None:
 def photos_of_blender(folder: Path) -> Path:
     for view in views():
         path = folder / "train" / view.name
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGBA", (WIDTH, HEIGHT)).save(path)
     return folder
 
@@ -192,6 +195,38 @@ def test_folders_of_other_tools_name_the_way_out(tmp_path: Path, name: str, mess
     path.write_text("{}")
     with pytest.raises(CameraError, match=message):
         read_cameras(tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted(str(path.relative_to(CAPTURES)) for path in CAPTURES.rglob("*.*")))
+def test_damaged_files_are_read_or_refused_with_a_message(tmp_path: Path, name: str) -> None:
+    """Cameras that are read have a usable frame, or their lens is refused."""
+    project = tmp_path / "project"
+    shutil.copytree(CAPTURES / Path(name).parts[0], project)
+    file = project / Path(*Path(name).parts[1:])
+    data = file.read_bytes()
+    photos = photos_of_blender(tmp_path / "photos") if "blender" in name else None
+    generator = random.Random(name)
+    for _ in range(60):
+        damaged = bytearray(data)
+        for _ in range(generator.choice((1, 1, 2, 8))):
+            position = generator.randrange(len(damaged))
+            match generator.randrange(4):
+                case 0:
+                    damaged[position] = generator.randrange(256)
+                case 1:
+                    damaged[position : position + 1] = generator.choice((b"9", b"-", b"e9", b".", b"[", b'"', b"null"))
+                case 2:
+                    del damaged[position : position + generator.choice((1, 8, 100))]
+                case 3:
+                    damaged[position:position] = damaged[position : position + generator.choice((1, 8, 100))]
+            if not damaged:
+                break
+        file.write_bytes(damaged)
+        with contextlib.suppress(CameraError):
+            for view in read_cameras(project, photos):
+                reduced = undistorted(view)
+                assert 1 <= reduced.width <= view.width
+                assert 1 <= reduced.height <= view.height
 
 
 def test_names_alone_suggest_a_format() -> None:
