@@ -65,7 +65,8 @@ class Capture:
         photos = [photo for photo in found if photo is not None]
         cameras = [undistorted(self.cameras[index]) for index in kept]
         sizes = [self.photo_sizes[index] for index in kept]
-        lines = _about_photos(cameras, sizes, photos, missing)
+        kept_width = min((new.width / self.cameras[i].width for new, i in zip(cameras, kept, strict=True)), default=1.0)
+        lines = [*_about_undistorted(cameras, kept_width), *_about_photos(sizes, photos, missing)]
         return Capture(cameras, self.orbit, sizes, photos, (*self.decisions, *lines))
 
     def checked(self, scene: Scene, near: float) -> Capture:
@@ -161,16 +162,20 @@ def _models(cameras: Sequence[Camera]) -> str:
     return f"{count} of {len(cameras)} cameras have lens distortion ({', '.join(models)})" if models else ""
 
 
-def _about_photos(
-    cameras: Sequence[Camera], sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]
-) -> list[Decision]:
+def _about_undistorted(cameras: Sequence[Camera], kept_width: float) -> list[Decision]:
+    """Return the line about undistorted photos, given the least fraction of their width that views show."""
+    models = _models(cameras)
+    if not models:
+        return []
+    reason = f"{models}; views show at least {kept_width:.0%} of the width, as much as their photos fill"
+    return [Decision("lenses", "the photos are undistorted", reason)]
+
+
+def _about_photos(sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]) -> list[Decision]:
     """Return the lines about missing, resized and rotated photos."""
     lines = []
-    models = _models(cameras)
-    if models:
-        lines.append(Decision("lenses", "the photos are undistorted", f"{models}; views show what their photos fill"))
     if missing:
-        left_out = f"warning: {len(missing)} of {len(missing) + len(cameras)} views are left out"
+        left_out = f"warning: {len(missing)} of {len(missing) + len(photos)} views are left out"
         lines.append(Decision("photos", left_out, f"they have no photo: {some_names(missing)}"))
     other = [(photo, size) for photo, size in zip(photos, sizes, strict=True) if photo.size != size]
     if other:
