@@ -167,8 +167,10 @@ def _about_undistorted(cameras: Sequence[Camera], kept_width: float) -> list[Dec
     models = _models(cameras)
     if not models:
         return []
-    reason = f"{models}; views show at least {kept_width:.0%} of the width, as much as their photos fill"
-    return [Decision("lenses", "the photos are undistorted", reason)]
+    size = (
+        "their size" if kept_width == 1 else f"at least {kept_width:.0%} of their width, as much as their photos fill"
+    )
+    return [Decision("lenses", "the photos are undistorted", f"{models}; views keep {size}")]
 
 
 def _about_photos(sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]) -> list[Decision]:
