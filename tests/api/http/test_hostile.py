@@ -517,7 +517,10 @@ def test_models_whose_other_files_lie(client: httpx.Client, files: Files, name: 
     assert answer.status_code == 202 or answer.json()["detail"].startswith("None of the 1 cameras sees"), answer.text
 
 
-def test_camera_files_cannot_ask_for_files_of_the_machine(client: httpx.Client, files: Files, tmp_path: Path) -> None:
+@pytest.mark.parametrize("photos", [[], [("photos", ("other.png", picture("PNG", 64, 48)))]], ids=["none", "others"])
+def test_camera_files_cannot_ask_for_files_of_the_machine(
+    client: httpx.Client, files: Files, tmp_path: Path, photos: list[tuple[str, tuple[str, bytes]]]
+) -> None:
     """If a transforms.json lacks image sizes, the reader opens the image at any path that the file contains."""
     there = tmp_path / "secret.png"
     there.write_bytes(files["style"])
@@ -525,8 +528,10 @@ def test_camera_files_cannot_ask_for_files_of_the_machine(client: httpx.Client, 
     for path in (there, tmp_path / "nothing.png", Path("/etc/passwd"), Path("../../../../../../etc/passwd")):
         content = json.loads(transforms(file_path=str(path)))
         del content["w"], content["h"]
-        body = form(files, cameras=("transforms.json", json.dumps(content).encode()))
-        problem = refused(client.post("/v1/jobs", files=body), 422, "invalid-cameras")
+        body = [*form(files, cameras=("transforms.json", json.dumps(content).encode())), *photos]
+        answer = client.post("/v1/jobs", files=body)
+        problem = answer.json() if photos else refused(answer, 422, "invalid-cameras")  # names come with their paths
+        assert (answer.status_code, problem["code"]) == (422, "invalid-cameras")
         told.add(problem["detail"].replace(str(path), "PATH").replace(str(path).lstrip("/"), "PATH"))
     assert len(told) == 1, f"answers tell what is on the machine: {told}"
 
