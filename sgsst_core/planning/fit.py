@@ -148,16 +148,17 @@ class _Likeness:
 
     def __init__(self, scene: Scene, near: float) -> None:
         self._scene, self._rasterizer = scene, make_rasterizer("cpu", scene, near=near)
-        self._renders: dict[str, tuple[Tensor, Tensor]] = {}
+        self._renders: dict[bytes, tuple[Tensor, Tensor]] = {}
 
     def psnr(self, photo: Photo, camera: Camera) -> float | None:
         """Return the PSNR in dB of a photo against its view's render; None if the scene covers too little of it."""
         view = resized(camera, min(camera.side, _SIDE))
-        if view.name not in self._renders:
+        key = view.world_to_camera.numpy().tobytes()  # names may repeat
+        if key not in self._renders:
             colors = view_colors(self._scene.sh_dc, rest_colors(self._scene.sh_rest, self._scene.means, view))
             coverage = self._rasterizer.coverage(view)[..., None]
-            self._renders[view.name] = _averaged(self._rasterizer.render(colors, view)), _averaged(coverage)[..., 0]
-        render, coverage = self._renders[view.name]
+            self._renders[key] = _averaged(self._rasterizer.render(colors, view)), _averaged(coverage)[..., 0]
+        render, coverage = self._renders[key]
         compared = coverage > _COVERED
         if float(compared.double().mean()) < _LEAST_COMPARED:
             return None
