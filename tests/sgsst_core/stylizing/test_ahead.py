@@ -152,7 +152,7 @@ def test_losses_are_those_of_photos_read_when_they_are_needed(
     options: dict[str, Any] = {"steps_sos": steps, "views_per_step": views_per_step}
     photos, plain = Photos(tmp_path), Photos(tmp_path)
     stylizer, expected = make(tiny_weights, photos, **options), make(tiny_weights, plain, **options)
-    monkeypatch.setattr(expected.job.views, "prefetch", lambda *_: None)
+    monkeypatch.setattr(expected.job.view_targets, "prefetch", lambda *_: None)
     assert run(stylizer) == run(expected) == "finished"
     assert [record.loss for record in stylizer.history] == [record.loss for record in expected.history]
     assert torch.equal(stylizer.stylized(), expected.stylized())
