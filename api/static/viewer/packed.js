@@ -1,6 +1,6 @@
 // @ts-check
 /**
- * Readers of compressed scenes: PlayCanvas' compressed PLY, Niantic's SPZ (versions 1 to 3) and antimatter15's .splat.
+ * Readers of compressed scenes: PlayCanvas' compressed PLY, Niantic's SPZ (versions 1 to 4) and antimatter15's .splat.
  *
  * Layouts are those of github.com/playcanvas/splat-transform, github.com/nianticlabs/spz and
  * github.com/antimatter15/splat. All are converted to rows of PLY values.
@@ -8,6 +8,7 @@
 import { SceneError } from "./byte_reader.js";
 import { BATCH } from "./packing.js";
 import { DEGREES, floats } from "./ply.js";
+import { decompress } from "../vendor/fzstd/fzstd.js";
 import { words } from "../words.js";
 
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
@@ -142,31 +143,78 @@ const AXES_EXTENSION = 0xadbe0003, MAX_EXTENSIONS = 1 << 20;
  */
 const ROTATED = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
 
+/** Version of files whose attributes are zstd streams of their own. */
+const SPZ_4 = 4;
+
 /**
+ * @typedef {object} SpzAttributes
+ * @property {Uint8Array<ArrayBuffer>[]} sections positions, opacities, colors, scales, rotations and harmonics
+ * @property {boolean} rotated whether the axes are RUB
+ */
+
+/**
+ * Return a scene of SPZ version 1 to 3, which is one gzip stream.
+ *
  * @param {ByteReader} zipped
  * @returns {Promise<SceneFile>}
  */
 export async function spz(zipped) {
   const reader = zipped.piped(/** @type {any} */ (new DecompressionStream("gzip")));
-  const head = new DataView((await reader.take(16)).buffer), count = head.getUint32(8, true), degree = head.getUint8(12);
-  if (head.getUint32(0, true) !== 0x5053474e) throw new SceneError(words.scene.notScene);
-  const version = head.getUint32(4, true), unit = 2 ** -head.getUint8(13), extended = head.getUint8(14) & 2;
-  if (version < 1 || version > 3) throw new SceneError(words.scene.newSpz);
-  if (!count || degree > 3) throw new SceneError(words.scene.notGaussians);
-  const rest = ((degree + 1) ** 2 - 1) * 3;
-  /** @type {Uint8Array<ArrayBuffer>[] | null} */
-  let sections = null, rotated = false;
-  return unpacked(count, degree, async (begin, into, width, some) => {
-    if (!sections) {
-      sections = [];
-      for (const each of [version === 1 ? 6 : 9, 1, 3, 3, version < 3 ? 3 : 4, rest]) sections.push(await reader.take(each * count));
-      rotated = Boolean(extended) && statesRub(await reader.peek(MAX_EXTENSIONS));
+  const head = new DataView((await reader.take(16)).buffer);
+  return spzScene(head, async (sizes) => {
+    /** @type {Uint8Array<ArrayBuffer>[]} */
+    const sections = [];
+    for (const size of sizes) sections.push(await reader.take(size));
+    return { sections, rotated: Boolean(head.getUint8(14) & 2) && statesRub(await reader.peek(MAX_EXTENSIONS)) };
+  }, SPZ_4 - 1);
+}
+
+/**
+ * Return a scene of SPZ version 4: header, extension records, sizes of the streams, and a zstd stream for each section
+ * that is not empty.
+ *
+ * @param {ByteReader} reader
+ * @returns {Promise<SceneFile>}
+ */
+export async function spz4(reader) {
+  const head = new DataView((await reader.take(32)).buffer), table = head.getUint32(16, true);
+  return spzScene(head, async (sizes) => {
+    const streams = sizes.filter(Boolean);
+    if (table < 32 || table > 32 + MAX_EXTENSIONS || head.getUint8(15) !== streams.length) throw new SceneError(words.scene.unreadable);
+    const rotated = statesRub(await reader.take(table - 32)), list = new DataView((await reader.take(16 * streams.length)).buffer);
+    /** @type {Uint8Array<ArrayBuffer>[]} */
+    const sections = [];
+    for (const [i, size] of streams.entries()) {
+      const stream = await reader.take(list.getUint32(16 * i, true)), section = new Uint8Array(size);
+      if (list.getUint32(16 * i + 8, true) !== size || decompress(stream, section).length !== size) throw new SceneError(words.scene.unreadable);
+      sections.push(section);
     }
-    const harmonics = sections[5], coefficients = rest / 3;
+    return { sections: [...sections, new Uint8Array(0)], rotated };
+  }, SPZ_4);
+}
+
+/**
+ * @param {DataView} head first fields, which all versions share
+ * @param {(sizes: number[]) => Promise<SpzAttributes>} load reads sections of these sizes in bytes
+ * @param {number} newest newest version that can be read
+ * @returns {SceneFile}
+ */
+function spzScene(head, load, newest) {
+  const version = head.getUint32(4, true), count = head.getUint32(8, true), degree = head.getUint8(12), unit = 2 ** -head.getUint8(13);
+  if (head.getUint32(0, true) !== 0x5053474e) throw new SceneError(words.scene.notScene);
+  if (version < 1 || version > newest) throw new SceneError(words.scene.newSpz);
+  if (!count || degree > 4) throw new SceneError(words.scene.notGaussians);
+  // degree 4 is skipped
+  const drawn = Math.min(degree, 3), stored = ((degree + 1) ** 2 - 1) * 3, rest = ((drawn + 1) ** 2 - 1) * 3, coefficients = rest / 3;
+  /** @type {SpzAttributes | null} */
+  let read = null;
+  return unpacked(count, drawn, async (begin, into, width, some) => {
+    read ??= await load([version === 1 ? 6 : 9, 1, 3, 3, version < 3 ? 3 : 4, stored].map((bytes) => bytes * count));
+    const { sections, rotated } = read, harmonics = sections[5];
     for (let i = 0; i < some; i++) {
       unpackSpz(sections, begin + i, version, unit, into, i * width);
       for (let n = 0; n < rest; n++) {
-        into[i * width + HARMONICS + (n % 3) * coefficients + Math.floor(n / 3)] = (harmonics[(begin + i) * rest + n] - 128) / 128;
+        into[i * width + HARMONICS + (n % 3) * coefficients + Math.floor(n / 3)] = (harmonics[(begin + i) * stored + n] - 128) / 128;
       }
       if (rotated) rotate(into, i * width, coefficients);
     }

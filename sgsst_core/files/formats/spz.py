@@ -4,7 +4,8 @@ A Gaussian takes 16 to 20 bytes before compression, and one byte per SH coeffici
 fixed-point numbers. Log scales, colors, opacities and SH coefficients have 8 bits. Rotations have three components of 8
 bits, or of 10 bits from version 3 on. The file stores one attribute after the other. Attributes are converted during
 decompression, so the decompressed data is never in memory as a whole. The layout is that of
-https://github.com/nianticlabs/spz.
+https://github.com/nianticlabs/spz. Versions 1 to 3 are one gzip stream. Version 4 has an uncompressed header and one
+zstd stream per attribute. SH coefficients of degree 4 are skipped.
 
 Axes are a matter of convention. Most programs store those of the PLY (RDF: x right, y down, z forward) unchanged; the
 format's library stores RUB (x right, y up, z backward) by default. An extension of the format states them. Written
@@ -55,7 +56,12 @@ _WINDOW_BYTES = 1 << 27
 #: Type of the extension record that states the axes, and its numbers for them; 0 stands for the library's default.
 _AXES_EXTENSION = 0xADBE0003
 _AXES_NUMBERS: dict[int, Axes] = {0: "rub", 4: "rub", 6: "rdf"}
+#: Extension record of written files, which states the axes of a PLY.
+_AXES_RECORD = struct.pack("<III", _AXES_EXTENSION, 4, 6)
 _HAS_EXTENSIONS = 2
+
+#: Stored SH coefficients per color channel above degree 0, by SH degree.
+_STORED_COEFFICIENTS = {**COEFFICIENTS, 4: 24}
 
 #: Sign changes of a rotation by 180 degrees about x, which converts between RDF and RUB: for positions, rotations
 #: (wxyz), and real spherical harmonics of degree 1 to 3. An SH function changes its sign if its polynomial has an odd
@@ -77,6 +83,7 @@ _MAX_FRACTIONAL_BITS = 20
 #: Compression level. Files are 2 % larger than at zlib's default level 6 but take a third of the time, because
 #: spherical harmonics are almost noise.
 _DEFLATE_LEVEL = 4
+_ZSTD_LEVEL = 6
 
 Take = Callable[[int], bytes]
 
@@ -98,6 +105,7 @@ class SpzHeader(SceneHeader):
         size: Size of the file in bytes.
         version: Version of the format, 1 to 4.
         fractional_bits: Fractional bits of the fixed-point positions; unused in version 1, which has 16-bit floats.
+        degree: SH degree of the file, 0 to 4.
         sections: Decompressed sizes in bytes of positions, opacities, colors, scales, rotations and spherical
             harmonics.
         streams: Streams of version 4, one per section that is not empty. Empty for other versions, which have one gzip
@@ -109,6 +117,7 @@ class SpzHeader(SceneHeader):
 
     size: int
     version: int
+    degree: int
     fractional_bits: int
     sections: tuple[int, ...]
     streams: tuple[SpzSection, ...] = ()
@@ -117,13 +126,9 @@ class SpzHeader(SceneHeader):
     axes: SpzAxes = "auto"
 
 
-def _read_header(start: FileStart) -> SpzHeader:
-    read = _zstd_header if start.head.startswith(_MAGIC) else _gzip_header
-    return read(start.path, start.head, start.size)
-
-
-def _gzip_header(path: Path, head: bytes, size: int) -> SpzHeader:
+def _gzip_header(file_start: FileStart) -> SpzHeader:
     """Read the header of version 1 to 3, which stores header and sections in one gzip stream."""
+    path, head, size = file_start.path, file_start.head, file_start.size
     try:
         start = zlib.decompressobj(31).decompress(head, 16)
     except zlib.error as error:
@@ -138,11 +143,13 @@ def _gzip_header(path: Path, head: bytes, size: int) -> SpzHeader:
             "compressed bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
         )
     extended = bool(start[14] & _HAS_EXTENSIONS)
-    return SpzHeader(SPZ, count, COEFFICIENTS[degree], size, version, fractional_bits, sections, extended=extended)
+    drawn = COEFFICIENTS[min(degree, 3)]
+    return SpzHeader(SPZ, count, drawn, size, version, degree, fractional_bits, sections, extended=extended)
 
 
-def _zstd_header(path: Path, head: bytes, size: int) -> SpzHeader:
+def _zstd_header(file_start: FileStart) -> SpzHeader:
     """Read the header of version 4, which is uncompressed and followed by one zstd stream per section."""
+    path, head, size = file_start.path, file_start.head, file_start.size
     version, count, degree, fractional_bits, sections = _shared_fields(path, head, (4,))
     if len(head) < 32:
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
@@ -170,11 +177,12 @@ def _zstd_header(path: Path, head: bytes, size: int) -> SpzHeader:
         streams.append(SpzSection(position, compressed, decompressed))
         position += compressed
     return SpzHeader(
-        SPZ,
+        SPZ_4,
         count,
-        COEFFICIENTS[degree],
+        COEFFICIENTS[min(degree, 3)],
         size,
         version,
+        degree,
         fractional_bits,
         sections,
         tuple(streams),
@@ -210,8 +218,8 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
     version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
     if version not in versions:
         raise SceneError(f"{path}: is SPZ of version {version}, which cannot be read. {advice('scene.spz')}")
-    if degree not in COEFFICIENTS:
-        raise SceneError(f"{path}: has SH degree {degree}; 0 to 3 can be read. {advice('scene.spz')}")
+    if degree not in _STORED_COEFFICIENTS:
+        raise SceneError(f"{path}: has SH degree {degree}; 0 to 4 can be read. {advice('scene.spz')}")
     if not count:
         raise SceneError(f"{path}: holds no Gaussians. Export the scene again.")
     if version > 1 and not fractional_bits <= 24:
@@ -224,7 +232,7 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
         3 * count,
         3 * count,
         (3 if version < 3 else 4) * count,
-        3 * COEFFICIENTS[degree] * count,
+        3 * _STORED_COEFFICIENTS[degree] * count,
     )
     return version, count, degree, fractional_bits, sections
 
@@ -239,7 +247,7 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> None:
         (into["sh_dc"], lambda data: _COLORS[data].reshape(-1, 3)),
         (into["scales"], lambda data: _SCALES[data].reshape(-1, 3)),
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
-        (into["sh_rest"], lambda data: _decode_harmonics(data, spz.coefficients)),
+        (into["sh_rest"], lambda data: _decode_harmonics(data, _STORED_COEFFICIENTS[spz.degree])),
     ]
     records = bytearray()
     streams = (
@@ -394,8 +402,9 @@ def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     return np.roll(with_largest(packed >> 30, values), 1, axis=1)
 
 
-def _decode_harmonics(data: NDArray[np.uint8], coefficients: int) -> NDArray[Any]:
-    return _HARMONICS[data].reshape(-1, coefficients, 3)
+def _decode_harmonics(data: NDArray[np.uint8], stored: int) -> NDArray[Any]:
+    """Decode SH coefficients up to degree 3."""
+    return _HARMONICS[data].reshape(-1, stored, 3)[:, : COEFFICIENTS[3]]
 
 
 def _write(output: BinaryIO, arrays: Arrays) -> None:
@@ -404,11 +413,50 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
     Raises:
         OutputError: If a position is too far from the origin.
     """
-    count, coefficients = arrays["sh_rest"].shape[:2]
-    bits = _fractional_bits(arrays["means"])
-    degree = next(degree for degree, number in COEFFICIENTS.items() if number == coefficients)
     deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
-    output.write(deflate.compress(struct.pack("<4sIIBBBB", _MAGIC, 3, count, degree, bits, _HAS_EXTENSIONS, 0)))
+    bits = _fractional_bits(arrays["means"])
+    output.write(deflate.compress(_first_fields(3, arrays, bits) + bytes(1)))
+    for section in _encoded_sections(arrays, bits):
+        for block in section:
+            output.write(deflate.compress(block))
+    output.write(deflate.compress(_AXES_RECORD))
+    output.write(deflate.flush())
+
+
+def _write_version_4(output: BinaryIO, arrays: Arrays) -> None:
+    """Write SPZ version 4, with all 8 bits of SH coefficients.
+
+    Raises:
+        OutputError: If a position is too far from the origin.
+    """
+    bits = _fractional_bits(arrays["means"])
+    streams = []
+    for section in _encoded_sections(arrays, bits):
+        compressor, size = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compressobj(), 0
+        compressed = bytearray()
+        for block in section:
+            compressed += compressor.compress(block)
+            size += len(block)
+        compressed += compressor.flush()
+        if size:
+            streams.append((size, compressed))
+    table = 32 + len(_AXES_RECORD)
+    output.write(_first_fields(4, arrays, bits) + struct.pack("<BI12x", len(streams), table) + _AXES_RECORD)
+    for size, compressed in streams:
+        output.write(struct.pack("<QQ", len(compressed), size))
+    for _, compressed in streams:
+        output.write(compressed)
+
+
+def _first_fields(version: int, arrays: Arrays, bits: int) -> bytes:
+    """Return the first 15 bytes of a header, which versions 2 to 4 share."""
+    count, coefficients = arrays["sh_rest"].shape[:2]
+    degree = next(degree for degree, number in COEFFICIENTS.items() if number == coefficients)
+    return struct.pack("<4sIIBBB", _MAGIC, version, count, degree, bits, _HAS_EXTENSIONS)
+
+
+def _encoded_sections(arrays: Arrays, bits: int) -> Iterator[Iterator[bytes]]:
+    """Yield the blocks of each section of version 3 and 4."""
     encoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.float64]], NDArray[Any]]]] = [
         (arrays["means"], lambda values: _encode_positions(values, bits)),
         (arrays["opacities"], opacity_bytes),
@@ -418,11 +466,8 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
         (arrays["sh_rest"], lambda values: _to_byte(values * 128 + 128)),
     ]
     for array, encode in encoders:
-        for start in range(0, count, _BLOCK_ROWS):
-            values = array[start : start + _BLOCK_ROWS].astype(np.float64)
-            output.write(deflate.compress(np.ascontiguousarray(encode(values)).tobytes()))
-    output.write(deflate.compress(struct.pack("<III", _AXES_EXTENSION, 4, 6)))  # RDF
-    output.write(deflate.flush())
+        blocks = (array[start : start + _BLOCK_ROWS] for start in range(0, len(array), _BLOCK_ROWS))
+        yield (np.ascontiguousarray(encode(block.astype(np.float64))).tobytes() for block in blocks)
 
 
 def _fractional_bits(means: NDArray[np.float32]) -> int:
@@ -457,10 +502,20 @@ def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
 SPZ = SceneFormat(
     name="spz",
     title="SPZ",
-    matches=lambda start: start.head.startswith((_MAGIC, _GZIP_MAGIC)),
-    read_header=_read_header,
+    matches=lambda start: start.head.startswith(_GZIP_MAGIC),
+    read_header=_gzip_header,
     bytes_per_gaussian=25,
     read=_read,
     write=_write,
+    shown=True,
+)
+SPZ_4 = SceneFormat(
+    name="v4.spz",
+    title="SPZ 4",
+    matches=lambda start: start.head.startswith(_MAGIC),
+    read_header=_zstd_header,
+    bytes_per_gaussian=25,
+    read=_read,
+    write=_write_version_4,
     shown=True,
 )

@@ -147,8 +147,9 @@ def test_methods_that_change_something_are_refused(client: httpx.Client) -> None
         assert client.head("/").status_code == 200
 
 
-def test_swagger_ui_is_what_its_makers_published() -> None:
-    folder = FOLDER / "vendor" / "swagger-ui"
+@pytest.mark.parametrize("library", ["swagger-ui", "fzstd"])
+def test_library_is_what_its_makers_published(library: str) -> None:
+    folder = FOLDER / "vendor" / library
     lines = (folder / "SHA256SUMS").read_text().splitlines()
     sums = {name: digest for digest, name in (line.split() for line in lines)}
     assert {path.name for path in folder.iterdir()} == {*sums, "README.md", "SHA256SUMS"}

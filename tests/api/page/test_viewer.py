@@ -7,7 +7,7 @@ import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,11 +65,14 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
 
 @pytest.mark.parametrize(
     ("form", "name"),
-    [("compressed.ply", "playbot_synthetic_sh2"), ("spz", "snowmiku_plush"), ("splat", "biker")],
+    [
+        ("compressed.ply", "playbot_synthetic_sh2"),
+        ("spz", "snowmiku_plush"),
+        ("v4.spz", "snowmiku_plush"),
+        ("splat", "biker"),
+    ],
 )
-def test_packed_scenes_are_shown(
-    visit: Visit, shared_data: Path, tmp_path: Path, form: Literal["compressed.ply", "spz", "splat"], name: str
-) -> None:
+def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path, form: str, name: str) -> None:
     scene, views = real_scene(shared_data, name)
     ply, _, _ = write_files(tmp_path, scene, views)
     ply.unlink()  # the browser and `sgsst render` read only the compressed scene, whose name is no hint
@@ -259,6 +262,7 @@ def test_nothing_is_drawn_while_nothing_changes(visit: Visit, tmp_path: Path) ->
         (b"no scene at all", "Not a scene file"),
         (b"ply" + bytes(70_000), "Not a PLY file."),
         (b"NGSP" + bytes(60), "This SPZ version"),
+        (b"NGSP\4\0\0\0" + b"\1\0\0\0" + bytes(60), "Couldn't read the scene."),
         (gzip.compress(b"no scene, but text that somebody has packed"), "Not a scene file"),
         (
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",

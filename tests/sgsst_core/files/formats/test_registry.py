@@ -16,7 +16,7 @@ from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat
 from sgsst_core.files.formats.splat import SPLAT
-from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.formats.spz import SPZ, SPZ_4
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.quality.compression import measure_compression
@@ -74,7 +74,7 @@ def test_sh_bands_of_zeros_are_omitted(tmp_path: Path) -> None:
         assert read_scene(path).scene.sh_degree == 1
 
 
-@pytest.mark.parametrize("format", [COMPRESSED_PLY, SPZ], ids=lambda format: format.name)
+@pytest.mark.parametrize("format", [COMPRESSED_PLY, SPZ, SPZ_4], ids=lambda format: format.name)
 def test_opacities_of_0_and_1_are_finite_and_come_back(tmp_path: Path, format: SceneFormat) -> None:
     scene = replace(wall(), opacities=torch.cat([torch.full((308,), 1e4), torch.full((308,), -1e4)]))
     path = tmp_path / f"scene.{format.name}"
@@ -85,7 +85,7 @@ def test_opacities_of_0_and_1_are_finite_and_come_back(tmp_path: Path, format: S
     assert torch.equal(read_scene(path).scene.opacities.sort().values, back.opacities.sort().values)
 
 
-@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53)])
+@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53), (SPZ_4, 53)])
 def test_real_scene_loses_little(shared_data: Path, tmp_path: Path, format: SceneFormat, bound: float) -> None:
     """The plush toy has 47,974 Gaussians of degree 3, trained from photos."""
     folder = shared_data / "scenes" / "snowmiku_plush"
@@ -134,6 +134,7 @@ def test_suffix_names_the_format() -> None:
     assert format_of_name("a.ply") is format_of_name("a.PLY") is PLY
     assert format_of_name("a.b.compressed.ply") is COMPRESSED_PLY
     assert format_of_name("a.SPZ") is SPZ
+    assert format_of_name("a.v4.spz") is SPZ_4
     assert format_of_name("a.splat") is SPLAT
     assert format_of_name("ply") is None
 

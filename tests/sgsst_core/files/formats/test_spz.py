@@ -8,6 +8,7 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import zstandard
@@ -15,7 +16,8 @@ from gsply.spz import read_spz, write_spz
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import read_scene_header
-from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.formats.spz import SPZ, SPZ_4
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import basis
@@ -57,17 +59,18 @@ def rotated(scene: Scene) -> Scene:
 def test_file_of_gsply_is_read_as_gsply_reads_it(tmp_path: Path, degree: int, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=degree)), version=version)
-    assert read_scene_header(path).format is SPZ
+    assert read_scene_header(path).format is (SPZ if version == 3 else SPZ_4)
     found = read_scene(path)
     assert found.scene.sh_degree == degree
     assert_close(found.scene, scene_of(read_spz(path)))
     assert_close(rotated(read_scene(path, spz_axes="rub").scene), scene_of(read_spz(path)))
 
 
+@pytest.mark.parametrize("format", [SPZ, SPZ_4], ids=lambda format: format.name)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gsply_reads_what_is_written(tmp_path: Path, degree: int) -> None:
+def test_gsply_reads_what_is_written(tmp_path: Path, degree: int, format: SceneFormat) -> None:
     path = tmp_path / "scene"
-    write_scene(path, cloud(700, degree=degree), SPZ)
+    write_scene(path, cloud(700, degree=degree), format)
     found = read_scene(path).scene
     assert found.sh_degree == degree
     assert_close(found, scene_of(read_spz(path)))
@@ -119,6 +122,30 @@ def test_written_file_states_the_axes_of_a_ply(tmp_path: Path) -> None:
     raw = gzip.decompress(encoded(tmp_path, SPZ))
     assert raw[14] == 2
     assert raw.endswith(axes_record(6))
+    raw = encoded(tmp_path, SPZ_4)
+    assert raw[14] == 2
+    assert raw[32:44] == axes_record(6)
+
+
+def test_both_versions_hold_the_same_values(tmp_path: Path) -> None:
+    paths = [tmp_path / format.name for format in (SPZ, SPZ_4)]
+    for path, format in zip(paths, (SPZ, SPZ_4), strict=True):
+        write_scene(path, cloud(700, degree=3), format)
+    first, second = (read_scene(path).scene for path in paths)
+    assert_close(first, second, opacities=0, others=0)
+
+
+def test_degree_4_is_read_as_degree_3(tmp_path: Path) -> None:
+    """Each Gaussian has 15 coefficients per channel of degree 1 to 3, and then 9 of degree 4."""
+    write_scene(tmp_path / "three", cloud(700, degree=3), SPZ)
+    raw = gzip.decompress((tmp_path / "three").read_bytes())[:-12]
+    body, harmonics = raw[: 16 + 700 * 20], np.frombuffer(raw[16 + 700 * 20 :], np.uint8).reshape(700, 45)
+    more = np.concatenate([harmonics, np.full((700, 27), 200, np.uint8)], axis=1)
+    (tmp_path / "four").write_bytes(
+        gzip.compress(body[:12] + b"\4" + body[13:14] + bytes(2) + body[16:] + more.tobytes())
+    )
+    first, second = (read_scene(tmp_path / name).scene for name in ("three", "four"))
+    assert_close(first, second, opacities=0, others=0)
 
 
 def spz_bytes(version: int, count: int = 1, degree: int = 0, sections: bytes = b"", *, flags: int = 0) -> bytes:
@@ -167,7 +194,7 @@ ROW = 20 + 9
         (spz_bytes(3, 4_000_000_000, 3, bytes(1000)), "declares 4000000000 Gaussians, which take 260000000016 bytes"),
         (spz_bytes(3, 616, 1, bytes(616 * ROW + (64 << 20))), "continues after all Gaussians"),
         (spz_bytes(5, 616, 1, bytes(616 * ROW)), "version 5, which cannot be read.*splat-transform"),
-        (spz_bytes(3, 616, 4, bytes(100)), "SH degree 4; 0 to 3 can be read.*splat-transform"),
+        (spz_bytes(3, 616, 5, bytes(100)), "SH degree 5; 0 to 4 can be read.*splat-transform"),
         (spz_bytes(3, 0, 0), "holds no Gaussians"),
         (gzip.compress(b"NGSP" + bytes(3)), "ends within its SPZ header"),
         (gzip.compress(b"something else that was packed"), "a gzip file, but no SPZ"),
