@@ -21,6 +21,7 @@ from sgsst_core.files.formats.ply_header import PlyElement, PlyHeader, element_o
 from sgsst_core.files.formats.quantized import (
     OPACITY_LOGITS,
     SH_C0,
+    along_curve,
     byte_table,
     opacity_bytes,
     to_steps,
@@ -182,7 +183,7 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
     Gaussians are sorted along a space-filling curve, so that chunks are compact and their bounds are tight.
     """
     count, coefficients = arrays["sh_rest"].shape[:2]
-    order = _along_curve(arrays["means"])
+    order = along_curve(arrays["means"])
     output.write(_header(count, coefficients))
     blocks = [order[start : start + _BLOCK_ROWS] for start in range(0, count, _BLOCK_ROWS)]
     packed = []
@@ -197,26 +198,6 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
             # channel-major, as in PLY
             rest = arrays["sh_rest"][rows].astype(np.float64).transpose(0, 2, 1)
             output.write(np.clip(np.floor(rest * 32 + 128), 0, 255).astype(np.uint8).tobytes())
-
-
-def _along_curve(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the indices that sort Gaussians along a Z-order curve with 21 bits per axis."""
-    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
-    cells = np.where(high > low, high - low, 1)
-    code = np.zeros(len(means), np.uint64)
-    for axis in range(3):
-        values = to_steps((means[:, axis] - low[axis]) / cells[axis], (1 << 21) - 1).astype(np.uint64)
-        # insert two empty bits after each bit
-        for shift, mask in (
-            (32, 0x1F00000000FFFF),
-            (16, 0x1F0000FF0000FF),
-            (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3),
-            (2, 0x1249249249249249),
-        ):
-            values = (values | (values << np.uint64(shift))) & np.uint64(mask)
-        code |= values << np.uint64(axis)
-    return code.argsort(kind="stable")
 
 
 def _header(count: int, coefficients: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Quantization shared by compressed scene formats: opacities, and rotations by their three smallest components.
+"""Quantization shared by compressed scene formats: opacities, rotations by their three smallest components, and order.
 
 All computations use float64, so that the format's own rounding is the only loss.
 """
@@ -69,3 +69,23 @@ def without_largest(quats: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.
     length = np.linalg.norm(values, axis=1) * np.where(values[rows, largest] < 0, -1, 1)
     values = values / np.where(length == 0, 1, length)[:, None]
     return largest, values[rows[:, None], _OTHER_THREE[largest]]
+
+
+def along_curve(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the indices that sort Gaussians along a Z-order curve with 21 bits per axis."""
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    cells = np.where(high > low, high - low, 1)
+    code = np.zeros(len(means), np.uint64)
+    for axis in range(3):
+        values = to_steps((means[:, axis] - low[axis]) / cells[axis], (1 << 21) - 1).astype(np.uint64)
+        # insert two empty bits after each bit
+        for shift, mask in (
+            (32, 0x1F00000000FFFF),
+            (16, 0x1F0000FF0000FF),
+            (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3),
+            (2, 0x1249249249249249),
+        ):
+            values = (values | (values << np.uint64(shift))) & np.uint64(mask)
+        code |= values << np.uint64(axis)
+    return code.argsort(kind="stable")

@@ -20,10 +20,6 @@ def advice(name: str) -> str:
 def refuse_unsupported(start: FileStart) -> None:
     """Raise a SceneError that names a converter if the file has a known but unsupported format."""
     path, head = start.path, start.head
-    if head.startswith(b"PK\x03\x04"):
-        raise SceneError(f"{path}: is a ZIP archive, as .sog scenes are, which cannot be read. {advice('scene.sog')}")
-    if head.lstrip().startswith(b"{") and b'"means"' in head and b".webp" in head:
-        raise SceneError(f"{path}: is the meta.json of a SOG scene, which cannot be read. {advice('meta.json')}")
     if _looks_like_ksplat(head, start.size):
         raise SceneError(f"{path}: is a .ksplat scene, which cannot be read. {advice('scene.ksplat')}")
 

@@ -274,7 +274,10 @@ SCENES: list[tuple[str, Make]] = [
     ("splat, one byte more", lambda f: f["splat"] + b"x"),
     ("splat with infinite places", lambda f: f["splat"] + struct.pack("<6f8B", *[float("inf")] * 3, 1, 1, 1, *[9] * 8)),
     ("splat with sizes of 0", lambda f: f["splat"][:-32] + f["splat"][-32:-20] + bytes(12) + f["splat"][-8:]),
-    ("SOG", lambda f: zipped("meta.json", b'{"version": 2, "means": {"files": ["means_l.webp"]}}')),
+    ("SOG, half of it", lambda f: f["sog"][: len(f["sog"]) // 2]),
+    ("SOG, files of another folder", lambda f: f["sog"].replace(b"quats.webp", b"../../a.sh")),
+    ("SOG, a gigabyte in an image", lambda f: zipped("meta.json", bytes(1 << 30))),
+    ("SOG without images", lambda f: zipped("meta.json", b'{"version": 2, "means": {"files": ["means_l.webp"]}}')),
 ]
 
 

@@ -15,6 +15,7 @@ from sgsst_core.files.formats import EXTRA_FORMATS, FORMATS, RESULT_FORMATS, TIT
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat
+from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.splat import SPLAT
 from sgsst_core.files.formats.spz import SPZ, SPZ_4
 from sgsst_core.files.scene_file import read_scene, write_scene
@@ -74,7 +75,7 @@ def test_sh_bands_of_zeros_are_omitted(tmp_path: Path) -> None:
         assert read_scene(path).scene.sh_degree == 1
 
 
-@pytest.mark.parametrize("format", [COMPRESSED_PLY, SPZ, SPZ_4], ids=lambda format: format.name)
+@pytest.mark.parametrize("format", [COMPRESSED_PLY, SPZ, SPZ_4, SOG], ids=lambda format: format.name)
 def test_opacities_of_0_and_1_are_finite_and_come_back(tmp_path: Path, format: SceneFormat) -> None:
     scene = replace(wall(), opacities=torch.cat([torch.full((308,), 1e4), torch.full((308,), -1e4)]))
     path = tmp_path / f"scene.{format.name}"
@@ -85,7 +86,7 @@ def test_opacities_of_0_and_1_are_finite_and_come_back(tmp_path: Path, format: S
     assert torch.equal(read_scene(path).scene.opacities.sort().values, back.opacities.sort().values)
 
 
-@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53), (SPZ_4, 53)])
+@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53), (SPZ_4, 53), (SOG, 46)])
 def test_real_scene_loses_little(shared_data: Path, tmp_path: Path, format: SceneFormat, bound: float) -> None:
     """The plush toy has 47,974 Gaussians of degree 3, trained from photos."""
     folder = shared_data / "scenes" / "snowmiku_plush"

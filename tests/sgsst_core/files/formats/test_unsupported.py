@@ -20,12 +20,6 @@ def ksplat() -> bytes:
 @pytest.mark.parametrize(
     ("data", "name", "message"),
     [
-        (b"PK\x03\x04" + bytes(100), "scene.sog", "as .sog scenes are.*splat-transform scene.sog scene.ply"),
-        (
-            b'{"version": 2, "means": {"files": ["means_l.webp"]}}',
-            "meta.json",
-            "a SOG scene.*splat-transform meta.json scene.ply",
-        ),
         (ksplat(), "scene.ksplat", "a .ksplat scene.*splat-transform scene.ksplat scene.ply"),
     ],
 )
