@@ -14,7 +14,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses $(TEST_PROCESSES) --dis
 
 SPELLED := api benchmarks deploy docs service sgsst_core tests worker *.md Makefile mkdocs.yml pyproject.toml
 
-.PHONY: demo test test-all test-slow lint lint-page docs clean
+.PHONY: demo test test-all test-slow test-ptx lint lint-page docs clean
 
 # Stylize the built-in scene and print where the results are.
 demo: $(VENV)/installed
@@ -30,6 +30,10 @@ test: lint
 test-slow: $(VENV)/installed-dev
 	$(BIN)/sgsst weights fetch vgg16
 	$(PYTEST) -m slow
+
+# Run the compiled GPU kernels in an interpreter of PTX, against their references. `test-slow` includes this.
+test-ptx: $(VENV)/installed-dev
+	$(BIN)/pytest tests/ptx
 
 test-all: test
 	$(MAKE) test-slow

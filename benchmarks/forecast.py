@@ -24,7 +24,7 @@ from sgsst_core.constants import RASTER_TILE
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
-from sgsst_core.features.statistics import SPAN_VALUES, TILE, matrix_precision
+from sgsst_core.features.statistics import TILE, matrix_precision, span_positions
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.content import ContentDifference
 from sgsst_core.loss.sos import SosLoss
@@ -246,7 +246,7 @@ def statistics(channels: int, positions: int, size: int) -> Work:
     # Each pair of channel tiles reads both tiles, or one on the diagonal. Spans are the outer loop, so a layer larger
     # than the L2 cache is read from memory each time.
     reads = tiles if channels * positions * size > L2 else 1
-    spans = -(-positions // (SPAN_VALUES // channels))
+    spans = -(-positions // span_positions(channels))
     moved = reads * channels * positions * size + 2 * spans * channels**2 * 4
     return Work(2.0 * min(TILE, channels) ** 2 * pairs * positions, moved, "matrix")
 

@@ -28,13 +28,13 @@ from benchmarks.machine import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
 from sgsst_core.features import statistics_kernels
 from sgsst_core.features.statistics import (
+    FLUSH,
     POSITIONS,
-    SPAN_VALUES,
-    SPANS,
     TILE,
     block_of_channels,
     block_of_entries,
     matrix_precision,
+    span_positions,
 )
 from sgsst_core.loss import statistics_terms
 from sgsst_core.loss import statistics_terms_kernels as loss_kernels
@@ -95,13 +95,13 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
     """Return the kernels that read features and position weights."""
     features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
     matrix = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
-    moments = {**matrix, "SPAN": SPAN_VALUES // channels, "P": POSITIONS}
+    moments = {**matrix, "SPAN": span_positions(channels), "FLUSH": FLUSH, "P": POSITIONS}
     return {
         f"shifted_moments_{of}": Target(
             statistics_kernels.shifted_moments,
             moments,
             4,
-            {"features": features, "counts": "*fp32"},
+            {"features": features, "sums": "*fp32"},
         ),
         f"add_style_gradient_{of}": Target(
             loss_kernels.add_style_gradient,
@@ -117,11 +117,11 @@ def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
     entries = block_of_entries(channels)
     block = {"ROWS": entries // block_of_channels(channels), "COLUMNS": block_of_channels(channels)}
     return {
-        f"add_moments{of}": Target(
-            statistics_kernels.add_moments,
-            {"CHANNELS": channels, "ENTRIES": entries, "S": SPANS},
+        f"combine_moments{of}": Target(
+            statistics_kernels.combine_moments,
+            {"CHANNELS": channels, "ENTRIES": entries},
             4,
-            {"counts": "*fp32", "mean": "*fp64"},
+            {"sums": "*fp64", "mean": "*fp64"},
         ),
         f"compare{of}": Target(
             loss_kernels.compare,

@@ -30,12 +30,16 @@ _GPU_BLOCK_VALUES = 1 << 21
 _SHIFT_POSITIONS = 1024
 #: Maximum distance of a channel's mean from the shift in standard deviations; cancellation grows with its square.
 _FAR = 8.0
-#: Feature values per span. A span is a run of positions that is summed in float32; spans are added in float64.
-SPAN_VALUES = 1 << 20
+#: Positions per span on a GPU, at least. A span is summed by one program in float32; spans are added in float64. Layers
+#: of many channels have longer spans, so that the sums of all spans are small compared to the features.
+_GPU_SPAN_POSITIONS, _SPAN_POSITIONS_PER_CHANNEL = 2048, 16
+#: Positions after which a program starts a new accumulator of second moments. Longer float32 chains round too much:
+#: one over 3,500 positions is off by 1e-5.
+FLUSH = 128
 #: Minimum number of feature rows averaged for the shift.
 _SHIFT_ROWS = 64
-#: Channels, positions and spans per step of a program.
-TILE, POSITIONS, SPANS = 64, 32, 4
+#: Channels and positions per step of a program.
+TILE, POSITIONS = 64, 32
 #: Matrix entries per program, rounded to whole rows.
 ENTRIES = 1024
 #: Minimum channels per block, as required for matrix products. Layers with fewer channels fill part of a block.
@@ -260,9 +264,14 @@ def layer_statistics_reference(features: Tensor, position_weights: Tensor | None
 def matrix_precision(dtype: torch.dtype) -> str:
     """Return Triton's input precision for matrix products with features of a dtype.
 
-    TF32 suffices for bfloat16: its 11-bit significand holds the 8 bits of bfloat16.
+    TF32 suffices for bfloat16: its 11-bit significand holds the 8 bits of bfloat16. Most AMD GPUs have no TF32.
     """
-    return "tf32" if dtype == torch.bfloat16 else "ieee"
+    return "tf32" if dtype == torch.bfloat16 and torch.version.hip is None else "ieee"
+
+
+def span_positions(channels: int) -> int:
+    """Return the number of positions per span of a layer."""
+    return max(_GPU_SPAN_POSITIONS, _SPAN_POSITIONS_PER_CHANNEL * channels)
 
 
 def block_of_positions(usual: int) -> int:
@@ -292,7 +301,7 @@ def _is_interpreted() -> bool:
 
 
 def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
-    """Compute `layer_statistics` on a GPU in three launches, without a temporary tensor as large as the features.
+    """Compute `layer_statistics` on a GPU in four launches, without a temporary tensor as large as the features.
 
     Moments are summed in float32 about a shift, the mean of some rows, which only has to be close to the true mean.
     Features are float32 or bfloat16 with contiguous channels, and c is below 16 or a power of two.
@@ -301,28 +310,24 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
 
     height, width, channels = features.shape
     device, positions = features.device, height * width
-    span = SPAN_VALUES // channels
-    spans = -(-positions // span)
-    tile = block_of_channels(channels, TILE)
+    span, tile = span_positions(channels), block_of_channels(channels, TILE)
     shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1), dtype=torch.float32)
-    counts = torch.empty(spans, device=device)
-    firsts = torch.empty((spans, channels), device=device)
-    seconds = torch.empty((spans, channels, channels), device=device)
+    sums = torch.empty((-(-positions // span), channels**2 + channels + 1), device=device)
     weights = features if position_weights is None else position_weights
-    kernels.shifted_moments[(spans, (-(-channels // tile)) ** 2)](
-        features, weights, shift, counts, firsts, seconds,
+    kernels.shifted_moments[(len(sums), (-(-channels // tile)) ** 2)](
+        features, weights, shift, sums,
         positions, width, *features.stride()[:2], *weights.stride()[:2],
-        CHANNELS=channels, TILE=tile, SPAN=span, P=block_of_positions(POSITIONS), WEIGHTED=position_weights is not None,
-        PRECISION=matrix_precision(features.dtype),
+        CHANNELS=channels, TILE=tile, SPAN=span, FLUSH=FLUSH, P=block_of_positions(POSITIONS),
+        WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
     )  # fmt: skip
     count = torch.empty((), dtype=torch.float64, device=device)
     mean = torch.empty(channels, dtype=torch.float64, device=device)
     centered = torch.empty((channels, channels), dtype=torch.float64, device=device)
     entries = block_of_entries(channels)
-    kernels.add_moments[(-(-(channels**2) // entries),)](
-        counts, firsts, seconds, shift, count, mean, centered, spans,
-        CHANNELS=channels, ENTRIES=entries, S=SPANS,
-    )  # fmt: skip
+    total = sums.sum(dim=0, dtype=torch.float64) if len(sums) != 1 else sums
+    kernels.combine_moments[(-(-(channels**2) // entries),)](
+        total, shift, count, mean, centered, CHANNELS=channels, ENTRIES=entries
+    )
     return LayerStatistics(count, mean, centered)
 
 

@@ -1,4 +1,4 @@
-"""GPU kernels for layer statistics: shifted moments of blocks of positions, and their sum in float64.
+"""GPU kernels for layer statistics: shifted moments of spans of positions, and statistics from their sum in float64.
 
 The kernels also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import). They use no
 atomics, so results are reproducible bit for bit.
@@ -41,23 +41,32 @@ def load_weights(weights, row_step, column_step, width, position, there, WEIGHTE
 
 
 @triton.jit
+def rounded(x, PRECISION: tl.constexpr):
+    """Round float32 inputs of a matrix product in TF32 to nearest, because GPUs truncate them."""
+    if PRECISION == "tf32":
+        bits = (x.to(tl.int32, bitcast=True) + 0x1000) & -0x2000
+        return tl.where(x == x, bits.to(tl.float32, bitcast=True), x)
+    return x
+
+
+@triton.jit
 def shifted_moments(
-    features, weights, shift, counts, firsts, seconds,
+    features, weights, shift, sums,
     positions, width, row_step, column_step, weight_row_step, weight_column_step,
-    CHANNELS: tl.constexpr, TILE: tl.constexpr, SPAN: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
-    PRECISION: tl.constexpr,
+    CHANNELS: tl.constexpr, TILE: tl.constexpr, SPAN: tl.constexpr, FLUSH: tl.constexpr, P: tl.constexpr,
+    WEIGHTED: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Compute moments about the shift over SPAN positions, for one TILE x TILE block of channel pairs.
 
-    Only blocks on and above the diagonal are computed. Below, a_p is a position weight and x_p = F_p - shift.
+    Only blocks on and above the diagonal are computed. Second moments are accumulated over FLUSH positions at a time,
+    so that no float32 chain is long. Below, a_p is a position weight and x_p = F_p - shift.
 
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
         weights: Position weights [h, width]; ignored if WEIGHTED is false.
         shift: [CHANNELS] float32.
-        counts: Output [spans] float32, sum of a_p; written by block (0, 0).
-        firsts: Output [spans, CHANNELS] float32, sum of a_p x_p; written by diagonal blocks.
-        seconds: Output [spans, CHANNELS, CHANNELS] float32, sum of a_p x_p x_p^T; lower blocks are not written.
+        sums: Output [spans, CHANNELS^2 + CHANNELS + 1] float32: the sum of a_p x_p x_p^T, of a_p x_p, and of a_p.
+            Entries of lower blocks are not written.
         positions: Number of positions, h * width.
     """
     tiles: tl.constexpr = (CHANNELS + TILE - 1) // TILE
@@ -68,68 +77,63 @@ def shifted_moments(
         second = tl.zeros([TILE, TILE], tl.float32)
         first = tl.zeros([TILE], tl.float32)
         count = tl.zeros([P], tl.float32)
-        begin = span * SPAN
-        end = tl.minimum(begin + SPAN, positions)
-        while begin < end:
-            position = begin + tl.arange(0, P)
-            there = position < end
-            a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
-            left = load_centered(features, shift, row_step, column_step, width, position, own, there, CHANNELS)
-            left = left * a[:, None]
-            right = load_centered(features, shift, row_step, column_step, width, position, other, there, CHANNELS)
-            second += tl.dot(tl.trans(left), right, input_precision=PRECISION)
-            first += tl.sum(left, 0)
-            count += a
-            begin += P
-        row = seconds + (span.to(tl.int64) * CHANNELS + own)[:, None] * CHANNELS
-        tl.store(row + other[None, :], second, mask=(own < CHANNELS)[:, None] & (other < CHANNELS)[None, :])
+        start = span * SPAN
+        end = tl.minimum(start + SPAN, positions)
+        while start < end:
+            some = tl.zeros([TILE, TILE], tl.float32)
+            stop = tl.minimum(start + FLUSH, end)
+            while start < stop:
+                position = start + tl.arange(0, P)
+                there = position < end
+                a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
+                left = load_centered(features, shift, row_step, column_step, width, position, own, there, CHANNELS)
+                left = left * a[:, None]
+                right = load_centered(features, shift, row_step, column_step, width, position, other, there, CHANNELS)
+                products = tl.dot(
+                    tl.trans(rounded(left, PRECISION)), rounded(right, PRECISION), input_precision=PRECISION
+                )
+                some += products
+                first += tl.sum(left, 0)
+                count += a
+                start += P
+            second += some
+        row = sums + span.to(tl.int64) * (CHANNELS * CHANNELS + CHANNELS + 1)
+        entry = own[:, None] * CHANNELS + other[None, :]
+        tl.store(row + entry, second, mask=(own < CHANNELS)[:, None] & (other < CHANNELS)[None, :])
         if down == across:
-            tl.store(firsts + span.to(tl.int64) * CHANNELS + own, first, mask=own < CHANNELS)
+            tl.store(row + CHANNELS * CHANNELS + own, first, mask=own < CHANNELS)
             if pair == 0:
-                tl.store(counts + span, tl.sum(count, 0))
+                tl.store(row + CHANNELS * CHANNELS + CHANNELS, tl.sum(count, 0))
 
 
 @triton.jit
-def add_moments(
-    counts, firsts, seconds, shift, count, mean, centered, spans,
-    CHANNELS: tl.constexpr, ENTRIES: tl.constexpr, S: tl.constexpr,
+def combine_moments(
+    sums, shift, count, mean, centered,
+    CHANNELS: tl.constexpr, ENTRIES: tl.constexpr,
 ):  # fmt: skip
-    """Combine the moments of all spans into count, mean and centered second moment, in float64.
+    """Compute count, mean and centered second moment from moments about a shift, in float64.
 
     Each program computes ENTRIES matrix entries.
 
     Args:
-        counts, firsts, seconds, shift: Outputs of `shifted_moments`, and its shift.
+        sums: [CHANNELS^2 + CHANNELS + 1] float64, the sum of the outputs of `shifted_moments` over all spans; with a
+            single span its output, float32.
+        shift: [CHANNELS] float32, shift of these moments.
         count: Output [] float64. All outputs are 0 if no position has weight.
         mean: Output [CHANNELS] float64.
         centered: Output [CHANNELS, CHANNELS] float64.
-        spans: Number of spans.
     """
     entry = tl.program_id(0) * ENTRIES + tl.arange(0, ENTRIES)
     inside = entry < CHANNELS * CHANNELS
     i, j = tl.where(inside, entry // CHANNELS, 0), entry % CHANNELS
     # Blocks below the diagonal are not computed: the matrix is symmetric, so read the transposed entry.
-    offset = tl.where(i <= j, i * CHANNELS + j, j * CHANNELS + i)
-    n = tl.zeros([S], tl.float64)
-    down, across, second = (
-        tl.zeros([ENTRIES], tl.float64),
-        tl.zeros([ENTRIES], tl.float64),
-        tl.zeros([ENTRIES], tl.float64),
-    )
-    begin = tl.zeros([], tl.int32)
-    while begin < spans:
-        span = begin + tl.arange(0, S)
-        there = span < spans
-        row = (span.to(tl.int64) * CHANNELS)[:, None]
-        n += tl.load(counts + span, mask=there, other=0.0).to(tl.float64)
-        down += tl.sum(tl.load(firsts + row + i[None, :], mask=there[:, None], other=0.0).to(tl.float64), 0)
-        across += tl.sum(tl.load(firsts + row + j[None, :], mask=there[:, None], other=0.0).to(tl.float64), 0)
-        each = tl.load(seconds + row * CHANNELS + offset[None, :], mask=there[:, None], other=0.0)
-        second += tl.sum(each.to(tl.float64), 0)
-        begin += S
-    total = tl.sum(n, 0)
+    upper = tl.where(i <= j, i * CHANNELS + j, j * CHANNELS + i)
+    firsts = sums + CHANNELS * CHANNELS
+    total = tl.load(firsts + CHANNELS).to(tl.float64)
     some = total > 0
     divisor = tl.where(some, total, 1.0)
+    second = tl.load(sums + upper, mask=inside, other=0.0).to(tl.float64)
+    down, across = tl.load(firsts + i).to(tl.float64), tl.load(firsts + j).to(tl.float64)
     tl.store(centered + entry, second - (down / divisor) * (across / divisor) * total, mask=inside)
     own = tl.where(some, tl.load(shift + j).to(tl.float64) + across / divisor, 0.0)
     tl.store(mean + j, own, mask=inside & (i == 0))

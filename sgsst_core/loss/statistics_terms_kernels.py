@@ -11,7 +11,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sgsst_core.features.statistics_kernels import load_centered, load_weights, mask_of
+from sgsst_core.features.statistics_kernels import load_centered, load_weights, mask_of, rounded
 
 
 @triton.jit
@@ -91,7 +91,7 @@ def add_style_gradient(
         centered = load_centered(features, mean, row_step, column_step, width, position, channel, there, CHANNELS)
         part_of = mask_of(channel < CHANNELS, own, CHANNELS)
         part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :], mask=part_of, other=0.0)
-        sums += tl.dot(centered, part, input_precision=PRECISION)
+        sums += tl.dot(rounded(centered, PRECISION), rounded(part, PRECISION), input_precision=PRECISION)
         k += K
     a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
     sums = (sums + tl.load(offset + own, mask=own < CHANNELS, other=0.0)[None, :]) * a[:, None]

@@ -68,7 +68,7 @@ def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tu
     ("channels", "height", "width"), [(3, 70, 50), (16, 50, 40), (64, 150, 200), (128, 40, 33), (512, 9, 31)]
 )
 def test_agrees_with_float64(channels: int, height: int, width: int, weighted: bool) -> None:
-    """With 64 channels, this size is summed in more than one span."""
+    """With 64 channels, this size is summed in several spans."""
     x = features(height, width, channels, seed=1)
     a = position_weights(height, width) if weighted else None
     found, exact = on_cpu(fused_statistics(x, a)), layer_statistics_reference(x.cpu(), None if a is None else a.cpu())
@@ -157,8 +157,8 @@ def test_bfloat16_features_are_summed_in_float32() -> None:
     x = features(40, 60, 32, seed=3).bfloat16()
     exact = layer_statistics_reference(x.cpu())
     found = on_cpu(fused_statistics(x))
-    # In the interpreter, products are exact; on a GPU they use TF32, which keeps three digits.
-    assert relative_error(found.centered, exact.centered) < (2e-3 if DEVICE == "cuda" else 3e-6)
+    # Products use TF32, whose inputs are rounded to 11 bits. Truncated inputs would be off by 8e-4.
+    assert relative_error(found.centered, exact.centered) < 4e-4
     target = target_of(32)
     _, gradient = fused_gradient(x, None, target)
     cpu_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())

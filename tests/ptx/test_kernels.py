@@ -1,0 +1,132 @@
+"""Tests of compiled kernels at production block sizes, and of the checks of the interpreter that executes them."""
+
+from __future__ import annotations
+
+import mmap
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
+from sgsst_core.loss.statistics_terms import fused_add_style_gradient
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from tests.ptx.driver import PtxDriver, compiled_kernels
+from tests.ptx.machine import Kernel
+from tests.ptx.memory import FaultError
+from tests.sgsst_core.pictures import picture, relative_error
+from tests.small_scenes import ball, cameras
+
+
+@pytest.mark.parametrize("capability", [80, 90])
+def test_images_and_gradients_agree_with_reference(capability: int) -> None:
+    scene, camera = ball(150), cameras(1, 45, 37)[0]
+    reference = make_rasterizer("reference", scene)
+    colors = torch.rand((len(scene), 3), generator=torch.Generator().manual_seed(0))
+    image_gradient = picture(37, 45, dtype=torch.float32) - 0.5
+    image, gradient = (
+        reference.render(colors.double(), camera),
+        reference.color_gradient(image_gradient.double(), camera),
+    )
+    with compiled_kernels(capability):
+        uncached = make_rasterizer("triton", scene)
+        for rasterizer in (uncached, CachedRasterizer(scene, uncached=uncached)):
+            assert relative_error(rasterizer.render(colors, camera), image) < 3e-7
+            assert relative_error(rasterizer.color_gradient(image_gradient, camera), gradient) < 5e-7
+
+
+def test_statistics_of_a_large_image_agree_with_float64() -> None:
+    image = 255 * picture(590, 590, dtype=torch.float32)
+    exact = layer_statistics_reference(image)
+    with compiled_kernels(80):
+        statistics = fused_statistics(image)
+    assert relative_error(statistics.mean, exact.mean) < 1e-6
+    assert relative_error(statistics.centered, exact.centered) < 1e-6
+
+
+def sparse(shape: tuple[int, ...], strides: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """Return zeros with large strides; only accessed pages take memory."""
+    count = sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True)) + 1
+    mapping = mmap.mmap(-1, count * dtype.itemsize, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | 0x4000)  # NORESERVE
+    return torch.frombuffer(mapping, dtype=dtype, count=count).as_strided(shape, strides)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_offsets_beyond_32_bits(dtype: torch.dtype) -> None:
+    """The last row begins after 2.5e9 values."""
+    generator = torch.Generator().manual_seed(0)
+    small = (2 + torch.randn((6, 9, 16), generator=generator)).to(dtype)
+    features, gradient = (sparse((6, 9, 16), (500_000_000, 16, 1), dtype) for _ in range(2))
+    features.copy_(small)
+    matrix, mean, offset = (torch.randn(shape, generator=generator) for shape in ((16, 16), (16,), (16,)))
+    matrix = matrix + matrix.T
+    exact = layer_statistics_reference(small)
+    expected = (small.double() - mean.double()) @ matrix.double() + offset.double()
+    tolerance = 1e-6 if dtype == torch.float32 else 4e-3
+    with compiled_kernels(80):
+        assert relative_error(fused_statistics(features).centered, exact.centered) < tolerance
+        fused_add_style_gradient(gradient, features, matrix, mean, offset)
+    assert relative_error(gradient.double(), expected) < tolerance
+
+
+# --- mutations: a defect in a kernel must be reported ---------------------------------------------------------------
+
+
+def statistics_kernel(driver: PtxDriver, features: Tensor) -> Kernel:
+    fused_statistics(features)
+    return driver.kernels["shifted_moments"]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_every_removed_barrier_is_reported(dtype: torch.dtype) -> None:
+    features = torch.randn((5, 29, 64), generator=torch.Generator().manual_seed(0)).to(dtype)
+    with compiled_kernels(80) as driver:
+        kernel = statistics_kernel(driver, features)
+        barriers = [
+            number for number, one in enumerate(kernel.program.instructions) if one.opcode[:2] == ("bar", "sync")
+        ]
+        assert len(barriers) > 2
+        for number in barriers:
+            none = replace(kernel.program.instructions[number], opcode=("bar", "warp", "sync"))
+            with kernel.changed(number, none), pytest.raises(FaultError, match="race in shared memory"):
+                fused_statistics(features)
+        fused_statistics(features)
+
+
+def test_shifted_masks_are_reported() -> None:
+    """Comparisons with one position too many let the kernel read or write beyond the end of a tensor."""
+    features = torch.randn((5, 29, 16), generator=torch.Generator().manual_seed(0)).contiguous()
+    reported = 0
+    with compiled_kernels(80) as driver:
+        kernel = statistics_kernel(driver, features)
+        exact = fused_statistics(features)
+        for number, instruction in enumerate(kernel.program.instructions):
+            if instruction.opcode[:2] != ("setp", "lt"):
+                continue
+            with kernel.changed(number, replace(instruction, opcode=("setp", "le", *instruction.opcode[2:]))):
+                try:
+                    reported += not torch.equal(fused_statistics(features).centered, exact.centered)
+                except FaultError:
+                    reported += 1
+    assert reported >= 3
+
+
+def test_faults_of_memory_are_reported() -> None:
+    scene, camera = ball(60), cameras(1, 33, 17)[0]
+    with compiled_kernels(80) as driver:
+        rasterizer = make_rasterizer("triton", scene)
+        colors = torch.rand((len(scene), 3))
+        rasterizer.render(colors, camera)
+        kernel = driver.kernels["render"]
+        stores = [
+            number for number, one in enumerate(kernel.program.instructions) if one.opcode[:2] == ("st", "global")
+        ]
+        store = kernel.program.instructions[stores[0]]
+        misaligned = replace(store, operands=(store.operands[0].replace("+ 0", "+ 2"), *store.operands[1:]))
+        with kernel.changed(stores[0], misaligned), pytest.raises(FaultError, match="misaligned"):
+            rasterizer.render(colors, camera)
+        everywhere = replace(store, guard=None)
+        with kernel.changed(stores[0], everywhere), pytest.raises(FaultError, match=r"outside of all tensors|race"):
+            rasterizer.render(colors, camera)
