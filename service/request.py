@@ -50,4 +50,5 @@ def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest
         parameters.settings(),
         _regions(staged, parameters),
         colors=True,
+        style_background=parameters.style_background,
     )

@@ -11,6 +11,8 @@ import re
 #: Content weight of each named style strength, chosen on the trade-off curve of style and content (docs/quality.md).
 STRENGTHS: dict[str, float] = {"light": 3e4, "balanced": 1e4, "strong": 1.0}
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
+#: Syntax of `parse_color`, for help texts.
+COLOR_SYNTAX = ": black, white, or R,G,B from 0 to 255."
 _COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 

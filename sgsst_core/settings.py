@@ -19,7 +19,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
-from sgsst_core.option_parsers import STRENGTHS, parse_bytes, parse_color, parse_strength, parse_weights
+from sgsst_core.option_parsers import COLOR_SYNTAX, STRENGTHS, parse_bytes, parse_color, parse_strength, parse_weights
 from sgsst_core.options import Declared, Option, renamed_hint
 
 PresetName = Literal["preview", "standard", "paper"]
@@ -151,7 +151,7 @@ class Settings(BaseModel):
             metavar="COLOR",
             default="black",
             parse=parse_color,
-            syntax=": black, white, or R,G,B from 0 to 255.",
+            syntax=COLOR_SYNTAX,
         ),
     ] = Field((0.0, 0.0, 0.0), description="Background color behind the Gaussians.")
     training_background: TrainingBackground = Field(

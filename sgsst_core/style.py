@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -25,11 +25,13 @@ class Style:
         images: Images, [H_i, W_i, 3] in 0..1 each.
         weights: Weights above 0 that add up to 1.
         names: Display names of the images; empty if they have none.
+        notes: What was not used when the images were read, such as a broken color profile.
     """
 
     images: tuple[Tensor, ...]
     weights: tuple[float, ...] = (1.0,)
     names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @staticmethod
     def of(style: Tensor | Style) -> Style:
@@ -50,7 +52,7 @@ class Style:
         images = tuple(change(image) for image in self.images)
         if all(new is old for new, old in zip(images, self.images, strict=True)):
             return self
-        return Style(images, self.weights, self.names)
+        return replace(self, images=images)
 
     @property
     def text(self) -> str:

@@ -17,7 +17,7 @@ from torch import Tensor
 from sgsst_core.decision import Decision
 from sgsst_core.errors import SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
-from sgsst_core.files.images import load_image
+from sgsst_core.files.images import WHITE, Color, load_image
 from sgsst_core.files.photos import Photo, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
@@ -84,7 +84,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     source = request.source
     axes, about_axes = collectives.broadcast(lambda: choose_axes(source, images))
     weights = _same_weights(request.backbone, collectives)
-    style = together(collectives, lambda: load_styles(request.styles))
+    style = together(collectives, lambda: load_styles(request.styles, request.style_background))
     scene_file, reader = read_shared_scene(
         source.scene,
         collectives,
@@ -123,7 +123,7 @@ def read_regions(
     settings, near = request.settings, request.source.near
 
     def load(files: Sequence[StyleFile]) -> Style:
-        style = load_styles(files)
+        style = load_styles(files, request.style_background)
         check_style_size(style, cameras, settings.style_scale)
         return style
 
@@ -133,8 +133,11 @@ def read_regions(
     )
 
 
-def load_styles(files: Sequence[StyleFile]) -> Style:
+def load_styles(files: Sequence[StyleFile], background: Color = WHITE) -> Style:
     """Read the images of a style and normalize their weights.
+
+    Args:
+        background: sRGB color behind transparent parts, in 0..1.
 
     Raises:
         ImageError: If an image cannot be used.
@@ -142,7 +145,9 @@ def load_styles(files: Sequence[StyleFile]) -> Style:
     """
     weights = normalized([file.weight for file in files])  # raises before any image is read
     names = tuple(file.path.name for file in files)
-    return Style(tuple(load_image(file.path) for file in files), weights, names)
+    notes: list[str] = []
+    images = tuple(load_image(file.path, background=background, warn=notes.append) for file in files)
+    return Style(images, weights, names, tuple(notes))
 
 
 def _capture_on_all_ranks(source: SceneRequest, scene: Scene, images: Path | None, collectives: Collectives) -> Capture:

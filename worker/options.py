@@ -14,10 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from sgsst_core.constants import NEAR
 from sgsst_core.files.formats.spz import SpzAxes
+from sgsst_core.option_parsers import COLOR_SYNTAX, parse_color
 from sgsst_core.options import Option, declared
 from sgsst_core.settings import (
     BY_PRESET,
     EVERYTHING,
+    Fraction,
     Near,
     PresetName,
     Resolution,
@@ -92,6 +94,10 @@ else:
 class StylizeOptions(_Chosen):
     """Options of `sgsst stylize` and of a job of the service. Omitted options take their values from the preset."""
 
+    style_background: Annotated[
+        tuple[Fraction, Fraction, Fraction],
+        Option(unit="RGB, 0 to 1", metavar="COLOR", default="white", parse=parse_color, syntax=COLOR_SYNTAX),
+    ] = Field((1.0, 1.0, 1.0), description="Color behind transparent parts of style images.")
     backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 if it is installed, else VGG16.")
     compute_everything: bool = Field(
         False, description="Compute even what cannot change the result; slower, with the same result."

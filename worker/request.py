@@ -49,6 +49,7 @@ class StylizeRequest:
         settings: Settings of the method.
         regions: Regions with their own style or frozen colors, from `region_requests`.
         colors: Whether to also write a file of the stylized colors alone, if nothing else of the scene changes.
+        style_background: sRGB color behind transparent parts of style images, in 0..1.
     """
 
     source: SceneRequest
@@ -60,6 +61,7 @@ class StylizeRequest:
     settings: Settings
     regions: tuple[RegionRequest, ...] = ()
     colors: bool = False
+    style_background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)

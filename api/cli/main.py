@@ -127,7 +127,17 @@ def stylize(
         region_options(region or (), region_style or (), region_weight or (), region_freeze or ())
     )
     styles = parse_styles(style)
-    request = StylizeRequest(source, styles, images, out, options.backbone, run.resume, settings, regions)
+    request = StylizeRequest(
+        source,
+        styles,
+        images,
+        out,
+        options.backbone,
+        run.resume,
+        settings,
+        regions,
+        style_background=options.style_background,
+    )
     _stylize(request, context.obj, options.workers, WorkerOptions(run.rank_timeout, run.checkpoint_seconds))
 
 
@@ -303,7 +313,17 @@ def plan(
     regions = region_requests(
         region_options(region or (), region_style or (), region_weight or (), region_freeze or ())
     )
-    request = StylizeRequest(source, parse_styles(style), images, out, options.backbone, False, settings, regions)
+    request = StylizeRequest(
+        source,
+        parse_styles(style),
+        images,
+        out,
+        options.backbone,
+        False,
+        settings,
+        regions,
+        style_background=options.style_background,
+    )
     with job_bar(error_console) as bar:
         made = make_plan(request, bar.show_planning, sheet)
     table = Table(Column("item", no_wrap=True), "decision and reason", Column("saves", no_wrap=True), show_lines=True)

@@ -58,7 +58,9 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     cameras = capture.cameras
     check_sh_attenuation(file, settings.sh_attenuation)
     weights = load_network_weights(request.backbone)
-    style = load_styles(request.styles)  # also reports an unusable style before any work is done
+    style = load_styles(
+        request.styles, request.style_background
+    )  # also reports an unusable style before any work is done
     regions = read_regions(request, file, fit_cameras(cameras, settings))
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)

@@ -126,7 +126,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         for path in staged.styles:
             _check_pixel_count(path, limits)
         job = stylize_request(staged, parameters)
-        style = load_styles(job.styles)
+        style = load_styles(job.styles, job.style_background)
         found["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
     with _errors_of("cameras"):
         check_choice(source)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from sgsst_core.errors import ImageError
 from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.color_profiles import ColorProfile
 
 #: Maximum number of pixels: Pillow's limit against decompression bombs, which is twice its warning threshold. These 179
 #: megapixels exceed the largest camera sensors, and take 2 GB as float32.
@@ -24,9 +25,19 @@ MAX_PIXELS = 2 * ((1 << 30) // 4 // 3)
 #: Accepted formats, whose decoding time is bounded by the number of pixels and bytes of a file. Pillow's other formats
 #: are refused, because some are decoded in Python or by external programs.
 FORMATS = ("JPEG", "PNG", "GIF", "BMP", "WEBP", "TIFF", "AVIF")
+#: Suffixes of HEIC images, which pillow-heif reads (the extra `heif`), and the brands at their beginning.
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+_HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1"}
 #: Maximum number of scans of a progressive JPEG. A scan of a few bytes makes the decoder process all pixels again.
 #: Encoders write about 10.
 MAX_JPEG_SCANS = 100
+
+#: sRGB color, each channel in 0..1.
+Color = tuple[float, float, float]
+WHITE: Color = (1.0, 1.0, 1.0)
+
+#: Formats whose further images are no frames, but previews or maps of the brightness.
+_STILL = ("JPEG", "MPO", "HEIF")
 _JPEG_QUALITY = 95
 _EXIF_ORIENTATION = 0x0112
 #: EXIF orientations that swap width and height.
@@ -37,29 +48,56 @@ _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
 
 
-def load_image(path: Path, *, oriented: bool = True) -> Tensor:
-    """Read an image in one of `FORMATS`, or the first frame of an animated one.
+class ImageWarning(UserWarning):
+    """Part of an image that is not used, such as a broken color profile."""
 
-    The EXIF orientation is applied (unless `oriented` is False), and transparent images are composited on white.
-    Palettes, gray, 16 bits and CMYK are converted to RGB.
+
+def load_image(
+    path: str | Path,
+    *,
+    background: Color = WHITE,
+    oriented: bool = True,
+    color_managed: bool = True,
+    warn: Callable[[str], None] | None = None,
+) -> Tensor:
+    """Read an image in one of `FORMATS` or HEIC, or the first frame of an animated one.
+
+    Colors are converted to sRGB by the image's ICC profile; images without one are taken for sRGB. Palettes, gray, 16
+    bits and CMYK are converted to RGB.
+
+    Args:
+        path: Path of the file.
+        background: sRGB color behind transparent parts, in 0..1; white by default.
+        oriented: Whether the EXIF orientation is applied.
+        color_managed: Whether the ICC profile is applied. Masks hold no colors.
+        warn: Callback for a color profile or frames that are ignored; None to issue an `ImageWarning`.
 
     Returns:
-        Image [H, W, 3] float32 in 0..1, sRGB values as stored (no linearization, no color profile).
+        Image [H, W, 3] float32 in 0..1, sRGB values (not linear).
 
     Raises:
-        ImageError: If the file is missing, not an image or truncated, or has more than MAX_PIXELS pixels or (JPEG)
-            MAX_JPEG_SCANS scans. Both limits are checked before decoding.
+        ImageError: If the file is missing, not an image or truncated, is HEIC without the extra `heif`, or has more
+            than MAX_PIXELS pixels or (JPEG) MAX_JPEG_SCANS scans. Both limits are checked before decoding.
 
     Example:
-        >>> image = load_image(Path("style.png"))
+        >>> image = load_image("style.png")
         >>> image.dtype, image.shape[2]
         (torch.float32, 3)
     """
+    path, warn = Path(path), warn or _issue_warning
     with _opened(path) as image:
         if image.format in ("JPEG", "MPO"):
             _check_scans(path)
+        if image.format not in _STILL and getattr(image, "is_animated", False):
+            warn(f"{path.name}: only its first frame is used")
         image.load()
-        return torch.from_numpy(_to_rgb(path, ImageOps.exif_transpose(image) if oriented else image))
+        profile = _profile_of(path, image, warn) if color_managed else None
+        upright = ImageOps.exif_transpose(image) if oriented else image
+        return torch.from_numpy(_to_rgb(path, upright, profile, background))
+
+
+def _issue_warning(text: str) -> None:
+    warnings.warn(text, ImageWarning, stacklevel=3)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -108,7 +146,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
-            opened = Image.open(path, formats=FORMATS)
+            opened = Image.open(path, formats=[*FORMATS, *_heif_format(path)])
         with opened as image:
             if image.width * image.height > MAX_PIXELS:
                 raise Image.DecompressionBombError
@@ -143,20 +181,66 @@ def _check_scans(path: Path) -> None:
             raise ImageError(f"{path}: is a progressive JPEG of more than {MAX_JPEG_SCANS} scans. Save it as PNG.")
 
 
-def _to_rgb(path: Path, image: Image.Image) -> NDArray[np.float32]:
+def _heif_format(path: Path) -> tuple[str, ...]:
+    """Return the name of Pillow's format for a HEIC file, and nothing for other files.
+
+    HEIC begins with a file type box of ISO/IEC 14496-12; its brands are those of ISO/IEC 23008-12.
+    """
+    with path.open("rb") as file:
+        head = file.read(12)
+    if head[4:8] != b"ftyp" or head[8:12] not in _HEIF_BRANDS:
+        return ()
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError as error:
+        raise ImageError(
+            f"{path}: is a HEIC image, which the extra `heif` reads. Run `pip install 'sgsst-service[heif]'`, or save "
+            "it as JPEG."
+        ) from error
+    register_heif_opener()
+    return ("HEIF",)
+
+
+def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> ColorProfile | None:
+    """Return the color profile of an image; None if it has none that changes colors."""
+    data = image.info.get("icc_profile")
+    if not data:
+        return None
+    mode = "L" if _is_gray(image) else "CMYK" if image.mode == "CMYK" else "RGB"
+    try:
+        profile = ColorProfile(data, mode)
+    except ValueError as error:
+        warn(f"{path.name}: its color profile is ignored, because {error}")
+        return None
+    return profile if profile.changes else None
+
+
+def _is_gray(image: Image.Image) -> bool:
+    return image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
+
+
+def _to_rgb(path: Path, image: Image.Image, profile: ColorProfile | None, background: Color) -> NDArray[np.float32]:
     """Convert a decoded image of any mode to RGB, [H, W, 3]."""
     if image.mode.startswith(("I", "F")):  # gray with more than 8 bits; Pillow would clip it at 255
         values: NDArray[np.float32] = np.asarray(image, dtype=np.float32)
         if not np.isfinite(values).all():
             raise ImageError(f"{path}: holds NaN or infinite pixels. Use another image.")
         gray = np.clip(values / np.float32(_full_scale(image.mode, float(values.max()))), 0, 1)
+        colors = profile.gray_to_srgb(gray) if profile else np.repeat(gray[:, :, None], 3, axis=2)
         key = image.info.get("transparency")
         if isinstance(key, int):
-            gray[values == key] = 1
-        return np.repeat(gray[:, :, None], 3, axis=2)
-    if image.has_transparency_data:
+            colors[values == key] = background
+        return colors
+    transparent = image.has_transparency_data
+    if transparent:
         image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+    if profile:
+        stored, image = image, profile.to_srgb(image)
+        if transparent:
+            image.putalpha(stored.getchannel("A"))
+    if transparent:
+        behind = tuple(round(255 * channel) for channel in background)
+        image = Image.alpha_composite(Image.new("RGBA", image.size, behind), image)
     pixels: NDArray[np.float32] = np.divide(np.asarray(image.convert("RGB")), 255, dtype=np.float32)
     return pixels
 

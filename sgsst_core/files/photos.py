@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from sgsst_core.errors import ImageError
-from sgsst_core.files.images import load_image, stored_size
+from sgsst_core.files.images import HEIF_SUFFIXES, load_image, stored_size
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import undistort
 
@@ -54,7 +54,7 @@ class PhotoFolder:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._extensions = Image.registered_extensions()
+        self._extensions = {*Image.registered_extensions(), *HEIF_SUFFIXES}
         #: Files by every trailing part of their relative path, without extension.
         self._index: dict[tuple[str, ...], list[Path]] = {}
         for path in sorted(folder.rglob("*")):
@@ -137,7 +137,7 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     return found
 
 
-def load_photo(photo: Photo, camera: Camera) -> Tensor:
+def load_photo(photo: Photo, camera: Camera, *, color_managed: bool = True) -> Tensor:
     """Read a photo as its pinhole camera sees it: [height, width, 3] float32 in 0..1.
 
     If the camera has a lens, its distortion is removed (`undistort`). Otherwise the photo is resized to the camera's
@@ -146,7 +146,7 @@ def load_photo(photo: Photo, camera: Camera) -> Tensor:
     Raises:
         ImageError: If the photo cannot be read (see `load_image`), or its aspect differs from the camera's.
     """
-    pixels = load_image(photo.path, oriented=photo.oriented)
+    pixels = load_image(photo.path, oriented=photo.oriented, color_managed=color_managed)
     if not fits((pixels.shape[1], pixels.shape[0]), camera):
         raise _misfit(photo.path, (pixels.shape[1], pixels.shape[0]), camera)
     if camera.lens is not None:

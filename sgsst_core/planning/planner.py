@@ -106,7 +106,7 @@ def make_plan(
             *([refine_decision(refinement, settings)] if refinement is not None else []),
             *(orbit_decisions(orbit, fitted, survey.uncovered) if orbit is not None else []),
             *(_about_regions(regions, resolved, plan, fitted) if regions is not None and resolved is not None else []),
-            *(_about_styles(style, settings) if style is not None else []),
+            *(_about_styles(style, regions, settings) if style is not None else []),
         ]
     return replace(plan, refinement=refinement, decisions=(*request_lines, *plan.decisions)), planning_context
 
@@ -117,16 +117,18 @@ def _style_count(style: Style | None, regions: Regions | None) -> int:
     return sum(len(mixture.images) if mixture else 1 for mixture in mixtures)
 
 
-def _about_styles(style: Style, settings: Settings) -> list[Decision]:
-    """Return the line about the mixture of several style images."""
+def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> list[Decision]:
+    """Return the lines about what was not used of style images, and about the mixture of several."""
+    own = [region.style for region in regions.every if region.style] if regions else []
+    lines = [Decision("style", "warning", note) for each in (style, *own) for note in each.notes]
     if len(style.images) == 1:
-        return []
+        return lines
     reason = f"{len(style.images)} images were given"
     if not has_statistics(settings.style_loss):
         reason += (
             "; features are matched with those of all images, whose weights matter only if there are too many features"
         )
-    return [Decision("styles", f"a mixture: {style.text}", reason, error=ANOTHER_LOSS)]
+    return [*lines, Decision("styles", f"a mixture: {style.text}", reason, error=ANOTHER_LOSS)]
 
 
 def _about_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[Camera]) -> list[Decision]:

@@ -1,0 +1,210 @@
+"""Tests that colors are converted to sRGB by an image's ICC profile, and that unusable profiles are ignored."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import subprocess
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageCms
+
+from sgsst_core.files.color_profiles import MAX_PROFILE_BYTES, ColorProfile
+from sgsst_core.files.images import ImageWarning, load_image
+from sgsst_core.files.photos import check_photos, find_masks, load_photo
+from sgsst_core.scene.camera import Camera
+from tests.icc_profiles import ADOBE_RGB, DISPLAY_P3, PROPHOTO, SRGB, cmyk_profile, gray_profile, rgb_profile
+
+BUILT_IN_SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
+def colors(channels: int = 3) -> np.ndarray:
+    """Return an image [24, 36, channels] uint8 of random colors."""
+    return np.random.default_rng(0).integers(0, 256, (24, 36, channels), dtype="u1")
+
+
+def save(path: Path, pixels: np.ndarray | Image.Image, profile: bytes, mode: str | None = None, **options: Any) -> Path:
+    image = pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels, mode)
+    image.save(path, icc_profile=profile, **options)
+    return path
+
+
+def srgb_of(linear_xyz: np.ndarray) -> np.ndarray:
+    """Return sRGB values in 0..1 of XYZ values relative to D65 (IEC 61966-2-1)."""
+    matrix = [
+        [3.2404542, -1.5371385, -0.4985314],
+        [-0.9692660, 1.8760108, 0.0415560],
+        [0.0556434, -0.2040259, 1.0572252],
+    ]
+    linear = np.clip(linear_xyz @ np.array(matrix).T, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def test_adobe_rgb_becomes_srgb(tmp_path: Path) -> None:
+    stored = colors()
+    image = load_image(save(tmp_path / "a.png", stored, rgb_profile(*ADOBE_RGB)))
+    # From the specification of Adobe RGB (1998), section 4.3.5.3.
+    matrix = [[0.57667, 0.18556, 0.18823], [0.29734, 0.62736, 0.07529], [0.02703, 0.07069, 0.99134]]
+    expected = srgb_of((stored / 255.0) ** 2.19921875 @ np.array(matrix).T)
+    assert np.abs(image.numpy() - expected).max() < 1.5 / 255
+    assert np.abs(image.numpy() - stored / 255.0).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "profile", [b"", rgb_profile(*SRGB), BUILT_IN_SRGB, gray_profile(0.0)], ids=["no", "own", "built-in", "gray"]
+)
+def test_images_without_a_profile_or_in_srgb_are_bit_identical(tmp_path: Path, profile: bytes) -> None:
+    stored = colors()[:, :, 0] if profile == gray_profile(0.0) else colors()
+    image = load_image(save(tmp_path / "a.png", stored, profile))
+    expected = torch.from_numpy(stored.reshape(24, 36, -1)).float() / 255
+    assert torch.equal(image, expected.expand(24, 36, 3))
+
+
+def test_gray_of_8_and_16_bits_is_converted_alike(tmp_path: Path) -> None:
+    profile = gray_profile(1.8)
+    steps = np.arange(256, dtype="u1")[None]
+    narrow = load_image(save(tmp_path / "a.png", steps, profile))
+    linear = (steps / 255.0) ** (round(1.8 * 256) / 256)
+    expected = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert np.abs(narrow.numpy()[:, :, 1] - expected).max() <= 1 / 255
+    wide = (np.arange(65536, dtype="u2")).reshape(256, 256)
+    image = load_image(save(tmp_path / "b.png", wide, profile))
+    assert torch.allclose(image.reshape(-1, 3)[::257], narrow[0], atol=1e-6)
+    assert len(image[:, :, 0].unique()) > 30_000
+
+
+def test_an_rgb_profile_applies_to_gray_pixels(tmp_path: Path) -> None:
+    steps = np.arange(256, dtype="u1")[None]
+    gray = load_image(save(tmp_path / "a.png", steps, rgb_profile(*PROPHOTO)))
+    same = load_image(save(tmp_path / "b.png", np.repeat(steps[:, :, None], 3, axis=2), rgb_profile(*PROPHOTO)))
+    assert torch.equal(gray, same)
+
+
+def test_transparent_and_palette_images_are_converted_before_they_are_composited(tmp_path: Path) -> None:
+    profile = rgb_profile(*DISPLAY_P3)
+    opaque = load_image(save(tmp_path / "a.png", colors(), profile))
+    rgba = np.dstack([colors(), np.full((24, 36), 255, "u1")])
+    rgba[:12, :, 3] = 0
+    image = load_image(save(tmp_path / "b.png", rgba, profile), background=(0.0, 1.0, 0.0))
+    assert torch.equal(image[12:], opaque[12:])
+    assert torch.equal(image[:12], torch.tensor([0.0, 1.0, 0.0]).expand(12, 36, 3))
+    palette = Image.fromarray(colors()).quantize(16)
+    found = load_image(save(tmp_path / "c.png", palette, profile))
+    assert torch.equal(found, load_image(save(tmp_path / "d.png", palette.convert("RGB"), profile)))
+
+
+def camera(name: str) -> Camera:
+    return Camera(name, 36, 24, 40.0, 40.0, 18.0, 12.0, torch.eye(4, dtype=torch.float64))
+
+
+def test_photos_are_converted_and_masks_are_not(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.png", colors(), rgb_profile(*ADOBE_RGB))
+    view = camera("a")
+    photo, mask = check_photos(tmp_path, [view])[0], find_masks(tmp_path, [view])[0]
+    assert photo is not None
+    assert mask is not None
+    assert torch.equal(load_photo(photo, view), load_image(path))
+    assert torch.equal(load_photo(mask, view, color_managed=False), torch.from_numpy(colors()).float() / 255)
+
+
+BROKEN: dict[str, tuple[bytes, str]] = {
+    "noise": (b"no profile", "is broken"),
+    "truncated": (rgb_profile(*ADOBE_RGB)[:200], "is broken|lacks"),
+    "no curves": (rgb_profile(*ADOBE_RGB).replace(b"TRC", b"XXX"), "lacks what a conversion to sRGB needs"),
+    "for other images": (cmyk_profile(), "is for CMYK colors"),
+    "too large": (rgb_profile(*ADOBE_RGB) + bytes(MAX_PROFILE_BYTES), "has more than 4 MiB"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_unusable_profiles_are_ignored_with_a_warning(tmp_path: Path, name: str) -> None:
+    profile, reason = BROKEN[name]
+    path = save(tmp_path / "a.tif", colors(), profile)
+    with pytest.warns(ImageWarning, match=rf"a\.tif: its color profile is ignored, because it {reason}"):
+        image = load_image(path)
+    assert torch.equal(image, torch.from_numpy(colors()).float() / 255)
+    told: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_image(path, warn=told.append)
+    assert len(told) == 1
+
+
+def test_profiles_with_random_damage_are_used_or_refused() -> None:
+    random = np.random.default_rng(0)
+    image = Image.fromarray(colors())
+    outcomes = set()
+    for original, mode in (
+        (rgb_profile(*DISPLAY_P3), "RGB"),
+        (rgb_profile(*ADOBE_RGB), "RGB"),
+        (cmyk_profile(5), "CMYK"),
+    ):
+        for _ in range(150):
+            data = bytearray(original)
+            for place in random.integers(0, min(len(data), 700), 4):
+                data[place] = random.integers(256)
+            try:
+                converted = ColorProfile(bytes(data), mode).to_srgb(image)
+                outcomes.add((converted.mode, converted.size))
+            except ValueError:
+                outcomes.add("refused")
+    assert outcomes == {("RGB", (36, 24)), "refused"}
+
+
+def wide_png(path: Path, pixels: np.ndarray, profile: bytes) -> Path:
+    """Write an RGB image of 16 bits, which Pillow cannot write."""
+    height, width = pixels.shape[:2]
+    rows = np.concatenate([np.zeros((height, 1), "u1"), pixels.astype(">u2").view("u1").reshape(height, -1)], axis=1)
+    chunks = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)),
+        (b"iCCP", b"test\0\0" + zlib.compress(profile)),
+        (b"IDAT", zlib.compress(rows.tobytes())),
+        (b"IEND", b""),
+    ]
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+            for kind, data in chunks
+        )
+    )
+    return path
+
+
+#: Ten files as painters, phones, cameras, scanners and printers write them.
+FILES: dict[str, Callable[[Path], Path]] = {
+    "adobe.png": lambda path: save(path, colors(), rgb_profile(*ADOBE_RGB)),
+    "adobe.jpg": lambda path: save(path, colors(), rgb_profile(*ADOBE_RGB), quality=95, subsampling=0),
+    "p3.png": lambda path: save(path, colors(), rgb_profile(*DISPLAY_P3)),
+    "p3.webp": lambda path: save(path, colors(), rgb_profile(*DISPLAY_P3), lossless=True),
+    "prophoto.tif": lambda path: save(path, colors(), rgb_profile(*PROPHOTO)),
+    "wide.png": lambda path: wide_png(path, colors().astype("u2") * 257, rgb_profile(*ADOBE_RGB)),
+    "gray.png": lambda path: save(path, colors()[:, :, 0], gray_profile(2.2)),
+    "gray16.png": lambda path: save(path, colors()[:, :, 0].astype("u2") * 257, gray_profile(1.8)),
+    "inks.tif": lambda path: save(path, colors(4), cmyk_profile(), "CMYK"),
+    "inks.jpg": lambda path: save(path, colors(4), cmyk_profile(), "CMYK", quality=95, subsampling=0),
+    "clear.png": lambda path: save(path, colors(4), rgb_profile(*DISPLAY_P3)),
+    "palette.png": lambda path: save(path, Image.fromarray(colors()).quantize(16), rgb_profile(*ADOBE_RGB)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILES)
+def test_colors_are_those_of_imagemagick(tmp_path: Path, name: str) -> None:
+    program = shutil.which("convert-im6.q16") or shutil.which("magick")
+    if program is None:
+        pytest.skip("ImageMagick is not installed: apt-get install imagemagick")
+    path = FILES[name](tmp_path / name)
+    (tmp_path / "srgb.icc").write_bytes(BUILT_IN_SRGB)
+    command = [program, path, "-profile", tmp_path / "srgb.icc", "-background", "white", "-flatten"]
+    command += ["-type", "TrueColor", "-depth", "16", "-endian", "LSB", "RGB:-"]
+    found = subprocess.run(command, check=True, capture_output=True, timeout=60).stdout
+    expected = np.frombuffer(found, "<u2").reshape(24, 36, 3) / 65535
+    assert np.abs(load_image(path).numpy() - expected).max() <= 1 / 255
