@@ -104,6 +104,15 @@ def camera(name: str) -> Camera:
     return Camera(name, 36, 24, 40.0, 40.0, 18.0, 12.0, torch.eye(4, dtype=torch.float64))
 
 
+def test_heic_images_are_read_with_their_profile(tmp_path: Path) -> None:
+    heif = pytest.importorskip("pillow_heif", reason="the extra `heif` is not installed")
+    heif.register_heif_opener()
+    pixels = np.full((24, 36, 3), (200, 60, 30), np.uint8)
+    path = save(tmp_path / "a.heic", pixels, rgb_profile(*DISPLAY_P3), format="HEIF", quality=100)
+    expected = load_image(save(tmp_path / "a.png", pixels, rgb_profile(*DISPLAY_P3)))
+    torch.testing.assert_close(load_image(path), expected, rtol=0, atol=2.5 / 255)
+
+
 def test_photos_are_converted_and_masks_are_not(tmp_path: Path) -> None:
     path = save(tmp_path / "a.png", colors(), rgb_profile(*ADOBE_RGB))
     view = camera("a")
