@@ -149,7 +149,7 @@ def test_unusable_profiles_are_ignored_with_a_warning(tmp_path: Path, name: str)
 def test_profiles_with_random_damage_are_used_or_refused() -> None:
     random = np.random.default_rng(0)
     image = Image.fromarray(colors())
-    outcomes = set()
+    outcomes: set[object] = set()
     for original, mode in (
         (rgb_profile(*DISPLAY_P3), "RGB"),
         (rgb_profile(*ADOBE_RGB), "RGB"),
@@ -157,8 +157,8 @@ def test_profiles_with_random_damage_are_used_or_refused() -> None:
     ):
         for _ in range(150):
             data = bytearray(original)
-            for place in random.integers(0, min(len(data), 700), 4):
-                data[place] = random.integers(256)
+            for position in random.integers(0, min(len(data), 700), 4):
+                data[position] = random.integers(256)
             try:
                 converted = ColorProfile(bytes(data), mode).to_srgb(image)
                 outcomes.add((converted.mode, converted.size))
@@ -212,7 +212,7 @@ def test_colors_are_those_of_imagemagick(tmp_path: Path, name: str) -> None:
         pytest.skip("ImageMagick is not installed: apt-get install imagemagick")
     path = FILES[name](tmp_path / name)
     (tmp_path / "srgb.icc").write_bytes(BUILT_IN_SRGB)
-    command = [program, path, "-profile", tmp_path / "srgb.icc", "-background", "white", "-flatten"]
+    command = [program, str(path), "-profile", str(tmp_path / "srgb.icc"), "-background", "white", "-flatten"]
     command += ["-type", "TrueColor", "-depth", "16", "-endian", "LSB", "RGB:-"]
     found = subprocess.run(command, check=True, capture_output=True, timeout=60).stdout
     expected = np.frombuffer(found, "<u2").reshape(24, 36, 3) / 65535
