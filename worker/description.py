@@ -46,8 +46,10 @@ def describe(job: Job) -> Prepared:
 
 def _describe_scene(job: Job) -> str:
     scene = job.scene_file.scene
-    dropped = f", {job.scene_file.dropped:,} invalid ones dropped" if job.scene_file.dropped else ""
-    return f"{len(scene):,} Gaussians{dropped}, SH degree {scene.sh_degree}"
+    notes = f", {job.scene_file.dropped:,} invalid ones dropped" if job.scene_file.dropped else ""
+    if job.scene_file.clamped:
+        notes += f", {job.scene_file.clamped:,} infinite opacities read as almost 0 or 1"
+    return f"{len(scene):,} Gaussians{notes}, SH degree {scene.sh_degree}"
 
 
 def _describe_views(job: Job) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.ply import PROPERTIES
+from sgsst_core.files.formats.quantized import OPACITY_LOGITS
 from sgsst_core.scene.stored_harmonics import RowLayout
 
 #: Order of the properties in messages; f_rest_* follow.
@@ -46,6 +47,8 @@ class SceneColumns:
     Attributes:
         arrays: float32 arrays by the names of the scene's tensors.
         flaws: Invalid values of each block that contains any.
+        clamped: Number of infinite opacities in each block that contains any. They are replaced by the logits of
+            almost 0 and 1 that compressed formats use, because exporters write an alpha of 255 as infinity.
     """
 
     def __init__(self, count: int, coefficients: int, stored: RowLayout | None) -> None:
@@ -62,6 +65,7 @@ class SceneColumns:
         for i in range(3 * coefficients):
             self._targets[f"f_rest_{i}"] = self.arrays["sh_rest"][:, i % coefficients, i // coefficients]
         self.flaws: list[_Flaws] = []
+        self.clamped: list[int] = []
 
     def take(self, start: int, rows: NDArray[Any]) -> None:
         """Copy a structured block of rows to the arrays from row `start` on. Thread-safe for different blocks."""
@@ -76,6 +80,11 @@ class SceneColumns:
 
         `rows` is required if SH coefficients stay in the file.
         """
+        opacities = self.arrays["opacities"][start : start + count]
+        infinite = np.isinf(opacities)
+        if infinite.any():
+            self.clamped.append(int(infinite.sum()))
+            np.clip(opacities, OPACITY_LOGITS[0], OPACITY_LOGITS[-1], out=opacities, where=infinite)
         arrays = [array[start : start + count] for array in self.arrays.values()]
         if self._stored is not None and rows is not None:
             table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)

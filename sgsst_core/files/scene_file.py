@@ -65,6 +65,7 @@ class SceneFile:
         retained: Mask [rows] bool of the file's rows that the scene contains; None if it contains all.
         stamp: Size in bytes and modification time in ns of the file when it was read.
         format: Name of the file's format.
+        clamped: Number of infinite opacities that were replaced by finite ones. The stylized PLY keeps them.
         copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
     """
 
@@ -74,6 +75,7 @@ class SceneFile:
     retained: NDArray[np.bool_] | None
     stamp: tuple[int, int]
     format: str = PLY.name
+    clamped: int = 0
     copies: NDArray[np.int64] | None = None
 
     def refined(self, refinement: Refinement | None) -> SceneFile:
@@ -110,8 +112,8 @@ def read_scene(
     Args:
         path: Path of the file.
         drop_invalid: Whether to drop Gaussians with NaN or infinite values, or with a quaternion of length 0, from the
-            scene and the stylized file. If False, such a file is refused. Properties that 3DGS does not use are not
-            checked.
+            scene and the stylized file. If False, such a file is refused. Infinite opacities are clamped instead.
+            Properties that 3DGS does not use are not checked.
         held_bytes: Maximum bytes of SH coefficients above degree 0 in memory. If they take more, they stay in the file
             (`StoredHarmonics`), provided that its layout allows this; see `stays_in_file`. None for `HELD_BYTES`.
         spz_axes: Axes of an SPZ file, "rub" or "rdf"; "auto" for those that the file states, else "rdf".
@@ -150,7 +152,7 @@ def read_scene(
     scene = Scene(**arrays)
     if retained is not None:
         scene = scene.subset(torch.from_numpy(retained))
-    return SceneFile(path, scene, ply, retained, stamp, header.format.name)
+    return SceneFile(path, scene, ply, retained, stamp, header.format.name, sum(columns.clamped))
 
 
 def _read_arrays(file: RowFile, header: SceneHeader, columns: SceneColumns) -> None:

@@ -109,6 +109,7 @@ def scene_findings(file: SceneFile) -> list[Finding]:
     scene = _Scene(file)
     return [
         *scene.invalid(),
+        *scene.infinite_opacities(),
         *scene.rotations(),
         *scene.sizes(),
         *scene.opacities(),
@@ -178,6 +179,12 @@ class _Scene:
                 done,
             )
         ]
+
+    def infinite_opacities(self) -> list[Finding]:
+        if not self.file.clamped:
+            return []
+        done = "read as almost 0 or 1, as in compressed formats; the stylized PLY keeps them"
+        return [Finding("scene", "infinite opacity", self.file.clamped, len(self.scene), "", done)]
 
     def rotations(self) -> list[Finding]:
         low, high = QUATERNION_LENGTHS

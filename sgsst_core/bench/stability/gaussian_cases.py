@@ -160,7 +160,7 @@ _SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def _invalid_in_file(name: str, value: str, full: bool) -> CaseResult:
-    """Check that a file with an invalid value is refused.
+    """Check that a file with an invalid value is refused, or its opacity clamped.
 
     With `drop_invalid`, the rest must render as if the Gaussian did not exist.
     """
@@ -170,8 +170,10 @@ def _invalid_in_file(name: str, value: str, full: bool) -> CaseResult:
         path = Path(folder) / "scene.ply"
         write_scene(path, scene)
         try:
-            read_scene(path)
-            return CaseResult(math.inf, 0.0, "the file was not refused")
+            file = read_scene(path)
+            if not file.clamped:
+                return CaseResult(math.inf, 0.0, "the file was not refused")
+            return replace(compare_rasterizers(file.scene, camera()), note="read as almost 0 or 1")
         except SceneError:
             found = read_scene(path, drop_invalid=True).scene
     rows = torch.zeros(60, dtype=torch.bool)

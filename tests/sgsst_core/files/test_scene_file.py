@@ -302,10 +302,10 @@ def test_non_finite_values_are_counted_by_property_and_may_be_dropped(tmp_path: 
     file = simple(5, degree=1, form=form)
     file.elements.append(("after", [("uchar", "a")], [{"a": 3}]))
     rows = file.elements[0][2]
-    rows[1] |= {"opacity": float("inf"), "f_rest_2": float("nan")}
-    rows[3] |= {"opacity": float("-inf")}
+    rows[1] |= {"scale_1": float("inf"), "f_rest_2": float("nan")}
+    rows[3] |= {"scale_1": float("-inf")}
     path = save(tmp_path, file)
-    with pytest.raises(SceneError, match=r"2 of 5 .*opacity \(2 infinite\), f_rest_2 \(1 NaN\).*--drop-invalid"):
+    with pytest.raises(SceneError, match=r"2 of 5 .*scale_1 \(2 infinite\), f_rest_2 \(1 NaN\).*--drop-invalid"):
         read_scene(path)
     source = read_scene(path, drop_invalid=True)
     assert (len(source.scene), source.dropped) == (3, 2)
@@ -315,6 +315,19 @@ def test_non_finite_values_are_counted_by_property_and_may_be_dropped(tmp_path: 
     left = [rows[i] | {f"f_dc_{c}": value for c in range(3)} for i, value in ((0, 9.0), (2, 8.0), (4, 7.0))]
     assert elements == {"vertex": left, "after": [{"a": 3}]}
     assert lines == [line.replace(b"vertex 5", b"vertex 3") for line in second_reader(path.read_bytes())[0]]
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_infinite_opacities_are_read_as_those_of_compressed_formats_and_kept(tmp_path: Path, form: str) -> None:
+    file = simple(5, form=form)
+    file.elements[0][2][1]["opacity"], file.elements[0][2][3]["opacity"] = float("inf"), float("-inf")
+    source = read_scene(save(tmp_path, file))
+    assert (source.dropped, source.clamped) == (0, 2)
+    expected = torch.tensor([0.25 / 255, 1 - 0.25 / 255])
+    torch.testing.assert_close(source.scene.opacities[[3, 1]].sigmoid(), expected, rtol=1e-5, atol=0)
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
+    rows = second_reader((tmp_path / "out.ply").read_bytes())[1]["vertex"]
+    assert [rows[1]["opacity"], rows[3]["opacity"]] == [float("inf"), float("-inf")]
 
 
 def test_a_scene_without_any_finite_gaussian_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,130 @@
+"""Tests against other programs: splat-transform and GaussForge read what is written, and vice versa.
+
+They come from npm and PyPI at fixed versions. Without either, the tests are skipped.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from sgsst_core.files.formats import RESULT_FORMATS, by_name
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.stored_harmonics import held
+from tests.sgsst_core.splat_scenes import cloud
+
+pytestmark = pytest.mark.slow
+
+PACKAGE = "@playcanvas/splat-transform@3.7.0"
+#: Formats that splat-transform reads; its name ends with this suffix for each of ours.
+READ_BY_SPLAT_TRANSFORM = ("ply", "compressed.ply", "spz", "v4.spz", "sog")
+#: Largest differences of opacities after the sigmoid, and of other values, from what another program reads. Compressed
+#: formats leave a byte's value open: some read its center, others its lower end.
+OPACITIES, VALUES = 1.1e-3, {"compressed.ply": 0.02}
+
+
+@pytest.fixture(scope="session")
+def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the package of npm."""
+    if not shutil.which("npm") or not shutil.which("node"):
+        pytest.skip("npm is not installed")
+    folder = tmp_path_factory.mktemp("npm")
+    (folder / "package.json").write_text("{}")
+    done = subprocess.run(
+        ["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", PACKAGE],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        pytest.skip(f"npm cannot install splat-transform: {done.stderr[-300:]}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    return cloud(2000, degree=2)
+
+
+def splat_transform(modules: Path, *arguments: str | Path) -> None:
+    program = modules / "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
+    command = ["node", str(program), "--quiet", "--overwrite", "--gpu", "cpu", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def matched(found: Scene, expected: Scene) -> Scene:
+    """Return the Gaussians of `found` in the order of `expected`, by position."""
+    assert len(found) == len(expected)
+    _, rows = cKDTree(found.means.numpy()).query(expected.means.numpy())
+    assert len(np.unique(rows)) == len(expected)
+    return found.subset(torch.from_numpy(rows))
+
+
+def assert_same(found: Scene, expected: Scene, tolerance: float = 1e-4) -> None:
+    """Assert that every value of every Gaussian is the same, up to the sign of quaternions."""
+    found = matched(found, expected)
+    assert found.sh_degree == expected.sh_degree
+    for field in fields(Scene):
+        one, other = (held(getattr(each, field.name)).double() for each in (found, expected))
+        if field.name == "opacities":
+            one, other = one.sigmoid(), other.sigmoid()
+        if field.name == "quats":
+            one, other = (torch.nn.functional.normalize(each, dim=1) for each in (one, other))
+            other = other * (one * other).sum(dim=1, keepdim=True).sign()
+        error = float((one - other).abs().max()) if one.numel() else 0.0
+        assert error <= (OPACITIES if field.name == "opacities" else tolerance), field.name
+
+
+@pytest.mark.parametrize("name", READ_BY_SPLAT_TRANSFORM)
+def test_splat_transform_reads_what_is_written(modules: Path, scene: Scene, tmp_path: Path, name: str) -> None:
+    ours, ply = tmp_path / f"ours.{name}", tmp_path / "theirs.ply"
+    write_scene(ours, scene, by_name(name))
+    splat_transform(modules, ours, ply)
+    assert_same(read_scene(ply).scene, read_scene(ours).scene, VALUES.get(name, 1e-4))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("theirs.compressed.ply", ()),
+        ("theirs.spz", ("--spz-version", "3")),
+        ("theirs.spz", ("--spz-version", "4")),
+        ("theirs.sog", ()),
+        ("meta.json", ()),
+    ],
+)
+def test_what_splat_transform_writes_is_read(
+    modules: Path, scene: Scene, tmp_path: Path, name: str, options: tuple[str, ...]
+) -> None:
+    ours, theirs, back = tmp_path / "ours.ply", tmp_path / name, tmp_path / "back.ply"
+    write_scene(ours, scene)
+    splat_transform(modules, *options, ours, theirs)
+    splat_transform(modules, theirs, back)
+    assert_same(read_scene(theirs).scene, read_scene(back).scene, 0.02 if "compressed" in name else 1e-4)
+
+
+@pytest.mark.parametrize("name", ["ply", "compressed.ply", "spz", "v4.spz", "sog"])
+def test_gaussforge_reads_what_is_written(scene: Scene, tmp_path: Path, name: str) -> None:
+    gaussforge = pytest.importorskip("gaussforge", reason="gaussforge is not installed")
+    ours = tmp_path / f"ours.{name}"
+    write_scene(ours, scene, by_name(name))
+    answer = gaussforge.GaussForge().read(ours.read_bytes(), name.removeprefix("v4."))
+    assert "error" not in answer, answer
+    found, expected = answer["data"], read_scene(ours).scene
+    for key, values in (("positions", expected.means), ("scales", expected.scales)):
+        one = torch.tensor(np.frombuffer(found[key], np.float32).reshape(-1, 3).copy())
+        torch.testing.assert_close(one.abs(), values.abs(), rtol=1e-4, atol=1e-4)
+
+
+def test_no_format_is_forgotten() -> None:
+    """A new format is added to the lists above, or here if no other program reads it."""
+    assert {each.name for each in RESULT_FORMATS} - {"glb"} == set(READ_BY_SPLAT_TRANSFORM)
