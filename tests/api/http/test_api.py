@@ -323,12 +323,13 @@ def test_the_command_line_sends_every_parameter(
     service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0], "style_weights": [1.0, 2.5]}
+    told["style_background"] = [0.0, 0.0, 0.0]
     told["regions"] = [
         {"name": "left", "select": "half-space=-1,0,0,0", "style": ["3_style.png:0.5"], "weight": 2.0},
         {"name": "rest", "weight": 3.0},
     ]
     told["scales"] = [1.0, 0.0, 0.5]
-    texts = {"background": "white", "scales": "1,0,0.5"}
+    texts = {"background": "white", "style_background": "black", "scales": "1,0,0.5"}
     ply, _, style = write_files(tmp_path, ball())
     command = ["submit", str(ply), "--style", str(style), "--style", f"{style}:2.5", "--url", service.url, "--json"]
     command += ["--region", "left:half-space=-1,0,0,0", "--region-style", f"left={style}:0.5"]
