@@ -83,9 +83,7 @@ class Outputs:
         Raises:
             OutputError: If the name does not end in a suffix of a format that can be written.
         """
-        format = format_of_name(out.name)
-        if format is None or format.write is None:
-            raise OutputError(f"{out}: does not end in {RESULT_SUFFIXES}. Name the scene file to write.")
+        format = result_format(out)
         if format is PLY:
             return Outputs(out)
         return Outputs(out.with_name(out.name[: -len(format.suffix)] + PLY.suffix), out)
@@ -210,13 +208,37 @@ def check_request(request: StylizeRequest) -> Outputs:
         raise OutputError(f"{out}: is a folder. Give the PLY file to write, such as {out / 'stylized.ply'}.")
     outputs = Outputs.of(out)
     for path in (outputs.ply, outputs.packed):
-        if path and path.exists() and request.source.scene.exists() and path.samefile(request.source.scene):
-            beside = "" if path == out else f" (the PLY beside {out.name})"
-            raise OutputError(
-                f"{path}{beside}: is the scene itself, which would be overwritten. Give another file name."
-            )
+        if path is not None:
+            check_is_not_scene(path, request.source.scene, "" if path == out else f" (the PLY beside {out.name})")
     check_folder(out.parent)
     return outputs
+
+
+def result_format(out: Path) -> SceneFormat:
+    """Return the format that the name of a scene to write determines.
+
+    Raises:
+        OutputError: If the name does not end in a suffix of a format that can be written, or is that of a folder.
+    """
+    format = format_of_name(out.name)
+    if format is None or format.write is None or out.is_dir():
+        raise OutputError(f"{out}: does not end in {RESULT_SUFFIXES}. Name the scene file to write.")
+    return format
+
+
+def check_is_not_scene(out: Path, scene: Path, remark: str = "") -> None:
+    """Check that an output is not the scene itself.
+
+    Args:
+        out: File to write.
+        scene: Scene to read.
+        remark: Text about the output for the message.
+
+    Raises:
+        OutputError: If it is.
+    """
+    if out.exists() and scene.exists() and out.samefile(scene):
+        raise OutputError(f"{out}{remark}: is the scene itself, which would be overwritten. Give another file name.")
 
 
 def check_folder(folder: Path) -> None:

@@ -20,7 +20,7 @@ from api.cli.options import with_options
 from api.cli.progress_bars import clock, job_bar, live_bar
 from api.cli.region_options import RegionKeepOption, RegionOption, RegionStyleOption, RegionWeightOption
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, WeightsError
-from sgsst_core.files.formats import EXTRA_SUFFIXES, SUFFIXES
+from sgsst_core.files.formats import EXTRA_SUFFIXES, RESULT_SUFFIXES, SUFFIXES
 from sgsst_core.options import renamed_hint
 from sgsst_core.settings import make_settings
 from worker.options import RunOptions, StylizeOptions, ViewOptions
@@ -246,7 +246,7 @@ def _conclude(outputs: Outputs, result: Result, command: str) -> None:
         out_console.print(f"{'loss over time:':<22}{line}")
     paths = [("stylized scene", outputs.ply)]
     if outputs.packed is not None and result.packed is not None:
-        out_console.print(f"{'compressed:':<22}{result.packed.text}")
+        out_console.print(f"{'compressed:':<22}{result.packed.text('the PLY')}")
         paths.append(("compressed scene", outputs.packed))
     paths += [("views", outputs.views)] if outputs.views.exists() else []
     if result.report_error is None:
@@ -392,6 +392,33 @@ def render(
         task = bar.add_task("", total=None)
         paths = render_views(source, background, out, lambda done, total: bar.update(task, completed=done, total=total))
     out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
+
+
+@app.command()
+@with_options(ViewOptions, only=("near", "drop_invalid", "spz_axes"))
+def convert(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help=f"Scene to write: {RESULT_SUFFIXES}.", show_default=False)],
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Report the PSNR of small renders against those of the scene.")
+    ] = False,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(help="Cameras that --compare renders, and that decide the axes of an SPZ. [default: an orbit]"),
+    ] = None,
+    *,
+    options: ViewOptions,
+) -> None:
+    """Convert a scene to another format, which the name of OUT determines."""
+    from api.cli.scene_tools import convert_scene
+    from worker.request import SceneRequest
+
+    converted = convert_scene(SceneRequest.of(scene, cameras, options), out, compare)
+    for line in converted.decisions:
+        out_console.print(f"{line.item + ':':<22}{line.decision}: {line.reason}")
+    if converted.loss is not None:
+        out_console.print(f"{'compared:':<22}{converted.loss.text(scene.name)}")
+    out_console.print(f"{'scene:':<22}{out}, {converted.count:,} Gaussians")
 
 
 @app.command()

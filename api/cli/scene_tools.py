@@ -1,4 +1,4 @@
-"""Implementation of the commands `plan`, `check` and `render`.
+"""Implementation of the commands `plan`, `check`, `render` and `convert`.
 
 The functions check all inputs, compute, and write the outputs, but print nothing. `stylize` is implemented by
 `worker.prepare` and `worker.execute`, on one rank or several.
@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from sgsst_core.decision import Decision
 from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
+from sgsst_core.quality.compression import CompressionLoss, measure_compression
 from sgsst_core.quality.findings import Finding, findings_of
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
@@ -26,8 +30,19 @@ from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.refining import refine, refined
+from worker.capture import choose_axes, read_capture
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
-from worker.request import SceneRequest, StylizeRequest, check_choice, check_folder
+from worker.request import (
+    SceneRequest,
+    StylizeRequest,
+    check_choice,
+    check_folder,
+    check_is_not_scene,
+    result_format,
+)
+
+#: Number of views of an orbit that a converted scene is compared in.
+_COMPARED_VIEWS = 3
 
 # --- plan ----------------------------------------------------------------------------------------------------------
 
@@ -145,3 +160,49 @@ def view_file_names(cameras: Sequence[Camera]) -> list[str]:
         plain = re.sub(r"[^A-Za-z0-9.-]+", "_", stem).strip("._")[-80:]
         names.append(f"{index:0{digits}d}_{plain}.png" if plain else f"{index:0{digits}d}.png")
     return names
+
+
+# --- convert -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Converted:
+    """Result of a conversion.
+
+    Attributes:
+        count: Number of Gaussians.
+        decisions: Lines about the scene's axes and the cameras.
+        loss: Difference of the written scene; None if it was not measured.
+    """
+
+    count: int
+    decisions: tuple[Decision, ...]
+    loss: CompressionLoss | None
+
+
+def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
+    """Write a scene in the format that the name of a file determines. Colors and order may change by its rounding.
+
+    Args:
+        source: Scene, and cameras for the comparison; without cameras, views are those of an orbit.
+        out: File to write.
+        compare: Whether to read the file back and compare renders.
+
+    Raises:
+        InvalidInputError: If scene, cameras or output cannot be used.
+    """
+    format = result_format(out)
+    check_is_not_scene(out, source.scene)
+    check_folder(out.parent)
+    if compare and source.cameras is None:
+        source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
+    axes, decisions = choose_axes(source)
+    scene = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes).scene
+    cameras: list[Camera] = []
+    if source.cameras or source.orbit:
+        capture = read_capture(source, scene).checked(scene, source.near)
+        cameras, decisions = capture.cameras, [*decisions, *capture.decisions]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_scene(out, scene, format)
+    loss = measure_compression(out, scene, cameras, near=source.near) if compare else None
+    return Converted(len(scene), tuple(decisions), loss)

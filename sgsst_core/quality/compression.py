@@ -1,4 +1,4 @@
-"""Quality loss of compressed scene files, measured by comparing renders with those of the original scene."""
+"""Quality loss of converted scene files, measured by comparing renders with those of the original scene."""
 
 from __future__ import annotations
 
@@ -42,11 +42,10 @@ class CompressionLoss:
         psnr = None if self.psnr is None else round(self.psnr, 2)
         return {"name": self.name, "format": self.format, "bytes": self.size, "views": self.views, "psnr_db": psnr}
 
-    @property
-    def text(self) -> str:
-        """One-line description of the result."""
+    def text(self, original: str) -> str:
+        """Return a description of the result in one line, given that of the original file."""
         psnr = "renders identical to" if self.psnr is None else f"{self.psnr:.1f} dB PSNR against"
-        return f"{self.format}, {self.size / 1e6:.1f} MB, {psnr} the PLY"
+        return f"{self.format}, {self.size / 1e6:.1f} MB, {psnr} {original}"
 
 
 def measure_compression(

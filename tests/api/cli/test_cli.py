@@ -14,7 +14,7 @@ import subprocess
 import sys
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from plyfile import PlyData
 from api.cli.main import main
 from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
-from sgsst_core.files.formats import RESULT_SUFFIXES, by_name
+from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
@@ -889,6 +889,44 @@ def test_render_refuses_what_stylize_refuses(files: Files, tmp_path: Path, capsy
     assert not (tmp_path / "renders").exists()
     assert main([*command[:-1], str(files.style)]) == 2
     assert "style.png" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [format.name for format in RESULT_FORMATS])
+def test_convert_writes_what_it_reads(files: Files, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    written, back = files.out.with_name(f"scene.{name}"), files.out.with_name("back.ply")
+    assert main(["convert", str(files.ply), str(written), "--compare", "--cameras", str(files.cameras)]) == 0
+    found = re.search(
+        rf"compared: +{name}, .* (renders identical to|([0-9.]+) dB PSNR against) scene.ply", capsys.readouterr().out
+    )
+    assert found
+    assert found[2] is None or float(found[2]) > 28
+    assert main(["convert", str(written), str(back)]) == 0
+    one, other = (read_scene(path) for path in (written, back))
+    assert (one.format, other.format) == (name, "ply")
+    for field in fields(one.scene):
+        assert torch.equal(getattr(one.scene, field.name), getattr(other.scene, field.name)), field.name
+
+
+def test_convert_compares_in_an_orbit(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["convert", str(files.ply), str(files.out), "--compare"]) == 0
+    assert "renders identical to scene.ply" in capsys.readouterr().out
+
+
+def test_convert_refuses_what_it_cannot_write(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files.ply.read_bytes()
+    for out, message in (
+        (files.ply, "is the scene itself"),
+        (files.ply.parent, f"does not end in {RESULT_SUFFIXES}"),
+        (files.out.with_name("scene.splat"), f"does not end in {RESULT_SUFFIXES}"),
+        (files.ply / "scene.spz", "there is a file of that name"),
+    ):
+        assert main(["convert", str(files.ply), str(out)]) == 2
+        assert message in capsys.readouterr().err
+    blind = files.cameras.with_name("blind.json")
+    blind.write_text("[]")
+    assert main(["convert", str(files.ply), str(files.out), "--cameras", str(blind)]) == 2
+    assert files.ply.read_bytes() == before
+    assert not files.out.parent.exists()
 
 
 def test_file_names_of_views_are_plain_and_sort_in_order() -> None:
