@@ -24,11 +24,20 @@ from sgsst_core.timing import Timer
 MOST_GRAPHS = 256
 #: Number of visits of a view before a graph speeds it up: the first visit warms up the kernels, the second is captured.
 FIRST_VISITS = 2
+#: First version of PyTorch whose allocator recovers from a failed capture.
+FIRST_TORCH = 2, 13
 
 
-def has_graphs(device: torch.device | str) -> bool:
-    """Return whether a device supports CUDA graphs. Only NVIDIA GPUs do; graphs are untested on ROCm."""
-    return torch.device(device).type == "cuda" and torch.version.hip is None
+def graphs_problem(device: torch.device | str) -> str | None:
+    """Return the reason why CUDA graphs are not used on a device; None if they are.
+
+    Before PyTorch 2.13, the allocator stays in capture mode after a capture has failed, which breaks the process.
+    """
+    if torch.device(device).type != "cuda" or torch.version.hip is not None:
+        return "only NVIDIA GPUs are known to replay them"
+    if tuple(map(int, torch.__version__.split(".")[:2])) < FIRST_TORCH:
+        return f"PyTorch {'.'.join(map(str, FIRST_TORCH))} or later is needed, but this is {torch.__version__}"
+    return None
 
 
 def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
@@ -85,10 +94,11 @@ class LossGraphs:
 
     The first evaluation with a given key (size, scales, tiles, style) runs in eager mode, which compiles kernels and
     lets cuDNN benchmark its algorithms. The second evaluation is captured as a graph. If capturing fails, this and all
-    later evaluations run in eager mode.
+    later evaluations run in eager mode. PyTorch then keeps the memory of the failed capture until the process ends; it
+    is at most the memory that `can_be_captured` reserves.
 
     Args:
-        loss: Loss of a single rank, on a device that supports CUDA graphs (`has_graphs`).
+        loss: Loss of a single rank, on a device that supports CUDA graphs (`graphs_problem`).
         most: Maximum number of cached graphs.
 
     Attributes:

@@ -33,10 +33,12 @@ class _Capture(threading.local):
     Attributes:
         recorders: Callbacks that receive each captured operation, its arguments, its keyword arguments and its result,
             all with CPU tensors.
+        stuck: Whether a capture has failed in a version of PyTorch whose allocator then stays in capture mode.
     """
 
     def __init__(self) -> None:
         self.recorders: list[Callable[[Any, Any, Any, Any], None]] = []
+        self.stuck = False
 
 
 capture = _Capture()
@@ -106,6 +108,8 @@ def inner(value: Any) -> Any:
 
 def wait(line: str | None = None) -> None:
     """Count a host synchronization: a wait of the host for the device."""
+    if capture.stuck:
+        raise RuntimeError("captures_underway.empty() INTERNAL ASSERT FAILED")
     refuse_in_capture("the host waits for the device")
     counts.waits[line or calling_line()] += 1
 

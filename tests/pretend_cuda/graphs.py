@@ -74,12 +74,18 @@ class CUDAGraph:
 def graph(
     cuda_graph: CUDAGraph, pool: Any = None, stream: Any = None, capture_error_mode: str = "global"
 ) -> Iterator[None]:
-    """Capture the operations of this thread within the block, as `torch.cuda.graph` does."""
+    """Capture the operations of this thread within the block, as `torch.cuda.graph` does.
+
+    If it fails, PyTorch before 2.13 leaves the allocator in capture mode.
+    """
     device.refuse_in_capture("another capture")
     device.wait()
     device.capture.recorders.append(cuda_graph.record)
     try:
         yield
+    except BaseException:
+        device.capture.stuck = torch.__version__ < "2.13"
+        raise
     finally:
         device.capture.recorders.clear()
     cuda_graph.end()

@@ -147,6 +147,7 @@ def pretend_cuda() -> Iterator[Counts]:
         "graph_pool_handle": lambda: (0, 1),
     }
     device.counts.clear()
+    device.capture.stuck = False
     with (
         mock.patch.multiple(torch.cuda, **instead),
         mock.patch.object(GridExecutor, "__call__", _count_launch(GridExecutor.__call__)),

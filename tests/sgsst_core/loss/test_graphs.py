@@ -14,7 +14,7 @@ if torch.cuda.is_available():
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, has_graphs
+from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, graphs_problem
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.loss.terms import layers_of
@@ -182,6 +182,14 @@ def test_what_cannot_be_captured_is_evaluated_as_ever(
     assert not torch.cuda.is_current_stream_capturing()
 
 
+def test_graphs_are_used_from_the_version_whose_allocator_survives_failures(
+    counts: Counts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for version, used in (("2.11.0+cu128", False), ("2.12.1", False), ("2.13.0+cu130", True), ("3.0", True)):
+        monkeypatch.setattr(torch, "__version__", version)
+        assert (graphs_problem("cuda") is None) is used
+
+
 @pytest.mark.usefixtures("without_triton")
 @pytest.mark.parametrize(
     ("options", "fits"), [({"tile_size": 32}, 9.0), ({"cache_activations": False}, 9.0), ({}, 1.9), ({}, 2.1)]
@@ -211,7 +219,7 @@ def test_a_view_without_its_content_is_not_captured(tiny_weights: BackboneWeight
 
 
 def test_where_graphs_are_thought_of(tiny_weights: BackboneWeights) -> None:
-    assert not has_graphs("cpu")
+    assert graphs_problem("cpu") == "only NVIDIA GPUs are known to replay them"
     tiling = Tiling(halo=64, held=1000.0, working=0.25, coarsest=16)
     assert can_be_captured(tiling, [400, 100])
     assert not can_be_captured(tiling, [401, 100])

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
+from torch.torch_version import TorchVersion
 
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
@@ -64,6 +67,28 @@ def test_launch_cost_without_graph_states_the_problem(
     with monkeypatch.context() as patch:
         patch.setattr(torch.cuda, "graph", broken)
         assert launch_cost(SosLoss(network), SIZE).problem == "RuntimeError: not here"
+
+
+@pytest.mark.parametrize(
+    ("version", "problem"), [("2.12.1", "PyTorch 2.13 or later is needed"), ("2.13.0", "not here")]
+)
+def test_a_failed_capture_does_not_break_the_process(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, version: str, problem: str
+) -> None:
+    network = FeatureNetwork(tiny_weights, device="cuda")
+    convolve = FeatureNetwork._convolve
+
+    def cannot_be_captured(network: FeatureNetwork, x: Tensor, step: Any) -> Tensor:
+        if torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("not here")
+        return convolve(network, x, step)
+
+    monkeypatch.setattr(torch, "__version__", TorchVersion(version))
+    monkeypatch.setattr(FeatureNetwork, "_convolve", cannot_be_captured)
+    found = launch_cost(SosLoss(network, coarsest=16), SIZE).problem
+    assert found is not None
+    assert problem in found
+    torch.cuda.synchronize()
 
 
 def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_weights: BackboneWeights) -> None:
