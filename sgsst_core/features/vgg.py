@@ -126,17 +126,20 @@ def convolutions(device: torch.device, *, tf32: bool = False, search: bool = Fal
         device: Device of the convolutions.
         tf32: Whether to use TF32 instead of full float32.
         search: Whether cuDNN benchmarks all of its algorithms at the first convolution of each shape. Otherwise it uses
-            its heuristics.
+            its heuristics, restricted to deterministic algorithms.
     """
     if device.type != "cuda":
         yield
         return
-    before = _CUDNN.benchmark, _CUDNN.conv.fp32_precision
+    before = _CUDNN.benchmark, _CUDNN.deterministic, _CUDNN.conv.fp32_precision
     try:
-        _CUDNN.benchmark, _CUDNN.conv.fp32_precision = search, "tf32" if tf32 else "ieee"
+        # PyTorch caches the algorithm of each shape under a key that contains `deterministic` but not `benchmark`.
+        # Setting both keeps a search from reusing what heuristics have chosen for another network of this process.
+        _CUDNN.benchmark, _CUDNN.deterministic = search, not search
+        _CUDNN.conv.fp32_precision = "tf32" if tf32 else "ieee"
         yield
     finally:
-        _CUDNN.benchmark, _CUDNN.conv.fp32_precision = before
+        _CUDNN.benchmark, _CUDNN.deterministic, _CUDNN.conv.fp32_precision = before
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,7 @@ class FeatureNetwork:
         pixel_weight: Weight of the terms of `PIXELS`: the layer's factor squared. The features of `PIXELS` are not
             multiplied by this factor.
         search: Whether cuDNN benchmarks its algorithms for every new image size, which takes about ten passes. Off by
-            default; worthwhile for sizes that recur often enough.
+            default; worthwhile for sizes that recur often enough. Decided before the first image of such a size.
     """
 
     def __init__(

@@ -19,10 +19,12 @@ from sgsst_core.loss.convergence import LEAST_FALL, window_length
 from sgsst_core.loss.nearest import MOST_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.statistics_terms import has_statistics
+from sgsst_core.parallel.division import Size
 from sgsst_core.planning.cost import OPTIMIZER_BYTES, CostModel, RanksChoice, ViewData
 from sgsst_core.planning.facts import LEAST_VISITS, LaunchCost, Link, Probe, RasterCost
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RASTERIZERS
+from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import CachedWeights, PlannedBackground, Precision, Settings
 
 #: Fraction of uncovered pixels above which statistics are weighted by coverage, unless the settings say otherwise.
@@ -210,6 +212,12 @@ def about_colors(settings: Settings) -> list[Decision]:
 # --- schedule ------------------------------------------------------------------------------------------------------
 
 
+def computed_scales(sizes: Sequence[Size], settings: Settings) -> list[int]:
+    """Return the number of scales with a positive weight of views of each size (height, width)."""
+    weights = ScaleWeights(settings.scales)
+    return [len(weights.chosen(scale_count(*size, settings.coarsest_side))) for size in sizes]
+
+
 def steps_coarse(scales: Sequence[int], settings: Settings) -> tuple[int, list[Decision]]:
     """Choose the number of steps of phase 1. `scales` are the numbers of scales with a weight, of all views."""
     if not settings.steps_coarse or max(scales) > 1 or settings.preset == "paper":
@@ -266,15 +274,20 @@ class Visits:
     of_a_size: int
 
     @staticmethod
-    def of(probe: Probe, settings: Settings, steps_coarse: int, *, weighted: bool) -> Visits:
-        """Count the visits of a schedule.
+    def of(survey: Survey, sizes: Sequence[Size], settings: Settings) -> Visits:
+        """Count the visits of the schedule of a job whose views have these sizes (height, width).
 
         With weighted statistics, every view has its own size, because it is cropped to its covered pixels.
         """
-        views = probe.survey.covered
-        visits = (steps_coarse + settings.steps_sos) * settings.views_per_step
-        sizes = len(views) if weighted else len({probe.sizes[index] for index in views})
-        return Visits(visits / len(views), visits // sizes)
+        weighted, _ = position_weights(survey, settings)
+        coarse, _ = steps_coarse(computed_scales(sizes, settings), settings)
+        views, visits = survey.covered, (coarse + settings.steps_sos) * settings.views_per_step
+        different = len(views) if weighted else len({sizes[index] for index in views})
+        return Visits(visits / len(views), visits // different)
+
+    def search(self, device: str) -> bool:
+        """Return whether cuDNN benchmarks its algorithms for the network on a device, "cpu" or "cuda"."""
+        return device == "cuda" and self.of_a_size >= LEAST_PASSES
 
 
 # --- network -------------------------------------------------------------------------------------------------------
@@ -349,7 +362,7 @@ def convolutions(probe: Probe, visits: Visits) -> tuple[bool, list[Decision]]:
     """Choose whether cuDNN benchmarks its algorithms on a GPU."""
     if probe.machine.device != "cuda":
         return False, []
-    search, item = visits.of_a_size >= LEAST_PASSES, "convolutions"
+    search, item = visits.search(probe.machine.device), "convolutions"
     reason = f"the network evaluates images of one size about {visits.of_a_size:,} times"
     if not search:
         return search, [Decision(item, "cuDNN does not benchmark its algorithms", reason)]

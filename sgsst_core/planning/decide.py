@@ -31,9 +31,8 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
     scan = choices.is_scan(survey, weighted=weighted)
     background = choices.training_background(settings, scan=scan)
     warm_start, start_lines = choices.warm_start(survey, settings, scan=scan)
-    scales = [len(tiling.scales(size)) for size in probe.sizes]
-    steps_coarse, coarse_lines = choices.steps_coarse(scales, settings)
-    visits = choices.Visits.of(probe, settings, steps_coarse, weighted=weighted)
+    steps_coarse, coarse_lines = choices.steps_coarse(choices.computed_scales(probe.sizes, settings), settings)
+    visits = choices.Visits.of(survey, probe.sizes, settings)
     cached_weights, weights_line = choices.blend_weights(probe, settings, visits)
     caches = cached_weights != "none"
     precision, precision_lines = choices.precision(probe, settings)

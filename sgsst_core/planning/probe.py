@@ -18,12 +18,12 @@ from torch import Tensor
 from sgsst_core.budget import memory_for
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork
 from sgsst_core.loss.difference import Difference
-from sgsst_core.loss.graphs import LossGraphs, has_graphs
+from sgsst_core.loss.graphs import LossGraphs, graphs_problem
 from sgsst_core.loss.nearest import nearest_layers, search
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.choices import rendered_gaussians
+from sgsst_core.planning.choices import Visits, rendered_gaussians
 from sgsst_core.planning.context import PlanningContext
 from sgsst_core.planning.facts import (
     LEAST_VISITS,
@@ -84,6 +84,9 @@ def measure(context: PlanningContext, survey: Survey, link: Link, maps: int = 0)
     """
     scene, device = context.scene, context.network.device
     views = [context.cameras[index] for index in survey.covered]
+    sizes = tuple((camera.height, camera.width) for camera in context.cameras)
+    # Measure with the algorithms of the job, and let cuDNN choose them once: it caches its choice for every shape.
+    context.network.search = Visits.of(survey, sizes, context.settings).search(context.machine.device)
     return Probe(
         SceneFacts(
             len(scene),
@@ -91,7 +94,7 @@ def measure(context: PlanningContext, survey: Survey, link: Link, maps: int = 0)
             used_degree=scene.used_degree(rendered_gaussians(survey, context.settings)),
             held_degree=0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree,
         ),
-        tuple((camera.height, camera.width) for camera in context.cameras),
+        sizes,
         survey,
         _network_facts(context, views[0], maps),
         context.rasterizer.name,
@@ -233,8 +236,9 @@ def _launch_cost(context: PlanningContext, views: Sequence[Camera]) -> LaunchCos
 
 def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
     """Time the loss of a synthetic view of size (height, width), with its gradient, with and without a graph."""
-    if not has_graphs(loss.network.device):
-        return LaunchCost(problem="only NVIDIA GPUs are known to replay them")
+    problem = graphs_problem(loss.network.device)
+    if problem is not None:
+        return LaunchCost(problem=problem)
     image = soft_image(max(size))[: size[0], : size[1]].contiguous().to(loss.network.device)
     style, view = loss.targets.of_style(Style.of(image.flip(0)), size), loss.targets.of_view(image)
     scales = loss.tiling.scales(size)

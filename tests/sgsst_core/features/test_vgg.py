@@ -40,11 +40,11 @@ class Watched(FeatureNetwork):
     """Network that records PyTorch's flags and the memory formats during its convolutions."""
 
     def note(self, *tensors: Tensor) -> None:
-        self.flags.add((CUDNN.conv.fp32_precision, CUDNN.benchmark))
+        self.flags.add((CUDNN.conv.fp32_precision, CUDNN.benchmark, CUDNN.deterministic))
         self.layouts += [tensor.is_contiguous(memory_format=torch.channels_last) for tensor in tensors]
 
     def __init__(self, *arguments: object, **options: object) -> None:
-        self.flags: set[tuple[str, bool]] = set()
+        self.flags: set[tuple[str, bool, bool]] = set()
         self.layouts: list[bool] = []
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
 
@@ -75,9 +75,9 @@ def test_every_convolution_has_channels_last(tiny_weights: BackboneWeights, dtyp
 @pytest.fixture(autouse=True)
 def _flags() -> Iterator[None]:
     cudnn, matmul = CUDNN, torch.backends.cuda.matmul
-    before = cudnn.benchmark, cudnn.allow_tf32, matmul.allow_tf32
+    before = cudnn.benchmark, cudnn.deterministic, cudnn.allow_tf32, matmul.allow_tf32
     yield
-    cudnn.benchmark, cudnn.allow_tf32, matmul.allow_tf32 = before
+    cudnn.benchmark, cudnn.deterministic, cudnn.allow_tf32, matmul.allow_tf32 = before
 
 
 def on_a_gpu(device: torch.device, **flags: bool) -> contextlib.AbstractContextManager[None]:
@@ -95,9 +95,10 @@ def test_flags_hold_in_the_network_alone(
     network.search = search
     monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
     pixel_gradient(network)
-    assert network.flags == {("tf32" if tf32 else "ieee", search)}
+    assert network.flags == {("tf32" if tf32 else "ieee", search, not search)}
     assert not CUDNN.allow_tf32
     assert not CUDNN.benchmark
+    assert not CUDNN.deterministic
     assert not torch.backends.cuda.matmul.allow_tf32
     assert network.precision == ("tf32" if tf32 else "float32")
 
