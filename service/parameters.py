@@ -16,6 +16,9 @@ from worker.styles import MOST_PICTURES
 
 #: Names without control characters: they are shown in terminals, and some databases cannot store zero bytes.
 _NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
+#: Maximum number of characters of a job's name.
+MAX_JOB_NAME = 200
+JobName = Annotated[str, Field(max_length=MAX_JOB_NAME, pattern=_NO_CONTROLS)]
 
 
 class JobParameters(StylizeOptions):
@@ -25,8 +28,8 @@ class JobParameters(StylizeOptions):
         json_schema_extra={"examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}]},
     )
 
-    name: Annotated[str, Option(default="none; sgsst submit uses the scene's file name")] = Field(
-        "", max_length=200, pattern=_NO_CONTROLS, description="Display name; need not be unique."
+    name: Annotated[JobName, Option(default="the names of scene and style")] = Field(
+        "", description="Display name; need not be unique."
     )
     style_weights: Annotated[
         list[Annotated[float, Field(gt=0, allow_inf_nan=False)]] | None, Option(instead="--style FILE:WEIGHT")

@@ -111,7 +111,7 @@ def submit(
     pictures = [file.path for file in (*styles, *theirs)]
     if regions:
         told["regions"] = _regions_to_send(regions, different_names(pictures)[len(styles) :])
-    chosen = {"name": scene.stem, **told, **_parse_parameters(parameters)}
+    chosen = told | _parse_parameters(parameters)
     with _client(url, key) as client:
         if dry_run:
             with _sending_and_planning() as (progress, planning):

@@ -188,6 +188,10 @@ class AsyncClient:
         await self._transport.fetch(Download(f"/v1/jobs/{job_id}/artifacts/{name}{query}", target, progress))
         return target
 
+    async def rename(self, job_id: str, name: str) -> Job:
+        """Change the display name of a job; an empty name restores the names of scene and style."""
+        return Job.of((await self._transport.call("PATCH", f"/v1/jobs/{job_id}", json={"name": name})).json())
+
     async def cancel(self, job_id: str) -> Job:
         """Cancel a job."""
         return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/cancel")).json())

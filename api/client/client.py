@@ -107,6 +107,7 @@ class Client:
     wait = _blocking(AsyncClient.wait)
     artifacts = _blocking(AsyncClient.artifacts)
     download = _blocking(AsyncClient.download)
+    rename = _blocking(AsyncClient.rename)
     cancel = _blocking(AsyncClient.cancel)
     retry = _blocking(AsyncClient.retry)
     delete = _blocking(AsyncClient.delete)

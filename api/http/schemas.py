@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.files.artifacts import media_type
-from service.parameters import JobParameters
+from service.parameters import JobName, JobParameters
 from service.store.history import Point
 from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
@@ -353,6 +353,14 @@ class SignIn(BaseModel):
     key: str = Field(min_length=1, max_length=200, description="`sgsst keys create NAME` on the service's machine.")
 
 
+class JobChange(BaseModel):
+    """Changes to a job."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"name": "plush, at night"}]})
+
+    name: JobName = Field(description="New display name; an empty one restores the names of scene and style.")
+
+
 class SessionView(BaseModel):
     """Session state for the browser."""
 
@@ -375,7 +383,16 @@ class Health(BaseModel):
     checks: dict[str, str]
 
 
-ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, UploadView, PlanView, Health, SignIn)
+ANSWERS: tuple[type[BaseModel], ...] = (
+    JobPage,
+    JobDetail,
+    ArtifactList,
+    UploadView,
+    PlanView,
+    Health,
+    SignIn,
+    JobChange,
+)
 
 
 def utc(seconds: float) -> datetime:

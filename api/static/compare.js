@@ -2,6 +2,7 @@
 /** View that compares two runs of one scene, on both sides of the wipe. */
 import { get } from "./api.js";
 import { h, put } from "./dom.js";
+import { labels } from "./names.js";
 import { ResultStage } from "./result_stage.js";
 import { words } from "./words.js";
 
@@ -20,7 +21,7 @@ export class CompareView {
       const jobs = await Promise.all(ids.map((id) => get(`/v1/jobs/${id}`, this.leaving.signal)));
       if (jobs.some((job) => job.status !== "succeeded")) throw new Error(words.compare.notThere);
       this.stage = new ResultStage(jobs, { signal: this.leaving.signal });
-      const names = jobs.map((job) => job.name || words.job.unnamed);
+      const names = labels(jobs);
       put(this.element, h("header.head", h("h1", words.compare.heading(names[0], names[1])), h("div.row", jobs.map((job, i) => h("a.button.quiet", { href: `#/jobs/${job.id}` }, names[i])))), this.stage.element);
     } catch (error) {
       if (this.leaving.signal.aborted) return;

@@ -3,6 +3,7 @@
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { LossChart } from "./chart.js";
 import { announce, h, icon, put } from "./dom.js";
+import { labels, nameOf, stylesOf } from "./names.js";
 import { decisions } from "./plan.js";
 import { ResultStage } from "./result_stage.js";
 import { actionsOf, titles, UNFINISHED } from "./statuses.js";
@@ -26,6 +27,7 @@ export class JobView {
     this.chart = new LossChart();
     this.lastEvent = "";
     this.heading = h("h1.name", say.unnamed);
+    this.renaming = h("span.renaming");
     this.badge = h("span");
     this.meta = h("p.meta");
     this.actions = h("div.row.actions-inline");
@@ -41,7 +43,7 @@ export class JobView {
     this.files = h("section.card");
     this.facts = h("section.card");
     this.curve = h("section.card", h("h2", say.loss), this.chart.element);
-    this.body = h("div.job", h("header.head", h("div", h("div.row", this.heading, this.badge), this.meta), this.actions),
+    this.body = h("div.job", h("header.head", h("div", h("div.row", this.heading, this.renaming, this.badge), this.meta), this.actions),
       this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.curve, this.plan, this.files, this.facts)));
     this.element = h("div", h("p.quiet.pending", words.page.loading));
     this.begin();
@@ -140,7 +142,7 @@ export class JobView {
 
   update() {
     const { job } = this;
-    this.title = job.name || say.unnamed;
+    this.title = nameOf(job);
     document.title = words.page.title(this.title);
     this.heading.textContent = this.title;
     put(this.badge, badge(job.status));
@@ -151,6 +153,36 @@ export class JobView {
     this.showActions();
     this.updateState();
     this.showFacts();
+    if (!this.renaming.firstChild) this.offerRename();
+  }
+
+  offerRename() {
+    this.heading.hidden = false;
+    put(this.renaming, h("button.tool", { type: "button", title: say.rename, "aria-label": say.rename, onclick: () => this.rename() }, icon("pen")));
+  }
+
+  /** Replace the heading by an input. Enter saves the name, Escape discards it. */
+  rename() {
+    const input = h("input", { type: "text", value: this.job.name, maxLength: 200, "aria-label": say.newName, autocomplete: "off" });
+    const close = () => {
+      this.offerRename();
+      this.renaming.firstChild.focus();
+    };
+    input.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && close());
+    const save = async (/** @type {Event} */ event) => {
+      event.preventDefault();
+      try {
+        this.job = await (await ask("PATCH", `/v1/jobs/${this.id}`, { json: { name: input.value.trim() } })).json();
+        close();
+        this.update();
+      } catch (error) {
+        this.tellError(error);
+      }
+    };
+    this.heading.hidden = true;
+    put(this.renaming, h("form", { onsubmit: save }, input, h("button.primary.small", { type: "submit" }, say.save), h("button.quiet.small", { type: "button", onclick: close }, say.keep)));
+    input.focus();
+    input.select();
   }
 
   updateState() {
@@ -276,7 +308,8 @@ export class JobView {
     get("/v1/jobs?status=succeeded&limit=100", this.leaving.signal).then(({ jobs }) => {
       const others = jobs.filter((/** @type {any} */ job) => job.id !== this.id && job.inputs.some((/** @type {any} */ input) => input.role === "scene" && input.sha256 === scene));
       chooser.hidden = !others.length;
-      put(chooser, h("option", { value: "" }, `${say.compare}…`), others.map((/** @type {any} */ job) => h("option", { value: job.id }, `${job.name || say.unnamed}, ${time(job.created_at)}`)));
+      const names = labels(others);
+      put(chooser, h("option", { value: "" }, `${say.compare}…`), others.map((/** @type {any} */ job, /** @type {number} */ i) => h("option", { value: job.id }, names[i])));
     }).catch(() => {});
     return chooser;
   }

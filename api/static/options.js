@@ -4,7 +4,7 @@ import { h, newId } from "./dom.js";
 import { words } from "./words.js";
 
 /**
- * @typedef {{name: string, title: string, help: string, element: HTMLElement, value: () => any, set: (value: any) => void, wrong: (text: string) => void}} Control
+ * @typedef {{name: string, title: string, help: string, element: HTMLElement, value: () => any, set: (value: any) => void, suggest: (text: string) => void, wrong: (text: string) => void}} Control
  *   `value` is undefined if the preset decides
  */
 
@@ -37,7 +37,7 @@ export function optionControl(name, schema, { title = titleOf(name), hint = true
   const element = h("div.option", { "data-name": name }, h("label", { htmlFor: id }, title), h("div.value", input, unit), help, error);
   const wrong = (/** @type {string} */ text) => showWrong(input, error, text);
   input.addEventListener("input", () => wrong(""));
-  return { name, title, help: schema.description ?? "", element, value: () => read(input.value), set: (value) => void (input.value = value === undefined || value === null ? "" : String(value)), wrong };
+  return { name, title, help: schema.description ?? "", element, value: () => read(input.value), set: (value) => void (input.value = value === undefined || value === null ? "" : String(value)), suggest: (text) => (input.placeholder = text), wrong };
 }
 
 /**

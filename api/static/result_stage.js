@@ -3,6 +3,7 @@
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { h, put } from "./dom.js";
+import { labels } from "./names.js";
 import { Stage } from "./stage.js";
 import { words } from "./words.js";
 
@@ -33,7 +34,7 @@ export class ResultStage {
 
   /** @param {string} name */
   chooser(name) {
-    const select = h("select", { "aria-label": name, onchange: () => this.showSides() });
+    const select = h("select", { "aria-label": name, onchange: () => this.showSides(name) });
     return { select, element: h("label.option.inline", h("span", name), select) };
   }
 
@@ -90,7 +91,7 @@ export class ResultStage {
 
   /** @param {any} job */
   async openRun(job) {
-    const { viewer } = this.stage, name = this.jobs.length > 1 ? job.name || job.id.slice(-6) : say.stylized;
+    const { viewer } = this.stage, name = this.jobs.length > 1 ? labels(this.jobs)[this.jobs.indexOf(job)] : say.stylized;
     if (!viewer || this.signal.aborted) return;
     const fade = job.parameters.sh_attenuation ?? 0;
     if (this.original && sceneOf(job) === sceneOf(this.jobs[0])) {
@@ -120,7 +121,11 @@ export class ResultStage {
     this.showSides();
   }
 
-  showSides() {
+  /** @param {string} [changed] name of the side whose choice has changed; the other side gives up an equal choice */
+  showSides(changed) {
+    const [other, same] = changed === say.right ? [this.left.select, this.right.select] : [this.right.select, this.left.select];
+    if (other.value === same.value && this.shown) other.value = this.shown.find((/** @type {string} */ key) => key !== same.value) ?? other.value;
+    this.shown = [this.left.select.value, this.right.select.value];
     const left = this.choices.get(this.left.select.value), right = this.choices.get(this.right.select.value);
     if (!left || !right) return;
     if (left === right) this.stage.show(left.side);

@@ -3,10 +3,11 @@
 import { ask, eventsOf, get, Problem, randomKey } from "./api.js";
 import { readCameras, ringCameras } from "./cameras.js";
 import { announce, h, icon, newId, put } from "./dom.js";
+import { defaultName } from "./names.js";
 import { optionControl } from "./options.js";
 import { costCard } from "./plan.js";
 import { RegionList } from "./regions.js";
-import { accepted, sceneSuffix } from "./scene_formats.js";
+import { accepted } from "./scene_formats.js";
 import { droppedFiles, Slot, sorted } from "./slots.js";
 import { Stage } from "./stage.js";
 import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
@@ -16,7 +17,7 @@ import { percent, words } from "./words.js";
 
 const say = words.submit;
 /** Options that are always visible, and those with an input elsewhere on the page. */
-const MAIN = ["resolution", "views", "content_weight", "max_seconds"], PLACED = new Set(["preset", "orbit", "up", "elevation", "radius", "style_weights", "regions", ...MAIN]);
+const MAIN = ["resolution", "views", "content_weight", "max_seconds"], PLACED = new Set(["name", "preset", "orbit", "up", "elevation", "radius", "style_weights", "regions", ...MAIN]);
 const DRAFT = "sgsst.draft";
 const UPS = /** @type {Record<string, number[]>} */ ({ x: [1, 0, 0], "-x": [-1, 0, 0], y: [0, 1, 0], "-y": [0, -1, 0], z: [0, 0, 1], "-z": [0, 0, -1] });
 
@@ -32,8 +33,9 @@ export class SubmitView {
       photos: new Slot(say.photos, say.photosHint, { accept: "image/*", multiple: true, ...changed(() => this.refresh()) }),
     };
     this.stage = new Stage();
+    this.name = optionControl("name", { type: "string" }, { title: say.name, hint: false });
     /** @type {Map<string, Control>} */
-    this.controls = new Map();
+    this.controls = new Map([["name", this.name]]);
     this.leaving = new AbortController();
     /** @type {Map<File, Upload>} */
     this.uploads = new Map();
@@ -68,7 +70,7 @@ export class SubmitView {
     this.result = h("div.result", { "aria-live": "polite" });
     this.notice = h("div.notice", { hidden: true });
     this.form = h("form.panel", { noValidate: true, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.act(false)) },
-      h("header", h("h1", say.heading), h("p.lead", say.lead)), this.notice,
+      h("header", h("h1", say.heading), h("p.lead", say.lead)), this.notice, this.name.element,
       h("section", h("h2", say.files), this.slots.scene.element, this.slots.style.element, this.shares),
       h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.viewsBody, this.found),
       h("section", h("h2", say.look), this.presets, this.main, this.regionFold, this.more),
@@ -115,7 +117,7 @@ export class SubmitView {
       return;
     }
     for (const [name, each] of Object.entries(schema)) {
-      if (["style_weights", "regions", "preset"].includes(name)) continue;
+      if (["name", "style_weights", "regions", "preset"].includes(name)) continue;
       this.controls.set(name, optionControl(name, each, name === "orbit" ? { title: say.howMany } : {}));
     }
     this.makePresets(schema.preset);
@@ -278,6 +280,7 @@ export class SubmitView {
   /** Discard the displayed plan, which was made for other files or parameters. */
   refresh() {
     if (this.result && !this.busy) put(this.result);
+    this.name.suggest(defaultName(this.slots.scene.files[0]?.name, this.slots.style.files.map(({ name }) => name)));
     this.clearWrong();
   }
 
@@ -297,8 +300,6 @@ export class SubmitView {
     }
     if (this.orbiting) values.orbit ??= "auto";
     if (this.preset) values.preset = this.preset;
-    const scene = this.slots.scene.files[0]?.name;
-    values.name ??= scene?.slice(0, scene.length - sceneSuffix(scene).length).replace(/[\u0000-\u001f\u007f-\u009f]/g, "").slice(0, 200);
     const regions = this.regions.value(), taken = new Set(regions.flatMap((region) => region.style ?? []));
     if (regions.length) values.regions = regions;
     const own = this.weights.filter((_, i) => !taken.has(this.slots.style.files[i]?.name)).map((input) => Number(input.value));

@@ -84,7 +84,7 @@ export const words = {
   },
   submit: {
     title: "New job", heading: "Paint a scene", lead: "Repaint a 3D Gaussian scene in the style of a painting. Nothing is uploaded until you press a button below.",
-    scene: "Scene", sceneHint: titles, style: "Style", styleHint: "One painting, or several to blend",
+    name: "Name", scene: "Scene", sceneHint: titles, style: "Style", styleHint: "One painting, or several to blend",
     cameras: "Cameras", camerasHint: "cameras.json, transforms.json, or the files of a COLMAP model", photos: "Photos", photosHint: "Optional: the original photos",
     choose: "Choose", change: "Change", remove: (/** @type {string} */ name) => `Remove ${name}`, drop: "Drop your scene here", dropMore: "you can add cameras and a painting too", dropNow: "Drop to add files",
     files: "Files", views: "Views", fromFiles: "Use my cameras", around: "Orbit the object", howMany: "Number of views", look: "Look", weights: "Blend",
@@ -110,7 +110,7 @@ export const words = {
     stages: /** @type {Record<string, string>} */ ({
       reading: "Reading the files", planning: "Analyzing views", starting: "Starting workers", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality",
     }),
-    unnamed: "Unnamed job", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`,
+    unnamed: "Unnamed job", rename: "Rename", newName: "New name", save: "Save", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`,
     left: (/** @type {number} */ s) => (s < 1 ? "almost done" : `about ${seconds(s)} left`), progress: "Progress", remove: "Delete", removeSure: "Delete this job and its results?", keep: "Cancel",
     lost: "Connection lost. Reconnecting…", back: "Reconnected.", loss: "Loss", noLoss: "The chart appears once painting starts.", preview: "Latest preview", noPreview: "The first preview will appear shortly.",
     made: (/** @type {string} */ at) => `Created ${at}`, took: (/** @type {number} */ s) => `took ${seconds(s)}`, attempt: (/** @type {number} */ n) => `attempt ${n}`, expires: (/** @type {string} */ at) => `kept until ${at}`,

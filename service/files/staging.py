@@ -9,7 +9,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from service.errors import RefusedInputError
+from service.parameters import MAX_JOB_NAME
 from sgsst_core.files.camera_advice import advice_for_name
+from sgsst_core.files.formats import format_of_name
 from worker.region_requests import MOST_REGIONS, RegionRequest
 from worker.styles import MOST_PICTURES
 
@@ -64,6 +66,15 @@ def clean_name(role: str, name: str, number: int) -> str:
 
 def _last_bytes(part: str) -> str:
     return part.encode()[-_MAX_NAME:].decode(errors="ignore")
+
+
+def default_job_name(inputs: Sequence[Mapping[str, Any]]) -> str:
+    """Return the name of a job whose request has none: "scene · painting", from the names of its files."""
+    scene = next(entry["name"] for entry in inputs if entry["role"] == "scene")
+    styles = [PurePosixPath(entry["name"]).stem for entry in inputs if entry["role"] == "style"]
+    format = format_of_name(scene)
+    plain = scene[: -len(format.suffix)] if format else PurePosixPath(scene).stem
+    return f"{plain} · {' + '.join(styles)}"[:MAX_JOB_NAME]
 
 
 def region_styles(regions: Sequence[RegionRequest]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Operations of users on their jobs: create, list, cancel, retry and delete them, and read their files and events."""
+"""Operations of users on their jobs and the files and events of those: create, list, rename, cancel, retry, delete."""
 
 from __future__ import annotations
 
@@ -232,6 +232,15 @@ class Jobs:
             job.finished_at = job.expires_at = job.error = job.progress = None
             move(session, job, Transition.RETRY, now)
         return job
+
+    def rename(self, job_id: str, owner: str | None, name: str) -> None:
+        """Change the display name of a job.
+
+        Raises:
+            NotFoundError: If there is no such job or it belongs to another owner.
+        """
+        with self._database.writing() as session:
+            _job_of_owner(session, job_id, owner, lock=True).name = name
 
     def delete(self, job_id: str, owner: str | None) -> list[str]:
         """Delete an ended job and release its inputs; the caller removes its results afterwards.

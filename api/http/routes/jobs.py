@@ -1,4 +1,4 @@
-"""`/v1/jobs`: create, list, show, cancel, retry and delete jobs."""
+"""`/v1/jobs`: create, list, show, rename, cancel, retry and delete jobs."""
 
 from __future__ import annotations
 
@@ -14,13 +14,23 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
-from api.http.multipart import Received, check_file, parse_json, read_json, receive
+from api.http.multipart import (
+    BadRequestError,
+    MediaTypeError,
+    Received,
+    TooSlowError,
+    check_file,
+    parse_json,
+    read_json,
+    receive,
+)
 from api.http.numbers import Digits
 from api.http.planning import DRY_RUN, answer_plan
 from api.http.receipts import Receipt
 from api.http.schemas import (
     JOB_ID,
     MOST_POINTS,
+    JobChange,
     JobDetail,
     JobPage,
     JobView,
@@ -40,8 +50,9 @@ from service.errors import (
     QueueFullError,
     QuotaError,
     RefusedInputError,
+    TooLargeError,
 )
-from service.files.staging import check_roles, clean_name, region_styles
+from service.files.staging import check_roles, clean_name, default_job_name, region_styles
 from service.inspection.inspector import Show
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
@@ -52,6 +63,8 @@ from service.weights import check_weights
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 #: Maximum bytes of a JSON body. Such a body contains no files, only the ids of uploads.
 _MAX_JSON = 1 << 20
+#: Maximum bytes of the JSON body that changes a job.
+_MAX_CHANGE = 4096
 
 IdempotencyHeader = Annotated[
     str | None,
@@ -72,6 +85,7 @@ _NOT_THERE = NotFoundError(f"There is no job {JOB_ID}.")
 #: Operations that a client may call next on a job.
 _FOLLOWING_OPERATIONS = (
     "get_job",
+    "change_job",
     "cancel_job",
     "retry_job",
     "delete_job",
@@ -171,7 +185,8 @@ def _queue_job(
     parameters, webhook = wanted.parameters, wanted.webhook
     idempotency = _idempotency(idempotency_key, wanted.inputs, parameters, webhook)
     values = parameters.model_dump(mode="json", exclude_unset=True)
-    new = NewJob(caller.owner, parameters.name, caller.priority, values, wanted.inputs, webhook or None)
+    name = parameters.name or default_job_name(wanted.inputs)
+    new = NewJob(caller.owner, name, caller.priority, values, wanted.inputs, webhook or None)
     jobs = context.store.jobs
     job, created = jobs.create(
         new,
@@ -314,6 +329,44 @@ def get_job(
     """Get a job. `Retry-After` says when to poll again; `If-None-Match` avoids sending an unchanged body."""
     check_id(job_id)
     return _job_response(context, caller, job_id, if_none_match)
+
+
+@router.patch(
+    "/{job_id}",
+    response_model=JobDetail,
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/JobChange"}}},
+        }
+    },
+    responses={
+        200: {"headers": _SHOWN, "links": links(*_FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
+        **problems(
+            _NOT_THERE,
+            invalid("name", "String should have at most 200 characters"),
+            MediaTypeError("The body must be application/json."),
+            TooLargeError(
+                "The request has more than 4,096 bytes. JSON only names uploads, or a key.", limit=_MAX_CHANGE
+            ),
+            BadRequestError("The body is not UTF-8."),
+            TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
+        ),
+    },
+    operation_id="change_job",
+)
+async def change_job(request: Request, job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+    """Rename a job, whatever its status."""
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+        raise MediaTypeError("The body must be application/json.")
+    change = JobChange.model_validate(await read_json(request, context.settings, _MAX_CHANGE))
+    return await asyncio.to_thread(_rename, context, caller, job_id, change.name)
+
+
+def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Response:
+    job = find(context, caller, job_id)
+    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs))
+    return _job_response(context, caller, job_id)
 
 
 @router.get(

@@ -624,6 +624,22 @@ def _answers(url: str) -> bool:
         return False
 
 
+def test_job_is_named_by_its_files_and_renamed(client: httpx.Client, files: dict[str, bytes]) -> None:
+    named = form(files, scene=("plush.compressed.ply", files["scene"]), style=("starry_night.jpg", files["style"]))
+    job = client.post("/v1/jobs", files=named).json()
+    here = f"/v1/jobs/{job['id']}"
+    assert job["name"] == "plush · starry_night"
+    renamed = client.patch(here, json={"name": "at night"})
+    assert renamed.status_code == 200
+    assert renamed.json()["name"] == client.get(here).json()["name"] == "at night"
+    assert client.patch(here, json={"name": ""}).json()["name"] == "plush · starry_night"
+    refused(client.patch(here, json={"name": "a" * 201}), 422, "invalid-request")
+    refused(client.patch(here, json={"name": "a\tb"}), 422, "invalid-request")
+    refused(client.patch(here, json={"status": "queued"}), 422, "invalid-request")
+    refused(client.patch(here, content=b"name"), 415, "unsupported-media-type")
+    refused(client.patch("/v1/jobs/job_1", json={"name": "a"}), 404, "not-found")
+
+
 def test_a_stream_with_nothing_left_to_tell(client: httpx.Client, files: dict[str, bytes]) -> None:
     """A stream would never end after the last event of an ended job, or after an event that does not exist."""
     job_id = client.post("/v1/jobs", files=form(files)).json()["id"]

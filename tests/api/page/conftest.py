@@ -10,6 +10,7 @@ import pytest
 
 from tests.api.page.browser import Watched, missing, open_browser
 from tests.api.service import Service
+from tests.small_scenes import cameras, wall, write_files
 
 
 @pytest.fixture(scope="module")
@@ -42,3 +43,9 @@ def visit(browser: Any, service: Service) -> Iterator[Callable[..., Watched]]:
     yield visit
     for watched in opened:
         watched.context.close()
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    ply, file, style = write_files(tmp_path, wall(sh_degree=1), cameras(3, 96, 72))
+    return {"scene": ply, "cameras": file, "style": style}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,79 +18,12 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.camera import resized
+from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, drop, set_options, submit
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
-from tests.small_scenes import ball, cameras, wall, write_files
+from tests.small_scenes import ball, wall, write_files
 
 pytestmark = pytest.mark.slow
-
-Visit = Callable[..., Watched]
-STEPS: dict[str, Any] = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
-#: More steps than any test waits for.
-LONG = STEPS | {"steps_sos": 1_000_000}
-REFUSED = "the server responded with a status of 422"
-
-
-@pytest.fixture
-def files(tmp_path: Path) -> dict[str, Path]:
-    ply, file, style = write_files(tmp_path, wall(sh_degree=1), cameras(3, 96, 72))
-    return {"scene": ply, "cameras": file, "style": style}
-
-
-def submit(service: Service, files: dict[str, Path], key: str | None = None, **parameters: Any) -> str:
-    """Submit a job through the API instead of the page, and return its id."""
-    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-    with service.client(key) as client:
-        answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(STEPS | parameters)})
-    assert answer.status_code == 202, answer.text
-    return str(answer.json()["id"])
-
-
-def done(service: Service, job_id: str) -> str:
-    """Wait until a job has succeeded, and return its id."""
-
-    def succeeded() -> bool:
-        status = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["status"]
-        assert status not in ("failed", "canceled"), service.said()
-        return bool(status == "succeeded")
-
-    wait_for(succeeded, f"{job_id} to succeed", service.said)
-    return job_id
-
-
-def choose(watched: Watched, files: dict[str, Path]) -> None:
-    for role, path in files.items():
-        watched.page.get_by_label(role.capitalize(), exact=True).set_input_files(path)
-
-
-def set_options(watched: Watched, **values: Any) -> None:
-    """Expand the section of options, and fill in the given ones."""
-    page = watched.page
-    page.locator(".presets input").first.wait_for()
-    page.locator("details.fold", has_text="All options").evaluate("(fold) => { fold.open = true; }")
-    for name, value in values.items():
-        control = page.locator(f"[data-name={name}]").locator("input, select").first
-        if control.evaluate("(element) => element.tagName") == "SELECT":
-            control.select_option(str(value).lower())
-        else:
-            control.fill(str(value))
-
-
-_DROP = """(files) => {
-  const carried = new DataTransfer();
-  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-  for (const [name, text] of files) carried.items.add(new File([bytes(text)], name));
-  for (const kind of ["dragenter", "dragover", "drop"]) {
-    const event = new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer: carried });
-    document.querySelector(".frame").dispatchEvent(event);
-  }
-}"""
-
-
-def drop(watched: Watched, files: dict[str, Path]) -> None:
-    """Drop all files at once on the page."""
-    carried = [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in files.values()]
-    watched.page.evaluate(_DROP, carried)
 
 
 def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:

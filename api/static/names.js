@@ -1,0 +1,55 @@
+// @ts-check
+/** Names of jobs, and labels that tell jobs apart. */
+import { sceneSuffix } from "./scene_formats.js";
+import { time, words } from "./words.js";
+
+/** @param {string} name @returns {string} name of an image without its suffix */
+const stem = (name) => name.replace(/\.[^.]*$/, "");
+
+/**
+ * Return the name that the service gives to a job without one.
+ *
+ * @param {string | undefined} scene name of the scene's file
+ * @param {string[]} styles names of the style images
+ */
+export function defaultName(scene, styles) {
+  if (!scene || !styles.length) return "";
+  const suffix = sceneSuffix(scene);
+  return `${suffix ? scene.slice(0, -suffix.length) : stem(scene)} · ${styles.map(stem).join(" + ")}`;
+}
+
+/** @param {any} job @returns {string} names of the job's style images */
+export const stylesOf = (job) => job.inputs.filter((/** @type {any} */ input) => input.role === "style").map((/** @type {any} */ input) => stem(input.name)).join(" + ");
+
+/** @param {any} job @returns {string} */
+export const nameOf = (job) => job.name || words.job.unnamed;
+
+/**
+ * Return a label for each job, by its styles. Jobs with the same styles also get their names, then their times of
+ * creation, then numbers, so that no two labels are equal.
+ *
+ * @param {any[]} jobs
+ * @returns {string[]}
+ */
+export function labels(jobs) {
+  const ways = [stylesOf, (/** @type {any} */ job) => nameOf(job), (/** @type {any} */ job) => time(job.created_at)];
+  const found = jobs.map(() => /** @type {string[]} */ ([]));
+  const joined = () => found.map((parts) => parts.join(", "));
+  for (const way of ways) {
+    const before = joined();
+    const texts = jobs.map(way);
+    jobs.forEach((_, i) => {
+      const alike = jobs.filter((_, k) => before[k] === before[i]).length;
+      const differs = jobs.some((_, k) => before[k] === before[i] && texts[k] !== texts[i]);
+      if (way === stylesOf || (alike > 1 && differs)) found[i].push(texts[i]);
+    });
+  }
+  const texts = joined();
+  return texts.map((text, i) => {
+    const number = texts.slice(0, i).filter((each) => each === text).length + 1;
+    return texts.filter((each) => each === text).length > 1 ? `${text} (${number})` : text;
+  });
+}
+
+/** Return a text as part of a file name. @param {string} text */
+export const fileName = (text) => text.replace(/[^\p{L}\p{N}._-]+/gu, "_").replace(/^[._]+|[._]+$/g, "").slice(0, 80);

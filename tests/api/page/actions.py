@@ -1,0 +1,76 @@
+"""Actions of users of the page, and of clients beside it, for the page's tests."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from tests.api.page.browser import Watched
+from tests.api.service import Service, wait_for
+
+Visit = Callable[..., Watched]
+STEPS: dict[str, Any] = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
+#: More steps than any test waits for.
+LONG = STEPS | {"steps_sos": 1_000_000}
+REFUSED = "the server responded with a status of 422"
+
+
+def submit(service: Service, files: dict[str, Path], key: str | None = None, **parameters: Any) -> str:
+    """Submit a job through the API instead of the page, and return its id."""
+    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+    with service.client(key) as client:
+        answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(STEPS | parameters)})
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["id"])
+
+
+def done(service: Service, job_id: str) -> str:
+    """Wait until a job has succeeded, and return its id."""
+
+    def succeeded() -> bool:
+        status = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["status"]
+        assert status not in ("failed", "canceled"), service.said()
+        return bool(status == "succeeded")
+
+    wait_for(succeeded, f"{job_id} to succeed", service.said)
+    return job_id
+
+
+def choose(watched: Watched, files: dict[str, Path]) -> None:
+    for role, path in files.items():
+        watched.page.get_by_label(role.capitalize(), exact=True).set_input_files(path)
+
+
+def set_options(watched: Watched, **values: Any) -> None:
+    """Expand the section of options, and fill in the given ones."""
+    page = watched.page
+    page.locator(".presets input").first.wait_for()
+    page.locator("details.fold", has_text="All options").evaluate("(fold) => { fold.open = true; }")
+    for name, value in values.items():
+        control = page.locator(f"[data-name={name}]").locator("input, select").first
+        if control.evaluate("(element) => element.tagName") == "SELECT":
+            control.select_option(str(value).lower())
+        else:
+            control.fill(str(value))
+
+
+_DROP = """(files) => {
+  const carried = new DataTransfer();
+  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  for (const [name, text] of files) carried.items.add(new File([bytes(text)], name));
+  for (const kind of ["dragenter", "dragover", "drop"]) {
+    const event = new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer: carried });
+    document.querySelector(".frame").dispatchEvent(event);
+  }
+}"""
+
+
+def drop(watched: Watched, files: dict[str, Path]) -> None:
+    """Drop all files at once on the page."""
+    carried = [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in files.values()]
+    watched.page.evaluate(_DROP, carried)

@@ -1,0 +1,74 @@
+"""Tests of the names of jobs on the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import httpx
+import pytest
+from PIL import Image
+
+from tests.api.page.actions import LONG, STEPS, Visit, choose, done, set_options, submit
+from tests.api.service import Service
+
+pytestmark = pytest.mark.slow
+
+
+def test_default_name_is_scene_and_painting(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    watched = visit()
+    page = watched.page
+    fields = page.locator("form.panel input:not([type=radio])")
+    assert fields.first.get_attribute("id") == page.get_by_label("Name", exact=True).first.get_attribute("id")
+    choose(watched, files)
+    assert page.get_by_label("Name", exact=True).first.get_attribute("placeholder") == "scene · style"
+    set_options(watched, **LONG)
+    page.get_by_role("button", name="Start").click()
+    page.get_by_role("heading", name="scene · style").wait_for()
+    job = httpx.get(f"{service.url}/v1/jobs/{page.url.rsplit('/', 1)[1]}").json()
+    assert job["name"] == "scene · style"
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".badge", has_text="Canceled").wait_for()
+    watched.check()
+
+
+def test_job_is_renamed(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = done(service, submit(service, files, name="first"))
+    watched = visit(f"/#/jobs/{job_id}")
+    page = watched.page
+    page.get_by_role("button", name="Rename").click()
+    page.get_by_label("New name").fill("second <b>name</b>")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="second <b>name</b>").wait_for()
+    assert httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["name"] == "second <b>name</b>"
+    page.get_by_role("button", name="Rename").click()
+    page.get_by_label("New name").fill("third")
+    page.keyboard.press("Escape")
+    page.get_by_role("heading", name="second").wait_for()
+    page.get_by_role("button", name="Rename").click()
+    page.get_by_label("New name").fill("")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="scene · style").wait_for()
+    watched.check()
+
+
+def test_compared_jobs_have_different_labels(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """Labels are the names of the styles; equal ones are told apart, and both sides never show the same job."""
+    night = files["style"].with_name("night.png")
+    Image.new("RGB", (64, 64), (20, 30, 90)).save(night)
+    quick = STEPS | {"steps_coarse": 1, "steps_sos": 1, "name": "same"}
+    ids = [done(service, submit(service, files | {"style": style}, **quick)) for style in (files["style"], night)]
+    watched = visit(f"/#/compare/{ids[0]}/{ids[1]}")
+    page = watched.page
+    page.get_by_role("heading", name="style and night").wait_for()
+    page.locator(".side.left", has_text="style").wait_for()
+    page.locator(".side.right", has_text="night").wait_for()
+    page.get_by_label("Left").select_option(ids[1])
+    page.locator(".side.left", has_text="night").wait_for()
+    assert page.get_by_label("Right").input_value() != ids[1]
+    assert page.locator(".side.right").inner_text() != page.locator(".side.left").inner_text()
+
+    twin = done(service, submit(service, files, **quick, seed=1))
+    page.goto(f"{service.url}/#/compare/{ids[0]}/{twin}")
+    page.locator(".side.right", has_text="style").wait_for()
+    assert page.locator(".side.right").inner_text() != page.locator(".side.left").inner_text()
+    watched.check()
