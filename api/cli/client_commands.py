@@ -12,25 +12,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as Bar
+from rich.progress import BarColumn, TextColumn
 from rich.table import Table
 
-from api.cli.options import with_options
-from api.cli.progress_bars import clock
-from api.cli.region_options import RegionKeepOption, RegionOption, RegionStyleOption, RegionWeightOption
+from api.cli.arguments import JobInputs, JsonOption
+from api.cli.console import FAILURE, error_console, out_console
+from api.cli.options import with_arguments, with_options
+from api.cli.progress_bars import clock, live_bar, transfer_bar
 from api.client.inputs import different_names
 from service.parameters import JobParameters
 from sgsst_core.files.formats import (
     EXTRA_FORMATS,
     RESULT_SUFFIXES,
-    SUFFIXES,
     ExtraName,
     by_name,
     format_of_name,
     result_name,
 )
-from worker.region_requests import RegionOptions, region_options, region_requests
+from worker.region_requests import RegionOptions, region_requests
 from worker.styles import parse_styles
 
 if TYPE_CHECKING:
@@ -39,53 +38,17 @@ if TYPE_CHECKING:
     from api.client import Client
     from api.client.answers import Job
 
-out_console = Console(highlight=False, markup=False, soft_wrap=True)
-error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
-
-#: Exit code of a command whose job has failed or was canceled.
-_JOB_FAILED = 1
-
 UrlOption = Annotated[
     str | None, typer.Option("--url", help="URL of the service. [default: SGSST_URL, else http://127.0.0.1:8000]")
 ]
 KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [default: SGSST_KEY]")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="ID of a job.", show_default=False)]
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add all commands of this module to the app."""
-    for command in (submit, status, watch, download, cancel, retry, delete, jobs):
-        app.command()(command)
-
-
 @with_options(JobParameters)
+@with_arguments(JobInputs)
 def submit(
-    scene: Annotated[
-        Path,
-        typer.Argument(metavar="SCENE", help=f"3DGS scene: {SUFFIXES}.", show_default=False),
-    ],
-    style: Annotated[
-        list[str],
-        typer.Option(
-            metavar="FILE[:WEIGHT]",
-            help="Style image; may be repeated. Several are mixed in proportion to their weights.",
-            show_default=False,
-        ),
-    ],
-    cameras: Annotated[
-        Path | None,
-        typer.Option(
-            help="cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender)."
-        ),
-    ] = None,
-    images: Annotated[
-        Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
-    ] = None,
-    region: RegionOption = None,
-    region_style: RegionStyleOption = None,
-    region_weight: RegionWeightOption = None,
-    region_freeze: RegionKeepOption = None,
+    inputs: JobInputs,
     *,
     options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Additional parameters, as in the REST API.")] = "{}",
@@ -102,28 +65,16 @@ def submit(
     key: KeyOption = None,
 ) -> None:
     """Submit a job to a service, with the options of stylize. With --out, wait for the result."""
-    told = options.model_dump(mode="json", exclude_unset=True)
-    styles = parse_styles(style)
-    if len(styles) > 1:
-        told["style_weights"] = [file.weight for file in styles]
-    regions = region_options(region or (), region_style or (), region_weight or (), region_freeze or ())
-    theirs = [file for each in region_requests(regions) for file in each.styles]
-    pictures = [file.path for file in (*styles, *theirs)]
-    if regions:
-        told["regions"] = _regions_to_send(regions, different_names(pictures)[len(styles) :])
-    chosen = told | _parse_parameters(parameters)
+    styles, settings = _styles_and_parameters(inputs, options, parameters)
+    files = {"cameras": inputs.cameras, "photos": inputs.images}
     with _client(url, key) as client:
         if dry_run:
             with _sending_and_planning() as (progress, planning):
-                plan = client.plan(
-                    scene, pictures, cameras=cameras, photos=images, progress=progress, planning=planning, **chosen
-                )
+                plan = client.plan(inputs.scene, styles, **files, progress=progress, planning=planning, **settings)
             out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
             return
-        with _transfer("sending") as progress:
-            job = client.submit(
-                scene, pictures, cameras=cameras, photos=images, webhook=webhook, progress=progress, **chosen
-            )
+        with transfer_bar(error_console, "sending") as progress:
+            job = client.submit(inputs.scene, styles, **files, webhook=webhook, progress=progress, **settings)
         if out is None:
             out_console.print(json.dumps(job.data) if as_json else job.id)
             if not as_json:
@@ -134,35 +85,50 @@ def submit(
         _conclude(client, _follow(client, job.id, as_json), out, as_json)
 
 
+def _styles_and_parameters(
+    inputs: JobInputs, options: JobParameters, parameters: str
+) -> tuple[list[Path], dict[str, Any]]:
+    """Return the style images to send, those of regions last, and the parameters of the job."""
+    values = options.model_dump(mode="json", exclude_unset=True)
+    styles = parse_styles(inputs.style)
+    if len(styles) > 1:
+        values["style_weights"] = [file.weight for file in styles]
+    regions = inputs.regions
+    of_regions = [file for region in region_requests(regions) for file in region.styles]
+    images = [file.path for file in (*styles, *of_regions)]
+    if regions:
+        values["regions"] = _regions_to_send(regions, different_names(images)[len(styles) :])
+    return images, values | _parse_parameters(parameters)
+
+
 def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> list[dict[str, Any]]:
     """Return regions as JSON objects for the API.
 
     Args:
         names: Names under which the style images of the regions are sent, in the order of `region_requests`.
     """
-    told = {each.name: each.model_dump(mode="json", exclude_defaults=True) for each in regions}
-    left = iter(names)
+    objects = {region.name: region.model_dump(mode="json", exclude_defaults=True) for region in regions}
+    unused_names = iter(names)
     for request in region_requests(regions):
         if request.styles:
-            told[request.name]["style"] = [f"{next(left)}:{file.weight!r}" for file in request.styles]
-    return list(told.values())
+            objects[request.name]["style"] = [f"{next(unused_names)}:{file.weight!r}" for file in request.styles]
+    return list(objects.values())
 
 
 def status(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
     """Show the status of a job."""
     with _client(url, key) as client:
-        found = client.job(job)
-    out_console.print(json.dumps(found.data) if as_json else _job_text(found))
+        _print_job(client.job(job), as_json)
 
 
 def watch(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
     """Show the progress of a job until it ends; exit with 1 if it does not succeed."""
     with _client(url, key) as client:
-        found = _follow(client, job, as_json)
+        ended = _follow(client, job, as_json)
     if not as_json:
-        out_console.print(_job_text(found))
-    if found.status != "succeeded":
-        raise typer.Exit(_JOB_FAILED)
+        out_console.print(_job_text(ended))
+    if ended.status != "succeeded":
+        raise typer.Exit(FAILURE)
 
 
 def download(
@@ -186,28 +152,26 @@ def download(
         for each in names:
             target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
             target.parent.mkdir(parents=True, exist_ok=True)
-            with _transfer(each) as progress:
-                chosen = (form or _packed_form(target)) if each == "stylized.ply" else None
+            with transfer_bar(error_console, each) as progress:
+                chosen = (form or _format_of(target)) if each == "stylized.ply" else None
                 if form and out is None and each == "stylized.ply":
                     target = Path(result_name(each, by_name(form)))
                 written.append(str(client.download(job, target, each, progress, chosen)))
             if not as_json:
-                _tell_loss(client, job, chosen)
+                _print_compression_loss(client, job, chosen)
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
 
 
 def cancel(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
     """Cancel a job."""
     with _client(url, key) as client:
-        found = client.cancel(job)
-    out_console.print(json.dumps(found.data) if as_json else _job_text(found))
+        _print_job(client.cancel(job), as_json)
 
 
 def retry(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
     """Queue a failed or canceled job again."""
     with _client(url, key) as client:
-        found = client.retry(job)
-    out_console.print(json.dumps(found.data) if as_json else _job_text(found))
+        _print_job(client.retry(job), as_json)
 
 
 def delete(job: JobArgument, url: UrlOption = None, key: KeyOption = None) -> None:
@@ -225,16 +189,18 @@ def jobs(
 ) -> None:
     """List jobs, newest first."""
     with _client(url, key) as client:
-        found = list(client.jobs(status=status or (), limit=limit))
+        page = list(client.jobs(status=status or (), limit=limit))
     if as_json:
-        out_console.print(json.dumps([job.data for job in found]))
+        out_console.print(json.dumps([job.data for job in page]))
         return
     table = Table("id", "name", "status", "progress", "created")
-    for job in found:
+    for job in page:
         created = datetime.fromisoformat(job.data["created_at"]).astimezone()
         table.add_row(job.id, job.data["name"], job.status, _progress_text(job), f"{created:%Y-%m-%d %H:%M}")
     Console(width=None if out_console.is_terminal else 140, highlight=False, markup=False).print(table)
 
+
+COMMANDS = (submit, status, watch, download, cancel, retry, delete, jobs)
 
 # --- shared --------------------------------------------------------------------------------------------------------
 
@@ -244,11 +210,11 @@ def _client(url: str | None, key: str | None) -> Client:
 
     from api.client import Client
 
-    stamina.instrumentation.set_on_retry_hooks([_tell_of_retry])
+    stamina.instrumentation.set_on_retry_hooks([_print_retry])
     return Client(url, key)
 
 
-def _tell_of_retry(details: RetryDetails) -> None:
+def _print_retry(details: RetryDetails) -> None:
     what = str(details.caused_by) or type(details.caused_by).__name__
     error_console.print(f"{what}: retrying in {details.wait_for:.0f} s")
 
@@ -266,19 +232,10 @@ def _parse_parameters(text: str) -> dict[str, Any]:
 
 
 @contextmanager
-def _transfer(what: str) -> Iterator[Any]:
-    """Show a progress bar of transferred bytes on a terminal, and nothing elsewhere."""
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total or None)
-
-
-@contextmanager
 def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
     """Show a progress bar of the sent bytes, then of the surveyed views; only on a terminal."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
-    with Bar(*columns, console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
+    with live_bar(error_console, *columns) as bar:
         task = bar.add_task("checking", total=None, text="")
 
         def sent(done: int, total: int) -> None:
@@ -296,7 +253,7 @@ def _follow(client: Client, job_id: str, as_json: bool) -> Job:
     """Show events until the job has ended: as a live bar on a terminal, as lines elsewhere, or as JSON lines."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
     live = error_console.is_terminal and not as_json
-    with Bar(*columns, console=error_console, transient=True, disable=not live) as bar:
+    with live_bar(error_console, *columns, enabled=not as_json) as bar:
         task = bar.add_task("waiting", total=1.0, text="")
         for event in client.watch(job_id):
             if as_json:
@@ -316,26 +273,26 @@ def _follow(client: Client, job_id: str, as_json: bool) -> Job:
 def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
     if job.status != "succeeded":
         error_console.print(_job_text(job))
-        raise typer.Exit(_JOB_FAILED)
-    with _transfer(out.name) as progress:
-        client.download(job.id, out, progress=progress, form=_packed_form(out))
+        raise typer.Exit(FAILURE)
+    with transfer_bar(error_console, out.name) as progress:
+        client.download(job.id, out, progress=progress, form=_format_of(out))
     if not as_json:
-        _tell_loss(client, job.id, _packed_form(out))
+        _print_compression_loss(client, job.id, _format_of(out))
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
 
 
-def _tell_loss(client: Client, job_id: str, form: ExtraName | None) -> None:
+def _print_compression_loss(client: Client, job_id: str, form: ExtraName | None) -> None:
     """Print the quality loss of a compressed result."""
     if form is None:
         return
     with tempfile.TemporaryDirectory() as folder:
         name = f"{result_name('stylized.ply', by_name(form))}.json"
-        found = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
-    psnr = "renders identical to" if found["psnr_db"] is None else f"{found['psnr_db']:.1f} dB PSNR against"
-    error_console.print(f"{form}, {found['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
+        loss = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
+    psnr = "renders identical to" if loss["psnr_db"] is None else f"{loss['psnr_db']:.1f} dB PSNR against"
+    error_console.print(f"{form}, {loss['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
 
 
-def _packed_form(out: Path) -> ExtraName | None:
+def _format_of(out: Path) -> ExtraName | None:
     """Return the compressed format that the ending of a file name stands for; None for any other name."""
     format = format_of_name(out.name)
     return format.name if format in EXTRA_FORMATS else None
@@ -351,6 +308,10 @@ def _step_text(progress: Any) -> str:
     if progress.get("eta_s") is not None:
         text += f", {clock(progress['eta_s'])} left"
     return text
+
+
+def _print_job(job: Job, as_json: bool) -> None:
+    out_console.print(json.dumps(job.data) if as_json else _job_text(job))
 
 
 def _progress_text(job: Job) -> str:

@@ -12,7 +12,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from api.cli.client_commands import JsonOption, error_console, out_console
+from api.cli.arguments import JsonOption
+from api.cli.console import error_console, out_console
 
 if TYPE_CHECKING:
     from service.settings import ServiceSettings
@@ -22,20 +23,11 @@ if TYPE_CHECKING:
 _FSCK_CODES = {"missing": 4, "damaged": 8, "orphaned": 16}
 _FSCK_ROLLED_BACK = 32
 
+keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
+
 DataOption = Annotated[
     Path | None, typer.Option(help="Data folder of the service. [default: SGSST_DATA, else ./sgsst-data]")
 ]
-
-
-def add_to(app: typer.Typer) -> None:
-    """Add all commands of this module to the app."""
-    app.command()(serve)
-    app.command()(fsck)
-    keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
-    keys_app.command("create")(create_key)
-    keys_app.command("list")(list_keys)
-    keys_app.command("revoke")(revoke_key)
-    app.add_typer(keys_app, name="keys")
 
 
 def serve(
@@ -74,16 +66,16 @@ def fsck(
     store = _open_store(data)
     from service.fsck import FileCheck
 
-    check, found = FileCheck(_service_settings(), store), []
+    check, findings = FileCheck(_service_settings(), store), []
     for finding in check.findings(mend=mend):
-        found.append(finding)
+        findings.append(finding)
         if not as_json:
             needed = f"  needed by {', '.join(finding.holders)}" if finding.holders else ""
             done = f"  {finding.mended}" if finding.mended else ""
             out_console.print(f"{finding.kind:<8}  {finding.what:<10}  {finding.name}{needed}{done}")
     if as_json:
-        out_console.print(json.dumps([asdict(finding) for finding in found]))
-    kinds: list[str] = [finding.kind for finding in found]
+        out_console.print(json.dumps([asdict(finding) for finding in findings]))
+    kinds: list[str] = [finding.kind for finding in findings]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in _FSCK_CODES)
     error_console.print(f"Checked {check.checked} files of the database: {counts}")
     if store.database.rolled_back:
@@ -106,6 +98,7 @@ def _check_database_exists(data: Path | None) -> None:
         raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
 
 
+@keys_app.command("create")
 def create_key(
     name: Annotated[str, typer.Argument(help="Name of its owner, for display.", show_default=False)],
     priority: Annotated[int, typer.Option(help="Priority; jobs with higher values run first.")] = 0,
@@ -136,6 +129,7 @@ def create_key(
     out_console.print(text)
 
 
+@keys_app.command("list")
 def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
     """List API keys, without the keys themselves."""
     rows = _open_store(data).keys.all()
@@ -151,6 +145,7 @@ def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
     Console(highlight=False, markup=False).print(table)
 
 
+@keys_app.command("revoke")
 def revoke_key(
     key_id: Annotated[
         str, typer.Argument(metavar="ID", help="ID of the key, as listed by `sgsst keys list`.", show_default=False)
@@ -160,6 +155,9 @@ def revoke_key(
     """Revoke an API key."""
     row = _open_store(data).keys.revoke(key_id)
     error_console.print(f"Revoked key {row.id} of {row.name!r}.")
+
+
+COMMANDS = (serve, fsck)
 
 
 def _service_settings() -> ServiceSettings:

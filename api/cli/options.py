@@ -1,9 +1,9 @@
-"""Command-line options, generated from the model fields that declare them."""
+"""Command-line options that come from the fields of a class, declared once for all commands that offer them."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import typer
@@ -27,8 +27,6 @@ def with_options(
     """Return a decorator that replaces one argument of a command by options, one per field of a model.
 
     The decorated function receives an instance of the model. Only options given on the command line are set in it.
-    typer reads options from a signature alone, so the decorator makes one; written by hand, each option would be
-    repeated in every command that offers it.
 
     Args:
         argument: Name of the function's argument that receives the model.
@@ -36,20 +34,49 @@ def with_options(
         without: Names of options to leave out.
     """
     names = (declared(model).keys() if only is None else set(only)) - set(without)
-    offered = {name: option for name, option in declared(model).items() if name in names}
+    parameters = {name: _parameter(option) for name, option in declared(model).items() if name in names}
+
+    def build(given: dict[str, Any]) -> BaseModel:
+        return _checked(model, {name: value for name, value in given.items() if value is not None})
+
+    return _expanding(argument, parameters, build)
+
+
+def with_arguments(group: type, argument: str = "inputs") -> Callable[[Command], Command]:
+    """Return a decorator that replaces one argument of a command by the fields of a dataclass.
+
+    Args:
+        group: Dataclass whose fields are annotated with `typer.Argument` or `typer.Option`.
+        argument: Name of the function's argument that receives the instance.
+    """
+    parameters = inspect.signature(group, eval_str=True).parameters
+    return _expanding(argument, parameters, lambda given: group(**given))
+
+
+def _expanding(
+    argument: str, parameters: Mapping[str, inspect.Parameter], build: Callable[[dict[str, Any]], object]
+) -> Callable[[Command], Command]:
+    """Return a decorator that replaces one argument of a command by several parameters.
+
+    typer reads options from a signature alone, so the decorator makes one; written by hand, each option would be
+    repeated in every command that offers it.
+
+    Args:
+        build: Function that converts the values of the parameters to the argument of the decorated function.
+    """
 
     def decorate(function: Command) -> Command:
         def command(**arguments: Any) -> None:
-            given = {name: value for name in offered if (value := arguments.pop(name)) is not None}
-            function(**arguments, **{argument: _checked(model, given)})
+            given = {name: arguments.pop(name) for name in parameters}
+            function(**arguments, **{argument: build(given)})
 
-        parameters: list[inspect.Parameter] = []
+        expanded: list[inspect.Parameter] = []
         for parameter in inspect.signature(function, eval_str=True).parameters.values():
-            expanded = [_parameter(each) for each in offered.values()] if parameter.name == argument else [parameter]
-            parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in expanded]
+            expanded += parameters.values() if parameter.name == argument else [parameter]
+        expanded = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in expanded]
         command.__name__, command.__doc__ = function.__name__, function.__doc__
-        command.__annotations__ = {each.name: each.annotation for each in parameters}
-        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {each.name: each.annotation for each in expanded}
+        command.__signature__ = inspect.Signature(expanded)  # type: ignore[attr-defined]
         return command
 
     return decorate

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 if TYPE_CHECKING:
     from sgsst_core.planning.survey import PlanningProgress
@@ -20,9 +28,18 @@ LOG_SECONDS = 60.0
 _STAGES = {"coarse": "coarsest scale", "sos": "all scales", "measuring": "measuring"}
 
 
-def live_bar(console: Console, *columns: ProgressColumn) -> Progress:
-    """Return a progress bar that is live on a terminal and prints nothing elsewhere."""
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+def live_bar(console: Console, *columns: ProgressColumn, enabled: bool = True) -> Progress:
+    """Return a progress bar that is live on a terminal and prints nothing elsewhere, or if it is not enabled."""
+    return Progress(*columns, console=console, transient=True, disable=not (enabled and console.is_terminal))
+
+
+@contextmanager
+def transfer_bar(console: Console, description: str) -> Iterator[Callable[[int, int], None]]:
+    """Show the progress of a transfer; yield a function that receives the transferred and the total bytes."""
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with live_bar(console, *columns) as bar:
+        task = bar.add_task(description, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total or None)
 
 
 class JobBar:

@@ -9,22 +9,23 @@ from pathlib import Path
 import pytest
 import torch
 
-from api.cli import main as cli
+from api.cli import stylize_commands
+from api.cli.main import main
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.scene_file import read_scene
 
 
 @pytest.mark.slow
-def test_demo_stylizes_its_own_scene_and_says_where_the_results_are(
+def test_demo_stylizes_its_scene_and_prints_result_paths(
     vgg16_weights: BackboneWeights,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(cli, "DEMO_STEPS", 1)
-    monkeypatch.setattr(cli, "DEMO_RESOLUTION", 180)
+    monkeypatch.setattr(stylize_commands, "DEMO_STEPS", 1)
+    monkeypatch.setattr(stylize_commands, "DEMO_RESOLUTION", 180)
     out = tmp_path / "demo"
-    assert cli.main(["demo", "--out", str(out)]) == 0
+    assert main(["demo", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
     names = {"stylized.ply", "stylized.report.json", "stylized.before_after.jpg", "stylized.loss.png"}
     names |= {"stylized.report.html"}
@@ -43,13 +44,11 @@ def test_demo_stylizes_its_own_scene_and_says_where_the_results_are(
     command = next(line for line in shown.splitlines() if line.startswith("command:")).removeprefix("command:")
     arguments = shlex.split(command)
     assert arguments[:3] == ["sgsst", "stylize", str(out / "motorcycle.ply")]
-    assert cli.main([*arguments[1:], "--resume"]) == 2
+    assert main([*arguments[1:], "--resume"]) == 2
     assert "this job is finished" in capsys.readouterr().err
 
 
-def test_demo_into_a_folder_that_cannot_be_written_is_an_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_demo_rejects_unwritable_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
-    assert cli.main(["demo", "--out", str(tmp_path / "file")]) == 2
+    assert main(["demo", "--out", str(tmp_path / "file")]) == 2
     assert "file" in capsys.readouterr().err

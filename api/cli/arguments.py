@@ -1,0 +1,104 @@
+"""Arguments and options that several commands have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sgsst_core.files.formats import SUFFIXES
+from worker.options import StylizeOptions
+from worker.region_requests import RegionOptions, region_options, region_requests
+from worker.styles import parse_styles
+
+if TYPE_CHECKING:
+    from worker.request import StylizeRequest
+
+SceneArgument = Annotated[
+    Path,
+    typer.Argument(metavar="SCENE", help=f"3DGS scene: {SUFFIXES}.", show_default=False),
+]
+CamerasOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender)."
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+@dataclass(frozen=True)
+class JobInputs:
+    """Files and regions of a job, as given on the command line; see `with_arguments`."""
+
+    scene: SceneArgument
+    style: Annotated[
+        list[str],
+        typer.Option(
+            metavar="FILE[:WEIGHT]",
+            help="Style image; may be repeated. Several are mixed in proportion to their weights.",
+            show_default=False,
+        ),
+    ]
+    cameras: CamerasOption = None
+    images: Annotated[
+        Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
+    ] = None
+    region: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME:SPEC",
+            help="Region of the scene: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, half-space=A,B,C,D (Ax+By+Cz>=D), "
+            "property=NAME>VALUE, mask=FILE.npy (a flag for each Gaussian) or masks=FOLDER (images of views, white "
+            "inside the region). May be repeated; where regions overlap, the later one wins.",
+        ),
+    ] = None
+    region_style: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE[:WEIGHT]", help="Style image of a region. Several are mixed. [default: the job's style]"
+        ),
+    ] = None
+    region_weight: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=WEIGHT", help="Weight of a region's style in the loss. [default: 1]"),
+    ] = None
+    region_freeze: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="Freeze a region: its colors stay bit-identical. rest: all Gaussians without a region."
+        ),
+    ] = None
+
+    @property
+    def regions(self) -> tuple[RegionOptions, ...]:
+        """Regions of the job.
+
+        Raises:
+            SettingsError: If an option of a region is malformed.
+        """
+        return region_options(
+            self.region or (), self.region_style or (), self.region_weight or (), self.region_freeze or ()
+        )
+
+    def request(self, options: StylizeOptions, out: Path, *, resume: bool = False) -> StylizeRequest:
+        """Return the request of a job on this machine.
+
+        Raises:
+            SettingsError: If options are malformed or contradict each other.
+        """
+        from worker.request import SceneRequest, StylizeRequest
+
+        return StylizeRequest(
+            source=SceneRequest.of(self.scene, self.cameras, options),
+            styles=parse_styles(self.style),
+            images=self.images,
+            out=out,
+            backbone=options.backbone,
+            resume=resume,
+            settings=options.settings(),
+            regions=region_requests(self.regions),
+            style_background=options.style_background,
+        )

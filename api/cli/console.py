@@ -1,0 +1,29 @@
+"""Consoles of the command line, and exit codes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+
+#: Exit codes for an unusable input or option, and for any other failure.
+BAD_INPUT, FAILURE = 2, 1
+
+out_console = Console(highlight=False, markup=False, soft_wrap=True)
+error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_field(name: str, value: object) -> None:
+    """Print one line of a command's results; the values of all lines are aligned."""
+    out_console.print(f"{name + ':':<22}{value}")
+
+
+@contextmanager
+def spinner(text: str) -> Iterator[None]:
+    """Show a spinner on a terminal, and nothing elsewhere."""
+    if not error_console.is_terminal:
+        yield
+        return
+    with error_console.status(text):
+        yield

@@ -1,0 +1,131 @@
+"""Commands that read a scene without stylizing it: `plan`, `check`, `render` and `convert`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.table import Column, Table
+
+from api.cli.arguments import CamerasOption, JobInputs, SceneArgument
+from api.cli.console import error_console, out_console, print_field, spinner
+from api.cli.options import with_arguments, with_options
+from api.cli.progress_bars import job_bar, live_bar
+from sgsst_core.files.formats import RESULT_SUFFIXES
+from worker.options import StylizeOptions, ViewOptions
+
+if TYPE_CHECKING:
+    from sgsst_core.planning.plan import Plan
+
+
+@with_options(StylizeOptions, without=("workers",))
+@with_arguments(JobInputs)
+def plan(
+    inputs: JobInputs,
+    out: Annotated[Path, typer.Option(help="JSON file to write the plan to.")] = Path("plan.json"),
+    sheet: Annotated[Path | None, typer.Option(help="JPEG file to write with images of the views.")] = None,
+    *,
+    options: StylizeOptions,
+) -> None:
+    """Show what a stylization would skip and why, and what a step would cost."""
+    from api.cli.scene_tools import make_plan
+
+    request = inputs.request(options, out)
+    with job_bar(error_console) as bar:
+        plan = make_plan(request, bar.show_planning, sheet)
+    out_console.print(_decisions_table(plan))
+    if plan.prediction:
+        seconds, peak = plan.prediction.seconds, plan.prediction.peak_bytes / 1e9
+        coarse = f" ({plan.prediction.seconds_coarse:.2g} s in phase 1)" if plan.steps_coarse else ""
+        on_device = plan.prediction.device_bytes
+        gpu = f" (GPU: {on_device / 1e9:.1f} GB)" if on_device is not None else ""
+        expected = f"{seconds:.2g} s per step on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
+        out_console.print(f"Predicted: {expected}")
+    if sheet is not None:
+        print_field("views", sheet)
+    print_field("plan", out)
+
+
+def _decisions_table(plan: Plan) -> Table:
+    table = Table(Column("item", no_wrap=True), "decision and reason", Column("saves", no_wrap=True), show_lines=True)
+    for item in plan.decisions:
+        saved = [f"{item.seconds:.2g} s per step"] if item.seconds is not None else []
+        saved += [f"{item.bytes / 1e6:.1f} MB"] if item.bytes is not None else []
+        error = "" if item.error == "none" else f" Costs: {item.error}."
+        table.add_row(item.item, f"{item.decision}: {item.reason}.{error}", "\n".join(saved))
+    return table
+
+
+@with_options(ViewOptions, without=("drop_invalid",))
+def check(
+    scene: SceneArgument,
+    cameras: CamerasOption = None,
+    style: Annotated[Path | None, typer.Option(help="Style image.")] = None,
+    *,
+    options: ViewOptions,
+) -> None:
+    """Report extreme values in a scene, its views and its style, and their consequences."""
+    from api.cli.scene_tools import look_for_extremes
+    from worker.request import SceneRequest
+
+    source = SceneRequest.of(scene, cameras, options)
+    with spinner("Checking the scene and every view"):
+        findings = look_for_extremes(source, style)
+    if not findings:
+        out_console.print("No extreme values were found.")
+        return
+    table = Table("finding", Column("count", justify="right"), "worst", "consequence", show_lines=True)
+    for item in findings:
+        table.add_row(f"{item.subject}: {item.what}", f"{item.count:,} of {item.total:,}", item.worst, item.done)
+    out_console.print(table)
+
+
+@with_options(ViewOptions)
+@with_options(StylizeOptions, "chosen", only=("background",))
+def render(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the PNG images.", show_default=False)],
+    cameras: CamerasOption = None,
+    *,
+    options: ViewOptions,
+    chosen: StylizeOptions,
+) -> None:
+    """Render all views of a scene."""
+    from api.cli.scene_tools import render_views
+    from worker.request import SceneRequest
+
+    source = SceneRequest.of(scene, cameras, options)
+    background = chosen.settings().background
+    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with live_bar(error_console, *columns) as bar:
+        task = bar.add_task("", total=None)
+        paths = render_views(source, background, out, lambda done, total: bar.update(task, completed=done, total=total))
+    out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
+
+
+@with_options(ViewOptions, only=("near", "drop_invalid", "spz_axes"))
+def convert(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help=f"Scene to write: {RESULT_SUFFIXES}.", show_default=False)],
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Report the PSNR of small renders against those of the scene.")
+    ] = False,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(help="Cameras that --compare renders, and that decide the axes of an SPZ. [default: an orbit]"),
+    ] = None,
+    *,
+    options: ViewOptions,
+) -> None:
+    """Convert a scene to another format, which the name of OUT determines."""
+    from api.cli.scene_tools import convert_scene
+    from worker.request import SceneRequest
+
+    converted = convert_scene(SceneRequest.of(scene, cameras, options), out, compare)
+    for line in converted.decisions:
+        print_field(line.item, f"{line.decision}: {line.reason}")
+    if converted.loss is not None:
+        print_field("compared", converted.loss.text(scene.name))
+    print_field("scene", f"{out}, {converted.count:,} Gaussians")

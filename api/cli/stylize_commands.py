@@ -1,0 +1,231 @@
+"""Commands that stylize a scene in this process or on several ranks: `stylize` and `demo`."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from api.cli.arguments import JobInputs
+from api.cli.console import FAILURE, error_console, out_console, print_field, spinner
+from api.cli.interrupt import stop_on_signal
+from api.cli.options import with_arguments, with_options
+from api.cli.progress_bars import clock, job_bar
+from api.cli.weights_commands import fetch
+from sgsst_core.errors import WeightsError
+from sgsst_core.files.formats import EXTRA_SUFFIXES
+from sgsst_core.settings import make_settings
+from worker.options import RunOptions, StylizeOptions
+
+if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
+    from worker.description import Prepared
+    from worker.execute import Result
+    from worker.ranks.attempts import RanksResult, WorkerOptions
+    from worker.request import Outputs, StylizeRequest
+
+#: Resolution and number of steps of the demo, and seconds after which it stops on a slow machine. The whole demo takes
+#: less than five minutes.
+DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 180
+
+#: Reasons to stop before the last step that need no action.
+_EARLY_ENDS = {
+    "target-loss": "the loss has reached --target-loss",
+    "converged": "the loss no longer falls (use --no-early-stop to run all steps)",
+}
+
+
+@with_options(StylizeOptions)
+@with_options(RunOptions, "run")
+@with_arguments(JobInputs)
+def stylize(
+    context: typer.Context,
+    inputs: JobInputs,
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Stylized PLY to write; report and images go beside it. "
+            f"A {EXTRA_SUFFIXES} is written in addition to a PLY of the same name."
+        ),
+    ],
+    *,
+    options: StylizeOptions,
+    run: RunOptions,
+) -> None:
+    """Stylize a scene with one or several style images."""
+    request = inputs.request(options, out, resume=run.resume)
+    from worker.ranks.attempts import WorkerOptions
+
+    _stylize(request, context.obj, options.workers, WorkerOptions(run.rank_timeout, run.checkpoint_seconds))
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the scene and the results.")] = Path("demo"),
+) -> None:
+    """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
+    from api.cli.demo_scene import build_demo
+    from sgsst_core.features.network_weights import load_network_weights
+    from worker.request import SceneRequest, StylizeRequest, check_folder
+    from worker.styles import StyleFile
+
+    check_folder(out)
+    try:
+        load_network_weights("auto")
+    except WeightsError:
+        fetch("vgg16")
+    with spinner("Building the scene"):
+        files = build_demo(out)
+    source = SceneRequest(scene=files.ply, cameras=files.cameras, resolution=DEMO_RESOLUTION)
+    settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
+    request = StylizeRequest(source, (StyleFile(files.style),), None, out / "stylized.ply", "auto", False, settings)
+    options: dict[str, object] = {"--style": files.style, "--cameras": files.cameras, "--out": request.out}
+    options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
+    options |= {"--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
+    arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
+    print_field("command", shlex.join(["sgsst", *arguments]))
+    _stylize(request, arguments)
+
+
+def _stylize(
+    request: StylizeRequest,
+    arguments: Sequence[str],
+    workers: int | None = None,
+    options: WorkerOptions | None = None,
+) -> None:
+    """Stylize a scene and print the plan and the results.
+
+    Args:
+        arguments: Arguments of this command; the command to resume the job is built from them.
+    """
+    from worker.ranks.attempts import WorkerOptions
+    from worker.request import check_request
+
+    outputs = check_request(request)
+    command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
+    options = options or WorkerOptions()
+    if workers is None:
+        _stylize_here(request, outputs, command, options.checkpoint_seconds)
+    else:
+        _stylize_on_ranks(request, outputs, command, workers, options)
+
+
+def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, checkpoint_seconds: float) -> None:
+    """Stylize on one rank in this process."""
+    from worker.description import describe
+    from worker.execute import execute
+    from worker.prepare import prepare
+
+    with job_bar(error_console) as bar:
+        job = prepare(request, warn=error_console.print, show_planning=bar.show_planning)
+    with stop_on_signal(_announce_stop) as stop:
+        prepared = describe(job)
+        _print_plan(prepared)
+        with job_bar(error_console) as bar:
+            bar.start(prepared)
+            result = execute(
+                job, progress=bar.show, stop=stop, warn=error_console.print, checkpoint_seconds=checkpoint_seconds
+            )
+    if result.stopped == "interrupted":
+        _print_interruption(outputs, result.step, result.total, result.step, command)
+        raise typer.Exit(stop.exit_code)
+    _print_result(outputs, result, command)
+
+
+def _stylize_on_ranks(
+    request: StylizeRequest, outputs: Outputs, command: str, workers: int, options: WorkerOptions
+) -> None:
+    """Stylize on several ranks, each in a process of its own."""
+    from worker.ranks.attempts import stylize_on_ranks
+    from worker.ranks.listener import Listener
+
+    with stop_on_signal(_announce_stop) as stop, job_bar(error_console) as bar:
+
+        def start(prepared: Prepared) -> None:
+            _print_plan(prepared)
+            bar.start(prepared)
+
+        notify = error_console.print
+        listener = Listener(
+            planning=bar.show_planning, prepared=start, progress=bar.show, happened=notify, warn=notify, stop=stop
+        )
+        ended = stylize_on_ranks(request, workers, listener, options=options)
+    if ended.interrupted:
+        _print_interruption(outputs, ended.step, ended.total, ended.saved, command)
+        raise typer.Exit(stop.exit_code)
+    assert ended.result is not None
+    _print_restarts(ended)
+    _print_result(outputs, ended.result, command)
+
+
+def _announce_stop() -> None:
+    error_console.print("Stopping after this step. Press Ctrl-C again to abort immediately.")
+
+
+def _print_plan(prepared: Prepared) -> None:
+    for heading, line in prepared.lines:
+        print_field(heading, line)
+
+
+def _print_interruption(outputs: Outputs, step: int, total: int, saved: int | None, command: str) -> None:
+    if saved is None:
+        error_console.print(f"Stopped at step {step}. Nothing was saved.")
+        return
+    state = "saved" if saved == step else f"step {saved} is saved"
+    error_console.print(
+        f"Stopped at step {step} of {total}; {state} in {outputs.checkpoint}.\nTo continue, run:\n{command}"
+    )
+
+
+def _print_restarts(ended: RanksResult) -> None:
+    for attempt in ended.attempts:
+        print_field(
+            "restarted",
+            f"{attempt.reason}, at step {attempt.last_step}; resumed from step {attempt.saved_step} "
+            f"after {attempt.seconds_to_resume:.1f} s",
+        )
+
+
+def _print_result(outputs: Outputs, result: Result, command: str) -> None:
+    before, after = result.losses
+    print_field("loss", f"{before:.4g} before, {after:.4g} after ({after / before:.1%})")
+    for line in _loss_over_time(result):
+        print_field("loss over time", line)
+    paths = [("stylized scene", outputs.ply)]
+    if outputs.packed is not None and result.packed is not None:
+        print_field("compressed", result.packed.text("the PLY"))
+        paths.append(("compressed scene", outputs.packed))
+    paths += [("views", outputs.views)] if outputs.views.exists() else []
+    if result.report_error is None:
+        paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
+        paths += [("report as JSON", outputs.report)]
+    for heading, path in paths:
+        print_field(heading, path)
+    if result.stopped in _EARLY_ENDS:
+        out_console.print(f"Stopped at step {result.step} of {result.total}: {_EARLY_ENDS[result.stopped]}.")
+    if result.stopped == "max-seconds":
+        out_console.print(
+            f"Reached --max-seconds at step {result.step} of {result.total}. The checkpoint is kept. To continue, "
+            f"raise --max-seconds, which counts from the first step:\n{command}"
+        )
+    if result.report_error is not None:
+        error_console.print(
+            f"The stylized scene is complete, but its report could not be written: {result.report_error}"
+        )
+        raise typer.Exit(FAILURE)
+
+
+def _loss_over_time(result: Result) -> list[str]:
+    """Return when the loss fell to certain fractions of its initial value, and its decrease at the end."""
+    bought = result.bought
+    if bought is None:
+        return []
+    lines = [
+        f"down to {entry['relative']:.0%} of the initial loss on all scales after {clock(entry['seconds'])}"
+        for entry in bought["reached"]
+    ]
+    last = bought["last_tenth"]
+    if last:
+        lines.append(f"from {last['from']:.2%} to {last['to']:.2%} in the last tenth of the time")
+    return lines
