@@ -74,6 +74,11 @@ class Regions:
         """Return the mask [N] bool of the Gaussians in the region with index `place`."""
         return self.labels == place
 
+    def with_checked_styles(self) -> Regions:
+        """Check the regions' styles, and convert their images; see `Style.given`."""
+        every = [replace(each, style=each.style and Style.given(each.style)) for each in self.every]
+        return replace(self, every=tuple(every))
+
     def refined(self, refinement: Refinement | None) -> Regions:
         """Return the regions after refinement: split Gaussians inherit the region of their parent."""
         if refinement is None:

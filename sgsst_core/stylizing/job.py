@@ -193,9 +193,11 @@ def plan_job(
 ) -> StylizationJob:
     """Plan and prepare a job; see `make_plan` for `weights`, `rasterizer` and exceptions.
 
-    If the settings request refinement, the job contains the refined scene.
+    Styles are checked and converted by `Style.given`. If the settings request refinement, the job contains the refined
+    scene.
     """
-    weights, style = weights or load_network_weights("auto"), Style.of(style)
+    style, regions = Style.given(style), regions and regions.with_checked_styles()
+    weights = weights or load_network_weights("auto")
     refinement = refine(
         scene,
         cameras,

@@ -1,17 +1,26 @@
-"""Tests of mixing several style images into one style."""
+"""Tests of mixing several style images into one style, and of images that callers pass as arrays."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from sgsst_core.errors import SettingsError
+from sgsst_core.errors import ImageError, SettingsError
 from sgsst_core.features.statistics import layer_statistics_reference, merge_all
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+from sgsst_core.files.images import load_image
 from sgsst_core.loss.nearest import MOST_VECTORS, positions_per_image
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.loss.terms import layers_of
-from sgsst_core.style import Style, mixed_moments, normalized
+from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.settings import make_settings
+from sgsst_core.style import Style, image_of, mixed_moments, normalized
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.pictures import picture
+from tests.small_scenes import cameras, wall
 
 
 def features(seed, count=40, offset=0.0):
@@ -113,3 +122,83 @@ def test_color_moments_of_a_mixture():
     together = torch.cat(pixels)
     torch.testing.assert_close(mean, together.mean(0))
     torch.testing.assert_close(covariance, together.T.cov(correction=0))
+
+
+BYTES = (picture(30, 20) * 255).round().to(torch.uint8)
+FLOATS = BYTES / 255
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        BYTES,
+        BYTES.numpy(),
+        FLOATS,
+        FLOATS.double(),
+        FLOATS.double().numpy().astype(">f8"),
+        FLOATS.permute(2, 0, 1),
+        BYTES.numpy()[:, :, ::-1][:, :, ::-1],
+        FLOATS.clone().requires_grad_(),
+        torch.cat([BYTES, torch.full((30, 20, 1), 255, dtype=torch.uint8)], dim=2),
+    ],
+    ids=["uint8", "numpy", "floats", "double", "big-endian", "CHW", "negative-strides", "gradient", "RGBA"],
+)
+def test_arrays_are_converted_to_the_image_that_they_hold(given):
+    converted = image_of(given)
+    torch.testing.assert_close(converted, FLOATS, rtol=0, atol=1e-7)
+    assert converted.is_contiguous()
+    assert not converted.requires_grad
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+def test_arrays_give_the_image_that_load_image_reads(tmp_path, mode):
+    image = Image.fromarray(BYTES.numpy()).convert(mode)
+    if mode == "RGBA":
+        image.putalpha(Image.linear_gradient("L").resize(image.size))
+    image.save(tmp_path / "style.png")
+    read = load_image(tmp_path / "style.png")
+    tolerance = 1 / 255 if mode == "RGBA" else 0  # files are composited in 8 bits
+    torch.testing.assert_close(image_of(np.asarray(image)), read, rtol=0, atol=tolerance + 1e-7)
+
+
+def test_images_in_the_right_form_are_not_copied():
+    style = Style((FLOATS,))
+    assert Style.given(style) is style
+    assert image_of(FLOATS) is FLOATS
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        (255 * FLOATS, "values from 60 to 201, .*Divide values in 0..255 by 255"),
+        (FLOATS - 0.5, "values from -0.2647 .*clamp others"),
+        (torch.full((4, 4, 3), torch.nan), "holds NaN"),
+        (BYTES.long(), "dtype int64. Give uint8"),
+        (np.zeros((4, 4, 3), bool), "dtype bool. Give uint8"),
+        (np.array([[["a"]]]), "dtype <U1. Give uint8"),
+        (FLOATS[None], r"shape \[1, 30, 20, 3\].*without a batch dimension"),
+        (FLOATS[:, :, :2], r"shape \[30, 20, 2\]"),
+        (FLOATS[:0], r"shape \[0, 20, 3\]"),
+        ("style.jpg", "is a str.*Read files with `load_image`"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_other_arrays_are_refused_in_a_sentence(given, problem):
+    with pytest.raises(ImageError, match=problem):
+        image_of(given)
+
+
+def test_styles_of_jobs_and_regions_are_checked(tiny_weights):
+    """Values in 0..255 would make the scene white."""
+    scene, settings = wall(), make_settings("preview", steps_sos=1)
+    regions = Regions((Region("rest"), Region("left", style=Style((255 * FLOATS,)))), torch.ones(len(scene)).byte())
+    for given, where in ((255 * FLOATS, None), (Style((FLOATS, 255 * FLOATS), (0.5, 0.5)), None), (FLOATS, regions)):
+        with pytest.raises(ImageError, match="by 255"):
+            Stylizer.planned(scene, cameras(1), given, settings, weights=tiny_weights, regions=where)
+    own = replace(regions.every[1], style=Style((BYTES,)))
+    regions = replace(regions, every=(regions.every[0], own))
+    jobs = [
+        Stylizer.planned(scene, cameras(1), given, settings, weights=tiny_weights, regions=where).job
+        for given, where in ((BYTES.numpy(), None), (FLOATS, None), (FLOATS, regions))
+    ]
+    assert all(torch.equal(job.style.images[0], FLOATS) for job in jobs)
