@@ -20,7 +20,7 @@ from service.files.blobs import BLOBS, UPLOADS
 from service.files.names import CHECKPOINT
 from service.files.objects import ObjectStore
 from service.files.stored_blobs import open_blobs
-from service.scheduling.strays import strays_of_job
+from service.scheduling.housekeeping import strays_of_job
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadPartRow, UploadRow

@@ -22,10 +22,11 @@ from sqlalchemy import event, select
 
 from benchmarks.fleet_parts.demand import SimulatedJob
 from service.files.names import CHECKPOINT
-from service.scheduling.dispatcher import Dispatcher
+from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.machine import Machine
-from service.scheduling.packing import Grant
+from service.scheduling.packing import Capacity, Grant
 from service.scheduling.scheduler import Holding
+from service.scheduling.selection import JobSelector
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -92,7 +93,7 @@ class Attempt:
 class Host:
     """Machine with its dispatcher. `life` counts restarts, so that events from before a restart are ignored."""
 
-    dispatcher: Dispatcher
+    selector: JobSelector
     gpus: int
     running: dict[str, Attempt] = field(default_factory=dict)
     life: int = 0
@@ -142,10 +143,10 @@ class Fleet:
         names = tuple(str(number) for number in range(gpus_each))
         self.hosts = []
         for number in range(hosts):
-            dispatcher = Dispatcher(settings, self.store, Machine(names, 64, 1 << 40))
-            dispatcher.name = f"host-{number}"
-            self.hosts.append(Host(dispatcher, gpus_each))
-            self.store.operations.beat(dispatcher.name, gpus_each, gpus_each)
+            capacity = Capacity(Machine(names, 64, 1 << 40), settings.parallel_jobs)
+            clocks = ClockWatch(self.store, settings.lease_seconds)
+            self.hosts.append(Host(JobSelector(f"host-{number}", self.store, capacity, clocks), gpus_each))
+            self.store.operations.beat(f"host-{number}", gpus_each, gpus_each)
 
     def _prepare_store(self) -> None:
         engine = self.store.database.engine
@@ -231,7 +232,7 @@ class Fleet:
         """Lease all jobs that fit a host, as a real dispatcher does in each poll."""
         while host.free and self._waiting:
             self._do("lease")
-            found = host.dispatcher.lease_next_job(host.held)
+            found = host.selector.lease_next_job(host.held)
             if found is None:
                 self._do("look")
                 host.keeps_room_for = self._reserved(host)
@@ -249,7 +250,7 @@ class Fleet:
 
     def _reserved(self, host: Host) -> str | None:
         with self.store.database.reading() as session:
-            mine = ReservationRow.dispatcher == host.dispatcher.name
+            mine = ReservationRow.dispatcher == host.selector.dispatcher
             return session.scalar(select(ReservationRow.job_id).where(mine))
 
     def _start(self, host: Host, lease: Lease, grant: Grant) -> None:
@@ -337,15 +338,15 @@ class Fleet:
     def _run_out(self, host: Host) -> None:
         self._do("failure")
         held = self.store.leases.waiting()
-        self.store.leases.run_out(host.dispatcher.name)
-        self.store.operations.gone(host.dispatcher.name)
+        self.store.leases.run_out(host.selector.dispatcher)
+        self.store.operations.gone(host.selector.dispatcher)
         self._waiting += self.store.leases.waiting() - held
         self._at(self._soon(), self._somebody_looks)
 
     def _repair(self, host: Host) -> None:
         host.up, host.keeps_room_for = True, None
         self._do("failure")
-        self.store.operations.beat(host.dispatcher.name, host.gpus, host.gpus)
+        self.store.operations.beat(host.selector.dispatcher, host.gpus, host.gpus)
         self._look(host)
         self._fail_some_day(host)
 

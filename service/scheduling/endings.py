@@ -32,7 +32,7 @@ class Message(TypedDict, total=False):
     detail: str
 
 
-class Wish(StrEnum):
+class StopRequest(StrEnum):
     """External request to end a running attempt."""
 
     #: The user has canceled the job.
@@ -81,7 +81,7 @@ class Ending:
 
 
 def attempt_ending(
-    wish: Wish | None,
+    request: StopRequest | None,
     last: Message | None,
     exit_code: int,
     log_tail: str | None,
@@ -92,7 +92,7 @@ def attempt_ending(
     """Return the ending of an attempt whose process has exited.
 
     Args:
-        wish: CANCEL or RELEASE if the end was requested, possibly too late; None otherwise.
+        request: CANCEL or RELEASE if the end was requested, possibly too late; None otherwise.
         last: Final message of the process, `done`, `failed` or `interrupted`; None if it sent none.
         exit_code: Exit code of the process; negative for the signal that killed it.
         log_tail: Last part of the process' log; None if there is no log.
@@ -104,9 +104,9 @@ def attempt_ending(
         if has_result:
             return Ending(AttemptOutcome.SUCCEEDED)
         return Ending(AttemptOutcome.FAILED, {"code": "internal", "message": "The job ended without a result."})
-    if wish == Wish.CANCEL:
+    if request == StopRequest.CANCEL:
         return Ending(AttemptOutcome.CANCELED)
-    if wish == Wish.RELEASE:
+    if request == StopRequest.RELEASE:
         return Ending(AttemptOutcome.RELEASED)
     if last is not None and last["kind"] == "failed":
         return Ending(AttemptOutcome.FAILED, last["error"], last["permanent"], last.get("detail"))

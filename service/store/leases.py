@@ -49,6 +49,11 @@ class Lease:
         """Id of the job."""
         return self.job.id
 
+    @property
+    def log_fields(self) -> dict[str, Any]:
+        """Fields of log records about the attempt."""
+        return {"job": self.job.id, "attempt": self.job.attempt}
+
 
 @dataclass(frozen=True)
 class Published:

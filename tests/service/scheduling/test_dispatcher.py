@@ -20,6 +20,7 @@ from service.scheduling.machine import Machine, is_dead, own_name
 from service.scheduling.packing import Capacity, Grant, QueuedJob
 from service.scheduling.running import RunningAttempt
 from service.scheduling.scheduler import Holding
+from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -74,16 +75,17 @@ def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Stor
     """Return an attempt that has not started."""
     blobs = BlobFolder(settings.folder, store.inputs, 0)
     artifacts = Artifacts(settings.artifacts_url)
-    return RunningAttempt(held, grant, folder, store, blobs, artifacts, settings, cluster=False)
+    stager = Stager(settings, store, blobs, artifacts, cluster=False)
+    return RunningAttempt(held, grant, folder, settings, store, artifacts, stager)
 
 
 def test_an_attempt_tells_when_it_will_end(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
     held = leased(store, "one")
     attempt = attempt_of(held, Grant(1, ("0",)), settings, store, tmp_path)
     for stage in ("planning", "preparing"):  # the remaining seconds of these stages are not the job's
-        attempt._take_in({"kind": "stage", "stage": stage, "seconds_left": 3.0})
+        attempt._handle({"kind": "stage", "stage": stage, "seconds_left": 3.0})
     assert attempt.holding == Holding(attempt.grant)
-    attempt._take_in({"kind": "progress", "step": 1, "total": 2, "seconds_left": 1000.0})
+    attempt._handle({"kind": "progress", "step": 1, "total": 2, "seconds_left": 1000.0})
     told = attempt.holding
     assert told.until is not None
     assert told.until - store.database.clock() == pytest.approx(1000.0, abs=60.0)
@@ -100,7 +102,7 @@ def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: S
     capacity = Capacity(Machine(grant.gpus, 2, 10**11), None)
     assert capacity.free([attempt.grant]) == 0
     for gpu in ("7", "5"):
-        attempt._take_in({"kind": "left-out", "gpus": [gpu]})
+        attempt._handle({"kind": "left-out", "gpus": [gpu]})
     assert attempt.grant == Grant(1, ("6",))
     job = QueuedJob(held.job_id, held.job.queued_at, held.job.parameters, held.job.inputs)
     following = capacity.grant(job, [attempt.grant], 1)
@@ -155,7 +157,7 @@ def test_leases_that_cannot_be_renewed_end_their_jobs_in_time(tmp_path: Path, mo
         """Attempt that runs forever."""
 
         def __init__(self, lease: Lease, grant: Grant, *others: object) -> None:
-            self.lease, self.holding = lease, Holding(grant)
+            self.lease, self.grant, self.holding = lease, grant, Holding(grant)
 
         alive = True
 

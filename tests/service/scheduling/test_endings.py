@@ -10,7 +10,7 @@ import pytest
 
 from service.errors import NoSpaceError, StoreError
 from service.scheduling.attempt_process import failure
-from service.scheduling.endings import OUTAGE, Ending, Message, Wish, attempt_ending, is_outage
+from service.scheduling.endings import OUTAGE, Ending, Message, StopRequest, attempt_ending, is_outage
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import (
     ClusterAwayError,
@@ -25,30 +25,36 @@ DONE: Message = {"kind": "done", "result": {"steps": 3}}
 INTERRUPTED: Message = {"kind": "interrupted"}
 ERROR = {"code": "diverged", "message": "The loss is not finite."}
 FAILED: Message = {"kind": "failed", "error": ERROR, "permanent": True}
-WISHES = [None, Wish.CANCEL, Wish.RELEASE]
+REQUESTS = [None, StopRequest.CANCEL, StopRequest.RELEASE]
 
 
-def ending(wish: Wish | None, last: Message | None, code: int = 0, log: str | None = "the log", **has: bool) -> Ending:
-    return attempt_ending(wish, last, code, log, **{"has_result": True, **has})
+def ending(
+    requested: StopRequest | None, last: Message | None, code: int = 0, log: str | None = "the log", **has: bool
+) -> Ending:
+    return attempt_ending(requested, last, code, log, **{"has_result": True, **has})
 
 
-@pytest.mark.parametrize("wish", WISHES)
-def test_who_is_done_has_succeeded_even_if_the_end_was_wanted(wish: Wish | None) -> None:
-    assert ending(wish, DONE) == Ending(AttemptOutcome.SUCCEEDED)
+@pytest.mark.parametrize("requested", REQUESTS)
+def test_who_is_done_has_succeeded_even_if_the_end_was_wanted(requested: StopRequest | None) -> None:
+    assert ending(requested, DONE) == Ending(AttemptOutcome.SUCCEEDED)
 
 
-@pytest.mark.parametrize("wish", WISHES)
-def test_without_a_result_nobody_has_succeeded(wish: Wish | None) -> None:
-    found = ending(wish, DONE, has_result=False)
+@pytest.mark.parametrize("requested", REQUESTS)
+def test_without_a_result_nobody_has_succeeded(requested: StopRequest | None) -> None:
+    found = ending(requested, DONE, has_result=False)
     assert (found.outcome, found.permanent) == (AttemptOutcome.FAILED, False)
     assert found.error == {"code": "internal", "message": "The job ended without a result."}
 
 
-@pytest.mark.parametrize(("wish", "outcome"), [(Wish.CANCEL, "canceled"), (Wish.RELEASE, "released")])
+@pytest.mark.parametrize(
+    ("requested", "outcome"), [(StopRequest.CANCEL, "canceled"), (StopRequest.RELEASE, "released")]
+)
 @pytest.mark.parametrize("last", [INTERRUPTED, FAILED, None])
 @pytest.mark.parametrize("code", [0, 1, -signal.SIGKILL])
-def test_an_end_that_was_wanted_is_no_failure(wish: Wish, outcome: str, last: Message | None, code: int) -> None:
-    assert ending(wish, last, code) == Ending(AttemptOutcome(outcome))
+def test_an_end_that_was_wanted_is_no_failure(
+    requested: StopRequest, outcome: str, last: Message | None, code: int
+) -> None:
+    assert ending(requested, last, code) == Ending(AttemptOutcome(outcome))
 
 
 def test_on_a_cluster_a_process_that_ray_ended_is_an_outage() -> None:

@@ -1,4 +1,4 @@
-"""Tests of how jobs share a machine's GPUs, with the real database and dispatcher on simulated machines."""
+"""Tests of how jobs share a machine's GPUs, with a real database and simulated machines."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import event, select
 
-from service.scheduling.dispatcher import Dispatcher
+from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Capacity, Grant, QueuedJob
 from service.scheduling.scheduler import Holding
+from service.scheduling.selection import JobSelector
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -32,14 +33,15 @@ def machine(gpus: int, **more: Any) -> Machine:
 
 
 class Queue:
-    """Database with jobs, and a dispatcher that decides which jobs to start, but does not run them."""
+    """Database with jobs, and the selector of a dispatcher on a simulated machine; no job runs."""
 
-    def __init__(self, folder: Path, gpus: int, parallel_jobs: int | None = None) -> None:
+    def __init__(self, folder: Path, gpus: int, parallel_jobs: int | None = None, name: str = "here") -> None:
         self.now = 1_000_000.0
-        settings = ServiceSettings(data=folder, parallel_jobs=parallel_jobs)
+        settings = ServiceSettings(data=folder)
         self.store = open_store(settings, lambda: self.now)
         self.store.inputs.add_blob(SHA, "aa/blob", 3)
-        self.dispatcher = Dispatcher(settings, self.store, machine(gpus))
+        capacity, clocks = Capacity(machine(gpus), parallel_jobs), ClockWatch(self.store, settings.lease_seconds)
+        self.selector = JobSelector(name, self.store, capacity, clocks)
         self.held: dict[str, Grant] = {}
         #: Expected ends of jobs that report progress; `pace` is their duration relative to the estimate.
         self.ends: dict[str, float] = {}
@@ -61,7 +63,7 @@ class Queue:
     def start(self) -> list[str]:
         """Start the jobs that fit, as the dispatcher does; return their ids in order."""
         started = []
-        while (found := self.dispatcher.lease_next_job(self.holdings())) is not None:
+        while (found := self.selector.lease_next_job(self.holdings())) is not None:
             lease, grant = found
             self.held[lease.job_id] = grant
             started.append(lease.job_id)
@@ -148,8 +150,7 @@ def test_a_big_job_waits_for_its_gpus_and_nothing_overtakes_it(eight: Queue) -> 
 
 
 def test_a_big_job_holds_up_one_machine_and_not_all(tmp_path: Path) -> None:
-    here, there = (Queue(tmp_path, gpus=8) for _ in range(2))
-    there.dispatcher.name = "there"
+    here, there = (Queue(tmp_path, gpus=8, name=name) for name in ("here", "there"))
     running = [here.add(workers=1), here.add(workers=1)]
     assert [*here.start(), *there.start()] == running
     big, *small = [here.add(workers=workers) for workers in (8, 1, 1, 1)]
@@ -215,10 +216,9 @@ def test_a_kept_job_waits_no_longer_than_was_foreseen_at_first(eight: Queue) -> 
 
 def test_the_machine_that_has_room_first_keeps_it(tmp_path: Path) -> None:
     """A machine whose capacity is freed late leaves a large job to others until the job has waited long enough."""
-    late, soon = (Queue(tmp_path, gpus=8) for _ in range(2))
-    soon.dispatcher.name = "soon"
+    late, soon = (Queue(tmp_path, gpus=8, name=name) for name in ("late", "soon"))
     for queue in (late, soon):
-        queue.store.operations.beat(queue.dispatcher.name, 8, 0)
+        queue.store.operations.beat(queue.selector.dispatcher, 8, 0)
     running = [late.add("a", workers=1) for _ in range(14)]
     soon.now = late.now
     for queue, some in ((late, running[:7]), (soon, running[7:])):
@@ -235,7 +235,7 @@ def test_the_machine_that_has_room_first_keeps_it(tmp_path: Path) -> None:
     assert kept_for(soon) == []
     soon.now = late.now = late.now + 60
     for queue in (late, soon):
-        queue.store.operations.beat(queue.dispatcher.name, 8, 0)
+        queue.store.operations.beat(queue.selector.dispatcher, 8, 0)
     assert late.start() == []
     assert soon.start() == []
     assert kept_for(soon) == [big]
@@ -267,7 +267,7 @@ def test_dispatchers_share_the_queue(eight: Queue) -> None:
     for name in ("here", "there"):
         eight.store.operations.beat(name, 8, 8)
     first, _ = eight.add(), eight.add()
-    found = eight.dispatcher.lease_next_job([])
+    found = eight.selector.lease_next_job([])
     assert found is not None
     assert (found[0].job_id, found[1].ranks) == (first, 8), "the other job is for the other dispatcher"
 

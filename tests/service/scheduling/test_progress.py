@@ -10,7 +10,7 @@ import pytest
 
 from service.scheduling import attempt_process
 from service.scheduling.attempt_process import tell_planning, tell_prepared, tell_progress
-from service.scheduling.running import progress_record, progress_seconds
+from service.scheduling.progress import progress_record, progress_seconds
 from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.stylizing.loop import Progress
 from worker.description import Prepared

@@ -14,7 +14,7 @@ from service import fsck
 from service.files import blobs
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
-from service.scheduling import strays
+from service.scheduling import housekeeping
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import ROOT
@@ -49,7 +49,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ServiceSettings
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "data"))
     open_store(ServiceSettings()).close()
     subprocess.run([sys.executable, "-c", _WORK], check=True, cwd=ROOT)
-    for module, name in ((blobs, "_ORPHAN_SECONDS"), (strays, "_STRAY_SECONDS"), (fsck, "_ORPHAN_SECONDS")):
+    for module, name in ((blobs, "_ORPHAN_SECONDS"), (housekeeping, "_STRAY_SECONDS"), (fsck, "_ORPHAN_SECONDS")):
         monkeypatch.setattr(module, name, -3600.0)
     return ServiceSettings()
 
@@ -63,7 +63,7 @@ def collect(settings: ServiceSettings) -> bool:
     """Open the database, delete unreferenced files, and return whether a rollback was detected."""
     store = open_store(settings)
     BlobFolder(settings.folder, store.inputs, 0).collect()
-    strays.remove_strays(store, Artifacts(settings.artifacts_url))
+    housekeeping.remove_strays(store, Artifacts(settings.artifacts_url))
     rolled_back = store.database.rolled_back
     store.close()
     return rolled_back

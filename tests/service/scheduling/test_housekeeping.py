@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from service.files.artifacts import Artifacts
-from service.scheduling import strays
+from service.scheduling import housekeeping
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -45,8 +45,8 @@ def test_what_comes_too_late_is_found(tmp_path: Path, monkeypatch: pytest.Monkey
     before, own = put(running.job_id, 1), put(running.job_id, 2)
     everything = {file.location for file in (kept, late, unknown, before, own)}
     assert set(artifacts.objects.below("")) == everything
-    assert strays.remove_strays(store, artifacts) == 0, "rows may still be on their way"
-    monkeypatch.setattr(strays, "_STRAY_SECONDS", -60.0)
-    assert strays.remove_strays(store, artifacts) == 3
+    assert housekeeping.remove_strays(store, artifacts) == 0, "rows may still be on their way"
+    monkeypatch.setattr(housekeeping, "_STRAY_SECONDS", -60.0)
+    assert housekeeping.remove_strays(store, artifacts) == 3
     assert set(artifacts.objects.below("")) == {kept.location, own.location}
     store.close()
