@@ -21,10 +21,10 @@ UNSTYLIZED = "unstylized"
 
 
 def judged(judge: Judge, sh_dc: Tensor) -> dict[str, float]:
-    """Return the judgment of colors [N, 3]."""
+    """Return the judgment of colors [N, 3], without measures that no view allows."""
     judgment = judge.judge(sh_dc)
     assert judgment is not None, "no view can be judged: give more cameras, or larger views"
-    return asdict(judgment)
+    return {name: value for name, value in asdict(judgment).items() if value is not None}
 
 
 def compare_rows(

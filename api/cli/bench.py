@@ -141,8 +141,8 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 
 def quality_table(quality: Quality) -> Table:
     """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
-    figures = ("style", "color_distance", "content", "features", "background_sensitivity", "saturated")
-    columns = (*figures, "short RMSE", "long RMSE", "remaining loss", "steps")
+    figures = ("style", "interior_style", "sliced_features", "color_distance", "content", "features")
+    columns = (*figures, "background_sensitivity", "saturated", "short RMSE", "long RMSE", "remaining loss", "steps")
     table = Table(
         Column("", no_wrap=True),
         *columns,
@@ -153,7 +153,7 @@ def quality_table(quality: Quality) -> Table:
         one = outcome.judgment
         table.add_row(
             outcome.name + (" *" if outcome in front else ""),
-            f"{one.style:.3f}",
+            *(_number(value) for value in (one.style, one.interior_style, one.sliced_features)),
             f"{one.color_distance:.0f}",
             *(f"{value:.3f}" for value in (one.content, one.features, one.background_sensitivity)),
             f"{one.saturated:.1%}",

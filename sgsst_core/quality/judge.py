@@ -4,7 +4,8 @@ A job's own loss cannot show whether its result is good, because the job minimiz
 features of AlexNet (the network of LPIPS). Their Gram matrices measure how close textures are to the style; their
 change measures the loss of content. Color statistics measure how close colors are to the style. Only pixels covered by
 Gaussians count. Every view is judged on a black and on a white background, because the background of an object scan is
-arbitrary.
+arbitrary. Features near a silhouette see the background as well; `interior_style` and `sliced_features` therefore use
+only features whose whole receptive field lies inside the object.
 """
 
 from __future__ import annotations
@@ -38,6 +39,12 @@ JUDGED_SIDE = 1024
 _BEHIND = (0.0, 1.0)
 #: Minimum coverage of judged views.
 _LEAST_COVERAGE = 1e-3
+#: Minimum coverage of every pixel that an interior feature sees.
+_INTERIOR = 0.9
+#: Minimum number of interior features of a layer. Layers with fewer are left out of a view's interior measures.
+_LEAST_INTERIOR = 64
+#: Number of random directions of the sliced Wasserstein distance, and number of quantiles along each.
+_DIRECTIONS, _QUANTILES = 64, 256
 #: Factor that converts color distances to 8-bit levels.
 _LEVELS = 255.0
 
@@ -55,6 +62,11 @@ class Judgment:
         features: 1 - cosine between AlexNet's features of the stylized and the unstylized scene, averaged over layers.
         background_sensitivity: Absolute difference in `style` between black and white background, averaged over views.
         saturated: Fraction of the Gaussians with a color channel outside [0, 1].
+        interior_style: `style` over features that see no background (see `Lpips.least_coverage`), averaged over layers
+            with enough of them; None if no view has any.
+        sliced_features: Sliced Wasserstein distance of order 1 between these features and the style's (Rabin et al.
+            2011), relative to the style's mean absolute projection, averaged likewise. It compares whole
+            distributions, not only second moments; no job optimizes it.
     """
 
     style: float
@@ -63,6 +75,8 @@ class Judgment:
     features: float
     background_sensitivity: float
     saturated: float
+    interior_style: float | None = None
+    sliced_features: float | None = None
 
 
 class Judge:
@@ -118,11 +132,12 @@ class Judge:
             return None
         sh_dc = sh_dc.detach().to(self._rasterizer.device)
         views = [self._view(camera, sh_dc) for camera in self.cameras]
-        style, color_distance, content, features = (
-            fmean(fmean(one[index] for one in view) for view in views) for index in range(4)
+        style, color_distance, content, features = map(
+            fmean, zip(*(one[:4] for view in views for one in view), strict=True)
         )
         background_sensitivity = fmean(abs(view[0][0] - view[1][0]) for view in views)
-        return Judgment(style, color_distance, content, features, background_sensitivity, saturated(sh_dc))
+        interior = (_mean_of_known([one[index] for view in views for one in view]) for index in (4, 5))
+        return Judgment(style, color_distance, content, features, background_sensitivity, saturated(sh_dc), *interior)
 
     @torch.no_grad()
     def renders(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
@@ -130,8 +145,8 @@ class Judge:
         image, coverage = self._render(sh_dc.detach().to(self._rasterizer.device), camera)
         return [self._on(image, coverage, camera, behind) for behind in _BEHIND]
 
-    def _view(self, camera: Camera, sh_dc: Tensor) -> list[tuple[float, float, float, float]]:
-        """Return (style, color_distance, content, features) of a view, on black and on white background."""
+    def _view(self, camera: Camera, sh_dc: Tensor) -> list[_Measures]:
+        """Return the measures of a view, on black and on white background."""
         image, coverage = self._render(sh_dc, camera)
         before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
         weights = coverage.to(self._lpips.device)
@@ -147,6 +162,7 @@ class Judge:
                     sum(fraction * judge.color_distance(stylized, part) for judge, part, fraction in parts),
                     _weighted_mean(distance, weights),
                     fmean(_change_of_direction(x, y, weights) for x, y in zip(own, theirs, strict=True)),
+                    *_interior(own, parts),
                 )
             )
         return found
@@ -181,6 +197,41 @@ class Judge:
         return [(judge, fraction, own / sum(sums)) for judge, fraction, own in parts if own > 0]
 
 
+#: Style, color distance, content, features, interior style and sliced features of one image.
+_Measures = tuple[float, float, float, float, float | None, float | None]
+
+
+def _interior(
+    features: list[Tensor], parts: list[tuple[_StyleJudge, Tensor, float]]
+) -> tuple[float | None, float | None]:
+    """Return `interior_style` and `sliced_features` of an image, averaged over the regions that have interior features.
+
+    Args:
+        features: Features [h, w, c] of the image, by layer.
+        parts: Judge, position weights [H, W] and fraction of the area of each region.
+    """
+    found = [(judge.interior(features, part), fraction) for judge, part, fraction in parts]
+    known = [(pair, fraction) for pair, fraction in found if pair is not None]
+    total = sum(fraction for _, fraction in known)
+    if not known:
+        return None, None
+    gram, sliced = (sum(fraction * pair[index] for pair, fraction in known) / total for index in range(2))
+    return gram, sliced
+
+
+@dataclass(frozen=True)
+class _LayerTarget:
+    """A style's features of one layer.
+
+    Attributes:
+        gram: Gram matrix [c, c].
+        quantiles: Quantiles of the features along random directions, [_QUANTILES, _DIRECTIONS].
+    """
+
+    gram: Tensor
+    quantiles: Tensor
+
+
 class _StyleJudge:
     """Judge that compares images with one style."""
 
@@ -188,7 +239,7 @@ class _StyleJudge:
         self._lpips = lpips
         self._style = style.map(lambda image: image.to(lpips.device, torch.float32))
         self._colors = style_moments(self._style)
-        self._targets: dict[tuple[int, int], list[Tensor]] = {}
+        self._targets: dict[tuple[int, int], list[_LayerTarget]] = {}
 
     def color_distance(self, image: Tensor, weights: Tensor) -> float:
         """Return the Frechet distance of the colors of an image [H, W, 3] with position weights [H, W]."""
@@ -201,32 +252,52 @@ class _StyleJudge:
             features: Features [h, w, c] of the image, by layer.
             weights: Position weights [H, W].
         """
-        targets = self._grams((int(weights.shape[0]), int(weights.shape[1])))
-        distances = []
-        for values, target in zip(features, targets, strict=True):
-            gram = _gram(values, _pooled(weights, values))
-            distances.append(float((gram - target).norm() / target.norm().clamp_min(torch.finfo(target.dtype).tiny)))
-        return fmean(distances)
+        targets = self._layers((int(weights.shape[0]), int(weights.shape[1])))
+        return fmean(
+            _relative(_gram(values, _pooled(weights, values)), target.gram)
+            for values, target in zip(features, targets, strict=True)
+        )
 
-    def _grams(self, view: tuple[int, int]) -> list[Tensor]:
-        """Return the style's Gram matrices for a view size.
+    def interior(self, features: list[Tensor], coverage: Tensor) -> tuple[float, float] | None:
+        """Return the Gram and the sliced Wasserstein distance over interior features; None if there are too few.
 
-        Style images are resized as in the loss, but not below AlexNet's minimum size.
+        Args:
+            features: Features [h, w, c] of the image, by layer.
+            coverage: Coverage [H, W] of the object or of the region.
         """
+        targets = self._layers((int(coverage.shape[0]), int(coverage.shape[1])))
+        found = []
+        for values, least, target in zip(features, self._lpips.least_coverage(coverage), targets, strict=True):
+            inside = values[least >= _INTERIOR][None]  # [1, n, c]
+            if inside.shape[1] >= _LEAST_INTERIOR:
+                ones = torch.ones(inside.shape[:2], device=inside.device)
+                sliced = _relative_difference(_quantiles(inside, ones), target.quantiles)
+                found.append((_relative(_gram(inside, ones), target.gram), sliced))
+        return (fmean(gram for gram, _ in found), fmean(sliced for _, sliced in found)) if found else None
+
+    def _layers(self, view: tuple[int, int]) -> list[_LayerTarget]:
+        """Return the style's features of each layer for a view size."""
         if view not in self._targets:
-            every = [self._grams_of(image, view) for image in self._style.images]
-            self._targets[view] = [
-                reduce(operator.add, [weight * gram for gram, weight in zip(grams, self._style.weights, strict=True)])
-                for grams in zip(*every, strict=True)
-            ]
+            every = [self._features(image, view) for image in self._style.images]
+            self._targets[view] = [self._target(layers) for layers in zip(*every, strict=True)]
         return self._targets[view]
 
-    def _grams_of(self, image: Tensor, view: tuple[int, int]) -> list[Tensor]:
-        """Return the Gram matrices of one style image."""
+    def _features(self, image: Tensor, view: tuple[int, int]) -> list[Tensor]:
+        """Return the features of one style image, resized as in the loss, but not below AlexNet's minimum size."""
         height, width = style_size((image.shape[0], image.shape[1]), view)
         enlarged = max(1.0, self._lpips.minimum_side / min(height, width))
-        features = self._lpips.features(resize_area(image, (round(height * enlarged), round(width * enlarged))))
-        return [_gram(x, torch.ones(x.shape[:2], device=x.device)) for x in features]
+        return self._lpips.features(resize_area(image, (round(height * enlarged), round(width * enlarged))))
+
+    def _target(self, layers: tuple[Tensor, ...]) -> _LayerTarget:
+        """Return the weighted mean of the style images' features [h, w, c] of one layer."""
+        parts = list(zip(layers, self._style.weights, strict=True))
+        ones = [torch.ones(x.shape[:2], device=x.device) for x in layers]
+        gram = reduce(operator.add, [weight * _gram(x, one) for (x, weight), one in zip(parts, ones, strict=True)])
+        together = torch.cat([x.flatten(0, 1) for x in layers])[None]
+        weights = torch.cat(
+            [(weight / one.numel() * one).flatten() for (_, weight), one in zip(parts, ones, strict=True)]
+        )
+        return _LayerTarget(gram, _quantiles(together, weights[None]))
 
 
 def saturated(sh_dc: Tensor) -> float:
@@ -265,6 +336,37 @@ def _gram(features: Tensor, weights: Tensor) -> Tensor:
     flat = features.flatten(0, 1)
     weighted = flat * weights.reshape(-1, 1).to(flat)
     return (weighted.T @ flat).double() / weights.sum(dtype=torch.float64)
+
+
+def _relative(gram: Tensor, target: Tensor) -> float:
+    """Return the distance of two Gram matrices relative to the target's norm."""
+    return float((gram - target).norm() / target.norm().clamp_min(torch.finfo(target.dtype).tiny))
+
+
+def _quantiles(features: Tensor, weights: Tensor) -> Tensor:
+    """Return the quantiles of features [h, w, c] with weights [h, w] along fixed random directions.
+
+    Returns:
+        Quantiles [_QUANTILES, _DIRECTIONS] float64, at the midpoints of equal fractions.
+    """
+    generator = torch.Generator().manual_seed(0)
+    directions = F.normalize(torch.randn(features.shape[2], _DIRECTIONS, generator=generator), dim=0)
+    ordered, order = (features.flatten(0, 1) @ directions.to(features)).sort(dim=0)
+    cumulative = weights.flatten().double()[order].cumsum(0)
+    fractions = (torch.arange(_QUANTILES, dtype=torch.float64, device=features.device) + 0.5) / _QUANTILES
+    wanted = (fractions[:, None] * cumulative[-1]).T.contiguous()
+    indices = torch.searchsorted(cumulative.T.contiguous(), wanted).T
+    return ordered.gather(0, indices.clamp_max(len(ordered) - 1)).double()
+
+
+def _relative_difference(quantiles: Tensor, target: Tensor) -> float:
+    """Return the mean difference of quantiles, relative to the target's mean absolute value."""
+    return float((quantiles - target).abs().mean() / target.abs().mean().clamp_min(torch.finfo(target.dtype).tiny))
+
+
+def _mean_of_known(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
 
 
 def _change_of_direction(x: Tensor, y: Tensor, coverage: Tensor) -> float:

@@ -29,6 +29,8 @@ LpipsNetwork = Literal["alex", "vgg16"]
 _VGG16_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
 #: (stride, padding) of AlexNet's convolutions (Krizhevsky 2014, the one-tower version of torchvision).
 _ALEX_CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
+#: Kernel sizes of these convolutions.
+_ALEX_KERNELS = (11, 5, 3, 3, 3)
 #: Convolutions of AlexNet that follow a 3x3 max pool of stride 2, counted from 1.
 _ALEX_POOLED = (2, 3)
 #: Minimum length in pixels of the shorter side. On smaller images, the output of the deepest layer is empty.
@@ -111,6 +113,23 @@ class Lpips:
         The sides of the image must be at least `minimum_side`.
         """
         return self._layers(image.to(self.device, self.dtype))
+
+    def least_coverage(self, coverage: Tensor) -> list[Tensor]:
+        """Return the smallest coverage inside the receptive field of each feature of AlexNet.
+
+        Args:
+            coverage: Coverage [H, W] of an image's pixels. Beyond the image's border, nothing counts.
+
+        Returns:
+            Minimum [h, w] for each of the five layers, at the positions of `features`.
+        """
+        hidden, minima = -coverage.to(self.device, self.dtype)[None, None], []
+        for layer, (stride, padding) in enumerate(_ALEX_CONVOLUTIONS, start=1):
+            if layer in _ALEX_POOLED:
+                hidden = F.max_pool2d(hidden, 3, 2)
+            hidden = F.max_pool2d(hidden, _ALEX_KERNELS[layer - 1], stride, padding)
+            minima.append(-hidden[0, 0])
+        return minima
 
     def between(self, first: list[Tensor], second: list[Tensor], size: tuple[int, int]) -> PerceptualDistance:
         """Compute the distance between two images of size (height, width) from their `features`."""

@@ -64,6 +64,8 @@ def novel_views_table(report: dict[str, Any]) -> Table | None:
 #: Title and text format of each measure in the judgment of a result.
 _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "style": ("distance to the style", number),
+    "interior_style": ("distance to the style, away from the background", number),
+    "sliced_features": ("distance of feature distributions", number),
     "color_distance": ("distance to its colors, in 8-bit levels", number),
     "content": ("content loss (LPIPS)", number),
     "features": ("feature distance (1 - cosine)", number),

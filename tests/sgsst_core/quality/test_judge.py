@@ -19,7 +19,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import resize_area
+from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.style import Style
@@ -132,8 +132,67 @@ def test_extreme_styles_give_finite_figures(alex: Lpips, picture: Tensor) -> Non
     """The styles are a single pixel, a black image without variance, and a line."""
     scene = ball()
     found = judged(judge_of(alex, scene, cameras(1), picture), torch.full_like(scene.sh_dc, -50.0))
-    assert all(np.isfinite(value) for value in vars(found).values())
+    assert all(value is None or np.isfinite(value) for value in vars(found).values())
     assert found.saturated == 1
+
+
+def test_interior_features_are_those_that_see_no_background(alex: Lpips) -> None:
+    """A change of uncovered pixels changes every other feature of a layer, and none inside."""
+    generator = torch.Generator().manual_seed(5)
+    image, other = torch.rand(2, 200, 240, 3, generator=generator)
+    coverage = torch.zeros(200, 240)
+    coverage[10:190, 20:210] = 1
+    changed = torch.where(coverage[..., None] > 0, image, other)
+    for layer, least in enumerate(alex.least_coverage(coverage)):
+        difference = (alex.features(image)[layer] - alex.features(changed)[layer]).abs().amax(dim=2)
+        assert least.shape == difference.shape
+        assert bool((least == 1).any())
+        assert bool((difference[least == 1] == 0).all())
+        if layer == 0:  # deeper, a change may vanish in a maximum
+            assert bool((difference[least < 1] > 0).all())
+
+
+def test_interior_measures_agree_with_plain_formulas(alex: Lpips) -> None:
+    """A wall that covers its views has interior features; weights of a mixture count pixels, not images."""
+    scene, view = wall(), cameras(1, 240, 180)[0]
+    pictures = (style(), style().flip(0).flip(2))
+    judge = judge_of(alex, scene, [view], Style(pictures, (0.75, 0.25)))  # type: ignore[arg-type]
+    found = judged(judge, scene.sh_dc)
+    lpips, renders = Lpips(dtype=torch.float64), judge.renders(scene.sh_dc, view)
+    coverage = CpuRasterizer(scene).coverage(view)
+    grams, sliced = [], []
+    for image in renders:
+        wanted = [
+            lpips.features(resize_area(one, style_size((one.shape[0], one.shape[1]), (180, 240)))) for one in pictures
+        ]
+        for layer, (own, least) in enumerate(zip(lpips.features(image), lpips.least_coverage(coverage), strict=True)):
+            inside = own[least >= 0.9].numpy()
+            if len(inside) < 64:
+                continue
+            theirs = [one[layer].flatten(0, 1).numpy() for one in wanted]
+            target = sum(w * x.T @ x / len(x) for x, w in zip(theirs, (0.75, 0.25), strict=True))
+            grams.append(np.linalg.norm(inside.T @ inside / len(inside) - target) / np.linalg.norm(target))
+            random = torch.randn(inside.shape[1], 64, generator=torch.Generator().manual_seed(0))
+            axes = F.normalize(random, dim=0).double().numpy()
+            mass = np.concatenate([np.full(len(x), w / len(x)) for x, w in zip(theirs, (0.75, 0.25), strict=True)])
+            difference, size = 0.0, 0.0
+            for axis in axes.T:
+                levels = (np.arange(256) + 0.5) / 256
+                first = np.quantile(inside @ axis, levels, method="inverted_cdf")
+                second = np.quantile(
+                    np.concatenate([x @ axis for x in theirs]), levels, method="inverted_cdf", weights=mass
+                )
+                difference, size = difference + np.abs(first - second).mean(), size + np.abs(second).mean()
+            sliced.append(difference / size)
+    assert len(grams) >= 6
+    assert found.interior_style == pytest.approx(np.mean(grams), rel=1e-4)
+    assert found.sliced_features == pytest.approx(np.mean(sliced), rel=1e-3)
+
+
+def test_objects_smaller_than_receptive_fields_have_no_interior_measures(alex: Lpips) -> None:
+    found = judged(judge_of(alex, ball(), cameras(1)), ball().sh_dc)
+    assert found.interior_style is None
+    assert found.sliced_features is None
 
 
 def test_frechet_distance_of_known_distributions() -> None:
