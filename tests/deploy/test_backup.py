@@ -76,7 +76,7 @@ def lose(service: Service) -> None:
 
 
 @pytest.mark.parametrize("kind", ["local", "servers"])
-def test_jobs_go_on_after_a_restore(kind: str, tmp_path: Path, tiny_installed: Path, request: Any) -> None:
+def test_jobs_continue_after_a_restore(kind: str, tmp_path: Path, tiny_installed: Path, request: Any) -> None:
     before: dict[str, Any] = {}
     after: dict[str, Any] = {}
     if kind == "servers":
@@ -116,7 +116,7 @@ def test_jobs_go_on_after_a_restore(kind: str, tmp_path: Path, tiny_installed: P
         assert "resum" in log.lower() or "goes on" in log.lower(), log
 
 
-def test_a_folder_without_a_backup_is_refused(tmp_path: Path) -> None:
+def test_restore_refuses_a_folder_without_a_backup(tmp_path: Path) -> None:
     ended = backup({"SGSST_DATA": str(tmp_path / "data")}, "restore", tmp_path)
     assert ended.returncode == 1
     assert "holds no backup" in ended.stderr

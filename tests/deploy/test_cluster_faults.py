@@ -33,7 +33,7 @@ def networks() -> set[str]:
     return {name for text in said for name in re.findall(r"sgsst\d[\w-]*", text)}
 
 
-def test_no_fault_of_a_machine_loses_a_job(folder: Path, vgg16_weights: BackboneWeights) -> None:
+def test_host_faults_lose_no_job(folder: Path, vgg16_weights: BackboneWeights) -> None:
     for module in ("moto.server", "psycopg", "s3fs"):
         pytest.importorskip(module, reason=f"{module} is not installed: see the extra [dev]")
     if reason := cluster_hosts.missing() or missing():

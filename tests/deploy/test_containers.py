@@ -142,7 +142,7 @@ def expected(files: tuple[Path, Path, Path], steps: int, cache: Path, out: Path)
     return out.read_bytes()
 
 
-def test_the_image_is_small_and_has_no_rights(podman: Containers) -> None:
+def test_image_is_small_and_unprivileged(podman: Containers) -> None:
     (image,) = json.loads(podman.run("podman", "image", "inspect", IMAGE))
     assert image["Size"] < 1_600_000_000
     assert image["Config"]["User"] == "10001:10001"
@@ -155,7 +155,7 @@ def test_the_image_is_small_and_has_no_rights(podman: Containers) -> None:
     assert podman.run(*inside, "ls /opt/sgsst/lib/python3*/site-packages/api/http/__pycache__ | grep -c server").strip()
 
 
-def test_submit_from_outside_gives_what_stylize_gives(
+def test_submit_to_container_equals_stylize(
     composed: Composed, files: tuple[Path, Path, Path], tiny_cache: Path, tmp_path: Path
 ) -> None:
     ply, cameras, style = files
@@ -168,11 +168,11 @@ def test_submit_from_outside_gives_what_stylize_gives(
     assert out.read_bytes() == expected(files, 6, tiny_cache, tmp_path / "expected.ply")
 
 
-def test_without_a_key_nobody_gets_in(composed: Composed) -> None:
+def test_container_requires_a_key(composed: Composed) -> None:
     assert httpx.get(f"{composed.url}/v1/jobs").status_code == 401
 
 
-def test_health_is_that_of_the_process(composed: Composed) -> None:
+def test_container_health_follows_its_process(composed: Composed) -> None:
     for service in ("api", "dispatcher"):
         inspected = composed.podman.run("podman", "inspect", composed.name(service))
         # run directly: `podman healthcheck run` uses the file's timeout, which may be too short on a busy machine
@@ -201,7 +201,7 @@ def seen(look: Callable[[], bool], composed: Composed, what: str) -> None:
 
 
 @pytest.mark.parametrize("victims", [("dispatcher", "api"), ("database", "store")])
-def test_a_job_by_curl_outlives_its_containers(
+def test_job_survives_restarts_of_its_containers(
     composed: Composed, victims: tuple[str, ...], files: tuple[Path, Path, Path], tiny_cache: Path, tmp_path: Path
 ) -> None:
     if "store" in victims and "moto" in composed.podman.run("podman", "exec", composed.name("store"), "ls", "/opt"):

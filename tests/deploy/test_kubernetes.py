@@ -75,7 +75,7 @@ def containers(overlay: str) -> list[dict[str, Any]]:
 
 
 @each_overlay
-def test_manifests_keep_to_the_schemas(overlay: str) -> None:
+def test_manifests_match_their_schemas(overlay: str) -> None:
     validate = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate is missing: see the extra [dev]")
     cluster_schema = json.loads(gzip.decompress(SCHEMA.read_bytes()))
     # the schema is that of a custom resource; Kubernetes adds the members common to all objects
@@ -88,7 +88,7 @@ def test_manifests_keep_to_the_schemas(overlay: str) -> None:
 
 
 @each_overlay
-def test_a_mistake_is_one_to_the_schemas(overlay: str) -> None:
+def test_schemas_reject_mistakes(overlay: str) -> None:
     validate = pytest.importorskip("kubernetes_validate", reason="kubernetes-validate is missing: see the extra [dev]")
     (cluster,) = of_kind(overlay, "RayCluster")
     cluster["spec"]["headGroupSpec"]["template"]["spec"]["container"] = []
@@ -101,7 +101,7 @@ def test_a_mistake_is_one_to_the_schemas(overlay: str) -> None:
 
 
 @each_overlay
-def test_pods_have_no_rights_and_know_their_size(overlay: str) -> None:
+def test_pods_are_unprivileged_and_have_resource_limits(overlay: str) -> None:
     for pod in pods(overlay):
         assert pod["spec"]["securityContext"]["runAsNonRoot"] is True
         assert pod["spec"]["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
@@ -121,7 +121,7 @@ def test_pods_have_no_rights_and_know_their_size(overlay: str) -> None:
 
 
 @each_overlay
-def test_no_container_but_the_autoscaler_has_a_token_of_kubernetes(overlay: str) -> None:
+def test_only_the_autoscaler_has_a_kubernetes_token(overlay: str) -> None:
     accounts = of_kind(overlay, "ServiceAccount")
     assert accounts
     for account in accounts:
@@ -160,7 +160,7 @@ def selected(overlay: str, policy: str) -> set[str]:
 
 
 @each_overlay
-def test_only_the_api_can_be_reached(overlay: str) -> None:
+def test_only_the_api_accepts_connections_from_outside(overlay: str) -> None:
     policies = policies_of(overlay)
     everything = {pod["metadata"]["labels"]["app.kubernetes.io/name"] for pod in pods(overlay)}
     assert selected(overlay, "sgsst-nobody") == everything
@@ -177,7 +177,7 @@ def test_only_the_api_can_be_reached(overlay: str) -> None:
 
 
 @each_overlay
-def test_pods_reach_what_they_need_alone(overlay: str) -> None:
+def test_pods_reach_only_what_they_need(overlay: str) -> None:
     """These are DNS, database, file store and Ray's other pods; with an autoscaler, also the Kubernetes API server."""
     policies = {name: spec for name, spec in policies_of(overlay).items() if "egress" in spec}
     (cluster,) = of_kind(overlay, "RayCluster")
@@ -203,7 +203,7 @@ def test_pods_reach_what_they_need_alone(overlay: str) -> None:
             assert credentials_of_the_cloud in block["except"]
 
 
-def test_webhooks_are_a_choice(tmp_path: Path) -> None:
+def test_webhooks_are_an_optional_component(tmp_path: Path) -> None:
     """The component enables webhooks and lets dispatchers reach all ports of public addresses, but no private ones."""
     for overlay in OVERLAYS:
         assert "SGSST_WEBHOOKS" not in rendered(overlay)
@@ -228,7 +228,7 @@ def _holds(block: dict[str, Any], address: str) -> bool:
     return found in networks[0] and not any(found in network for network in networks[1:])
 
 
-def test_images_can_be_named_by_their_digests(tmp_path: Path) -> None:
+def test_images_can_be_pinned_by_digest(tmp_path: Path) -> None:
     digest = "sha256:" + 64 * "a"
 
     def pin(overlay: dict[str, Any]) -> None:
@@ -253,7 +253,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[dict
 
 
 @each_overlay
-def test_ray_asks_for_a_token_and_is_of_the_version_that_is_installed(overlay: str) -> None:
+def test_ray_requires_a_token_and_matches_the_installed_version(overlay: str) -> None:
     (cluster,) = of_kind(overlay, "RayCluster")
     assert cluster["spec"]["authOptions"] == {"mode": "token", "secretName": "sgsst-ray"}
     assert cluster["spec"]["rayVersion"] == version("ray")
@@ -268,7 +268,7 @@ def test_ray_asks_for_a_token_and_is_of_the_version_that_is_installed(overlay: s
     assert {"name": "RAY_ADDRESS", "value": name} in process["env"]
 
 
-def test_gpus_that_dispatchers_give_out_are_those_that_there_can_be() -> None:
+def test_dispatchers_assign_no_more_gpus_than_the_cluster_has() -> None:
     (cluster,) = of_kind("gpu", "RayCluster")
     (group,) = cluster["spec"]["workerGroupSpecs"]
     (worker,) = group["template"]["spec"]["containers"]
@@ -284,7 +284,7 @@ def test_gpus_that_dispatchers_give_out_are_those_that_there_can_be() -> None:
 
 
 @each_overlay
-def test_settings_and_secrets_are_those_that_the_service_has(overlay: str) -> None:
+def test_settings_and_secrets_exist_in_the_service(overlay: str) -> None:
     (settings,) = of_kind(overlay, "ConfigMap")
     known = {f"SGSST_{name.upper()}" for name in ServiceSettings.model_fields}
     assert {name for name in settings["data"] if name.startswith("SGSST_")} <= known
@@ -300,7 +300,7 @@ def test_settings_and_secrets_are_those_that_the_service_has(overlay: str) -> No
     assert of_kind(overlay, "Secret") == []
 
 
-def test_the_api_stays_up_while_it_is_replaced() -> None:
+def test_api_stays_available_during_updates() -> None:
     (api,) = [each for each in of_kind("gpu", "Deployment") if each["metadata"]["name"] == "sgsst-api"]
     assert api["spec"]["replicas"] == 2
     assert api["spec"]["strategy"]["rollingUpdate"] == {"maxSurge": 1, "maxUnavailable": 0}

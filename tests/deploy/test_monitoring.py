@@ -41,13 +41,13 @@ def promtool(*words: str | Path) -> None:
     assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}"
 
 
-def test_alerts_fire_when_they_should_and_only_then() -> None:
+def test_alerts_fire_only_when_they_should() -> None:
     promtool("check", "rules", MONITORING / "alerts.yaml")
     promtool("test", "rules", MONITORING / "alerts_test.yaml")
     promtool("check", "config", "--syntax-only", MONITORING / "prometheus.yaml")
 
 
-def test_every_alert_is_tested_and_explained() -> None:
+def test_every_alert_is_tested_and_documented() -> None:
     tested = (MONITORING / "alerts_test.yaml").read_text()
     text = OPERATIONS.read_text()
     for name in rules():
@@ -57,14 +57,14 @@ def test_every_alert_is_tested_and_explained() -> None:
         assert f"`{name}`" in text
 
 
-def test_every_query_is_one_that_prometheus_reads(tmp_path: Path) -> None:
+def test_every_query_is_valid(tmp_path: Path) -> None:
     records = [{"record": f"query:{number}", "expr": query} for number, query in enumerate(queries())]
     file = tmp_path / "queries.yaml"
     file.write_text(yaml.safe_dump({"groups": [{"name": "queries", "rules": records}]}))
     promtool("check", "rules", file)
 
 
-def test_every_metric_that_is_read_is_on_metrics(tmp_path: Path) -> None:
+def test_every_queried_metric_is_exported(tmp_path: Path) -> None:
     with Service(tmp_path / "data", alone=True) as service, service.client() as client:
         client.get("/v1/jobs")
         shown = set(re.findall(r"^(sgsst_\w+)", client.get("/metrics").text, flags=re.M))
@@ -75,7 +75,7 @@ def test_every_metric_that_is_read_is_on_metrics(tmp_path: Path) -> None:
     assert {name for name in written if not name.endswith("_")} - shown - {n[: -len("_count")] for n in shown} == set()
 
 
-def test_every_route_that_is_read_is_one() -> None:
+def test_every_queried_route_exists() -> None:
     named = set(re.findall(r'route="([^"]+)"', " ".join(queries())))
     assert named
     assert named <= {route.path for route in jobs.router.routes if isinstance(route, APIRoute)}

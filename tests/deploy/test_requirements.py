@@ -37,7 +37,7 @@ def constraints() -> dict[str, str]:
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_versions_are_those_that_the_tests_run_with(file: str) -> None:
+def test_pinned_versions_equal_the_tested_ones(file: str) -> None:
     tested = constraints()
     found = packages(file)
     assert found
@@ -45,7 +45,7 @@ def test_versions_are_those_that_the_tests_run_with(file: str) -> None:
         assert tested.get(name) == version.partition("+")[0], f"{name}: run deploy/lock.py"
 
 
-def test_the_image_without_gpus_has_no_package_of_cuda() -> None:
+def test_cpu_image_has_no_cuda_packages() -> None:
     assert not cuda_packages() & packages("common").keys()
     assert packages("cpu") == {"torch": f"{constraints()['torch']}+cpu"}
     assert packages("cuda")["torch"] == constraints()["torch"]
@@ -53,7 +53,7 @@ def test_the_image_without_gpus_has_no_package_of_cuda() -> None:
 
 
 @pytest.mark.parametrize("kind", ["cpu", "cuda"])
-def test_nothing_that_is_needed_is_missing(kind: str) -> None:
+def test_requirements_are_complete(kind: str) -> None:
     """Only requirements of packages that are installed here can be checked."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [

@@ -42,7 +42,7 @@ def read(folder: Path) -> dict[str, str]:
     return {name: (folder / name).read_text() for name in SECRETS}
 
 
-def test_passwords_are_generated_once_and_kept(folder: Path) -> None:
+def test_passwords_are_generated_only_once(folder: Path) -> None:
     make_secrets(folder, {})
     first = read(folder)
     assert len(set(first.values())) == len(SECRETS)
@@ -52,7 +52,7 @@ def test_passwords_are_generated_once_and_kept(folder: Path) -> None:
     assert not list(folder.rglob("*.part"))
 
 
-def test_a_password_that_is_given_comes_first(folder: Path) -> None:
+def test_given_password_takes_precedence(folder: Path) -> None:
     make_secrets(folder, {})
     before = read(folder)
     make_secrets(folder, {"SGSST_DATABASE_PASSWORD": r"a:b\c"})
@@ -60,7 +60,7 @@ def test_a_password_that_is_given_comes_first(folder: Path) -> None:
     assert (folder / "database" / "pgpass").read_text() == "database:*:*:sgsst:a\\:b\\\\c\n"
 
 
-def test_files_are_what_the_programs_read(folder: Path) -> None:
+def test_secret_files_have_the_expected_formats(folder: Path) -> None:
     make_secrets(folder, {})
     found = read(folder)
     for name in ("database/pgpass", "store/credentials"):
@@ -73,7 +73,7 @@ def test_files_are_what_the_programs_read(folder: Path) -> None:
     assert identity["credentials"] == [{"accessKey": found["store/key"], "secretKey": found["store/secret"]}]
 
 
-def test_the_compose_file_has_no_password() -> None:
+def test_compose_file_contains_no_password() -> None:
     text = COMPOSE.read_text()
     assert re.findall(r"\$\{\w*(?:PASSWORD|SECRET|KEY)\w*:-[^}]+\}", text) == []
     for name, service in yaml.safe_load(text)["services"].items():

@@ -25,7 +25,7 @@ def missing() -> str | None:
 
 
 @pytest.mark.parametrize("how", ["quiet", "kill"])
-def test_a_job_needs_no_folder_that_machines_share(how: str, tmp_path: Path, vgg16_weights: BackboneWeights) -> None:
+def test_cluster_job_needs_no_shared_folder(how: str, tmp_path: Path, vgg16_weights: BackboneWeights) -> None:
     for module in ("moto.server", "psycopg", "s3fs"):
         pytest.importorskip(module, reason=f"{module} is not installed: see the extra [dev]")
     if reason := problem() or missing():

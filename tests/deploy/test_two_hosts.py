@@ -67,7 +67,7 @@ def assert_removed(network: re.Match[str] | None) -> None:
     assert f"sgsst-{network[1]}" not in left
 
 
-def test_one_job_on_two_hosts_from_a_cold_cache(tmp_path: Path, vgg16_weights: BackboneWeights) -> None:
+def test_job_runs_on_two_hosts_with_cold_caches(tmp_path: Path, vgg16_weights: BackboneWeights) -> None:
     if reason := problem():
         pytest.skip(reason)
     kernels, out = tmp_path / "kernels", tmp_path / "out" / "stylized.ply"

@@ -16,7 +16,7 @@ def artifacts(request: pytest.FixtureRequest, tmp_path: Path) -> Artifacts:
     return Artifacts(f"file://{tmp_path / 'results'}" if request.param == "file" else f"memory://{tmp_path}")
 
 
-def test_a_file_comes_back_whole_and_in_parts(artifacts: Artifacts, tmp_path: Path) -> None:
+def test_artifact_is_read_completely_and_in_ranges(artifacts: Artifacts, tmp_path: Path) -> None:
     source = tmp_path / "stylized.ply"
     source.write_bytes(bytes(range(256)) * 9000)
     put = artifacts.put("job_1", 1, "previews/x.jpg", source)
@@ -29,7 +29,7 @@ def test_a_file_comes_back_whole_and_in_parts(artifacts: Artifacts, tmp_path: Pa
         list(artifacts.read(put.location, 0, put.size + 1))
 
 
-def test_a_file_that_nobody_writes_to_is_not_copied(artifacts: Artifacts, tmp_path: Path) -> None:
+def test_final_file_is_linked_and_others_are_copied(artifacts: Artifacts, tmp_path: Path) -> None:
     source = tmp_path / "checkpoint"
     source.write_bytes(b"first")
     put = artifacts.put("job_1", 1, ".checkpoint", source, final=True)
@@ -41,7 +41,7 @@ def test_a_file_that_nobody_writes_to_is_not_copied(artifacts: Artifacts, tmp_pa
     assert put.sha256 == hashlib.sha256(b"first").hexdigest()
 
 
-def test_where_names_cannot_be_shared_it_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_final_file_is_copied_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(source: object, target: object) -> None:
         raise OSError(errno.EXDEV, "Invalid cross-device link")
 
@@ -54,7 +54,7 @@ def test_where_names_cannot_be_shared_it_is_copied(tmp_path: Path, monkeypatch: 
         Artifacts(f"file://{tmp_path / 'results'}").put("job_1", 1, "stylized.ply", tmp_path / "none", final=True)
 
 
-def test_what_no_row_refers_to_is_swept(artifacts: Artifacts, tmp_path: Path) -> None:
+def test_files_without_rows_are_swept(artifacts: Artifacts, tmp_path: Path) -> None:
     source = tmp_path / "plan.json"
     source.write_bytes(b"{}")
     old, new, later = (artifacts.put("job_1", epoch, "plan.json", source) for epoch in (1, 2, 10))

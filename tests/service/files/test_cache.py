@@ -41,7 +41,7 @@ def cache(tmp_path: Path) -> FileCache:
     return FileCache(tmp_path / "cache", 2500)
 
 
-def test_a_file_is_fetched_once(cache: FileCache, tmp_path: Path) -> None:
+def test_file_is_fetched_once(cache: FileCache, tmp_path: Path) -> None:
     data, sha256 = content(1)
     source = Source(data)
     for name in ("a", "b"):
@@ -52,7 +52,7 @@ def test_a_file_is_fetched_once(cache: FileCache, tmp_path: Path) -> None:
     assert (tmp_path / "a").stat().st_mtime == int(sha256[:8], 16), "its time tells of its content alone"
 
 
-def test_what_was_used_longest_ago_goes_first_and_what_is_in_use_stays(cache: FileCache, tmp_path: Path) -> None:
+def test_least_recently_used_files_are_evicted_unless_in_use(cache: FileCache, tmp_path: Path) -> None:
     found = [content(number) for number in range(5)]
     for number in (0, 1):
         cache.link(found[number][1], 1000, tmp_path / str(number), Source(found[number][0]))
@@ -72,7 +72,7 @@ def test_what_was_used_longest_ago_goes_first_and_what_is_in_use_stays(cache: Fi
     assert files(tmp_path) == {found[3][1], found[4][1]}
 
 
-def test_what_is_damaged_on_the_way_is_fetched_again(cache: FileCache, tmp_path: Path) -> None:
+def test_transfer_error_is_fetched_again(cache: FileCache, tmp_path: Path) -> None:
     data, sha256 = content(1)
     source = Source(b"damaged")
 
@@ -84,7 +84,7 @@ def test_what_is_damaged_on_the_way_is_fetched_again(cache: FileCache, tmp_path:
     assert ((tmp_path / "a").read_bytes(), source.fetched) == (data, 2)
 
 
-def test_what_is_damaged_in_the_store_is_nobodys_file(cache: FileCache, tmp_path: Path) -> None:
+def test_damaged_object_is_not_cached(cache: FileCache, tmp_path: Path) -> None:
     _, sha256 = content(1)
     with pytest.raises(DamagedFileError):
         cache.link(sha256, 1000, tmp_path / "a", Source(b"another"))
@@ -93,7 +93,7 @@ def test_what_is_damaged_in_the_store_is_nobodys_file(cache: FileCache, tmp_path
     assert list((tmp_path / "cache" / "half").iterdir()) == []
 
 
-def test_what_the_hosts_disk_damages_is_fetched_again(cache: FileCache, tmp_path: Path) -> None:
+def test_damaged_cache_entry_is_fetched_again(cache: FileCache, tmp_path: Path) -> None:
     data, sha256 = content(1)
     source = Source(data)
     cache.link(sha256, len(data), tmp_path / "a", source)
@@ -103,7 +103,7 @@ def test_what_the_hosts_disk_damages_is_fetched_again(cache: FileCache, tmp_path
     assert ((tmp_path / "b").read_bytes(), source.fetched) == (data, 2)
 
 
-def test_what_the_store_has_lost_is_its_error(cache: FileCache, tmp_path: Path) -> None:
+def test_lost_object_raises_lost_file_error(cache: FileCache, tmp_path: Path) -> None:
     def fetch(target: Path) -> None:
         raise FileNotFoundError(target)
 
@@ -112,7 +112,7 @@ def test_what_the_store_has_lost_is_its_error(cache: FileCache, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("helps", [True, False])
-def test_a_full_disk_is_freed_of_what_nobody_uses(cache: FileCache, tmp_path: Path, helps: bool) -> None:
+def test_full_disk_evicts_unused_files(cache: FileCache, tmp_path: Path, helps: bool) -> None:
     old, old_sha256 = content(1)
     cache.link(old_sha256, 1000, tmp_path / "old", Source(old))
     (tmp_path / "old").unlink()
@@ -134,7 +134,7 @@ def test_a_full_disk_is_freed_of_what_nobody_uses(cache: FileCache, tmp_path: Pa
     assert old_sha256 not in files(tmp_path)
 
 
-def test_a_file_that_is_handed_over_is_not_copied(cache: FileCache, tmp_path: Path) -> None:
+def test_adopted_file_is_not_copied(cache: FileCache, tmp_path: Path) -> None:
     data, sha256 = content(1)
     for name in ("first", "second"):
         (tmp_path / name).write_bytes(data)
@@ -148,9 +148,7 @@ def test_a_file_that_is_handed_over_is_not_copied(cache: FileCache, tmp_path: Pa
     assert ((tmp_path / "a").stat().st_ino, source.fetched) == (first, 0)
 
 
-def test_half_files_go_by_how_long_they_have_lain(
-    cache: FileCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_old_partial_files_are_removed(cache: FileCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A complete file gets its synthetic time just before it is moved into the cache, and may then seem decades old."""
     half = tmp_path / "cache" / "half" / "0123456789abcdef"
     half.write_bytes(b"whole")
@@ -181,7 +179,7 @@ def _use(folder: str, number: int) -> None:
         target.unlink()
 
 
-def test_processes_share_it(cache: FileCache, tmp_path: Path) -> None:
+def test_processes_share_the_cache(cache: FileCache, tmp_path: Path) -> None:
     spawned = multiprocessing.get_context("spawn")
     processes = [spawned.Process(target=_use, args=(str(tmp_path), number)) for number in range(3)]
     for process in processes:

@@ -56,7 +56,7 @@ def die_at_the_end(service: Service, path: Path, where: str, *, linked: bool) ->
 
 
 @pytest.mark.parametrize("linked", [False, True])
-def test_the_last_part_is_taken_up_again(files: dict[str, Path], tmp_path: Path, linked: bool) -> None:
+def test_last_part_can_be_sent_again(files: dict[str, Path], tmp_path: Path, linked: bool) -> None:
     content = files["scene"].read_bytes()
     with Service(tmp_path / "data", alone=True) as service:
         where = begin(service, files["scene"])
@@ -71,7 +71,7 @@ def test_the_last_part_is_taken_up_again(files: dict[str, Path], tmp_path: Path,
         assert not any((service.data / "uploads").iterdir())
 
 
-def test_a_job_may_name_it_at_once(files: dict[str, Path], tmp_path: Path) -> None:
+def test_job_can_use_the_finished_upload_at_once(files: dict[str, Path], tmp_path: Path) -> None:
     with Service(tmp_path / "data", alone=True) as service:
         where = begin(service, files["scene"])
         die_at_the_end(service, files["scene"], where, linked=True)
@@ -83,7 +83,7 @@ def test_a_job_may_name_it_at_once(files: dict[str, Path], tmp_path: Path) -> No
         assert httpx.get(f"{service.url}{where}").json()["complete"]
 
 
-def test_missing_bytes_do_not_become_zeros(files: dict[str, Path], tmp_path: Path) -> None:
+def test_missing_bytes_are_not_read_as_zeros(files: dict[str, Path], tmp_path: Path) -> None:
     with Service(tmp_path / "data", alone=True) as service:
         where = begin(service, files["scene"])
         part = service.data / "uploads" / f"{where.rsplit('/', 1)[1]}.part"
@@ -93,7 +93,9 @@ def test_missing_bytes_do_not_become_zeros(files: dict[str, Path], tmp_path: Pat
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_the_digest_of_many_parts_is_that_of_the_file(files: dict[str, Path], tmp_path: Path, killed: bool) -> None:
+def test_digest_of_an_upload_in_parts_equals_that_of_its_file(
+    files: dict[str, Path], tmp_path: Path, killed: bool
+) -> None:
     content = files["scene"].read_bytes()
     middle = len(content) // 2
     with Service(tmp_path / "data", alone=True) as service:

@@ -56,7 +56,7 @@ def write(folder: Path, size: int = SIZE) -> Path:
     return path
 
 
-def test_what_is_put_is_read_and_fetched(artifacts: Artifacts, tmp_path: Path) -> None:
+def test_stored_object_is_read_and_fetched(artifacts: Artifacts, tmp_path: Path) -> None:
     source = write(tmp_path)
     content = source.read_bytes()
     put = artifacts.put("job_1", 3, "previews/step_1.jpg", source)
@@ -71,14 +71,14 @@ def test_what_is_put_is_read_and_fetched(artifacts: Artifacts, tmp_path: Path) -
         list(artifacts.read(put.location, 0, SIZE + 1))
 
 
-def test_a_name_is_never_written_twice(artifacts: Artifacts, tmp_path: Path) -> None:
+def test_object_names_are_never_reused(artifacts: Artifacts, tmp_path: Path) -> None:
     first = artifacts.put("job_1", 1, "plan.json", write(tmp_path, 10))
     second = artifacts.put("job_1", 1, "plan.json", write(tmp_path, 11))
     assert first.location != second.location
     assert len(b"".join(artifacts.read(first.location, 0, 10))) == 10
 
 
-def test_files_that_no_row_refers_to_are_swept(artifacts: Artifacts, tmp_path: Path) -> None:
+def test_objects_without_rows_are_swept(artifacts: Artifacts, tmp_path: Path) -> None:
     source = write(tmp_path, 10)
     kept, lost = (artifacts.put("job_1", epoch, "stylized.ply", source) for epoch in (2, 1))
     other = artifacts.put("job_10", 1, "stylized.ply", source)
@@ -94,7 +94,7 @@ def test_files_that_no_row_refers_to_are_swept(artifacts: Artifacts, tmp_path: P
     artifacts.remove_job("job_1")
 
 
-def test_another_process_sees_what_was_put_since_it_looked(
+def test_later_objects_are_visible_to_other_processes(
     artifacts: Artifacts, environment: dict[str, str], prefix: str, tmp_path: Path
 ) -> None:
     """fsspec caches folder listings, but files that other processes have just added must be found."""
@@ -108,7 +108,7 @@ def test_another_process_sees_what_was_put_since_it_looked(
     assert httpx.head(late).status_code == 404
 
 
-def test_a_bucket_that_is_not_there_is_not_ready(artifacts: Artifacts) -> None:
+def test_missing_bucket_is_not_ready(artifacts: Artifacts) -> None:
     artifacts.ping()
     with pytest.raises(OSError, match="nowhere"):
         Artifacts("s3://nowhere/x").ping()

@@ -89,7 +89,7 @@ def fleet(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     s3.close()
 
 
-def test_what_one_host_takes_in_another_one_reads(fleet: Fleet) -> None:
+def test_blob_of_one_host_is_read_on_another(fleet: Fleet) -> None:
     one, two = fleet.host("one"), fleet.host("two")
     data = os.urandom(3 * MB + 1)
     sha256 = fleet.take(one, data)
@@ -108,7 +108,7 @@ def test_what_one_host_takes_in_another_one_reads(fleet: Fleet) -> None:
 
 @pytest.mark.parametrize("lost", [True, False])
 @pytest.mark.parametrize("size", [100, 6 * MB])
-def test_what_is_sent_again_heals_the_store(fleet: Fleet, lost: bool, size: int) -> None:
+def test_uploading_again_repairs_a_damaged_blob(fleet: Fleet, lost: bool, size: int) -> None:
     data = os.urandom(size)
     one, two = fleet.host("one"), fleet.host("two")
     sha256 = fleet.take(one, data)
@@ -127,7 +127,7 @@ def test_what_is_sent_again_heals_the_store(fleet: Fleet, lost: bool, size: int)
     assert fleet.read(fleet.host("three"), sha256) == data
 
 
-def test_parts_are_read_without_a_copy_of_the_whole(fleet: Fleet) -> None:
+def test_ranges_are_read_without_a_full_copy(fleet: Fleet) -> None:
     data = os.urandom(2 * MB + 7)
     one, two = fleet.host("one"), fleet.host("two")
     row = fleet.store.inputs.blobs([fleet.take(one, data)]).popitem()[1]
@@ -139,7 +139,7 @@ def test_parts_are_read_without_a_copy_of_the_whole(fleet: Fleet) -> None:
         list(two.read(row, 0, 5))
 
 
-def test_what_nobody_needs_leaves_the_store(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unused_blobs_are_collected(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     host = fleet.host("one")
     sha256 = fleet.take(host, b"wanted by nobody")
     Artifacts(fleet.url).objects.put(_file(fleet.folder, b"x"), "blobs/aa/orphan")
@@ -161,7 +161,7 @@ def _file(folder: Path, data: bytes) -> Path:
 
 
 @pytest.mark.parametrize(("first", "able", "joined"), [(6 * MB, True, True), (6 * MB, False, False), (MB, True, False)])
-def test_an_upload_goes_on_at_another_host(fleet: Fleet, first: int, able: bool, joined: bool) -> None:
+def test_upload_continues_on_another_host(fleet: Fleet, first: int, able: bool, joined: bool) -> None:
     data = os.urandom(8 * MB)
     upload = fleet.upload(len(data))
     fleet.append(fleet.host("one"), upload, data[:1000], data[1000:first])
@@ -181,7 +181,7 @@ def test_an_upload_goes_on_at_another_host(fleet: Fleet, first: int, able: bool,
     assert two.finish_upload(fleet.again(upload), HOUR) == sha256, "another request has finished it already"
 
 
-def test_of_two_who_send_the_same_bytes_one_is_told_so(fleet: Fleet) -> None:
+def test_one_of_two_concurrent_writers_gets_a_conflict(fleet: Fleet) -> None:
     upload = fleet.upload(30)
     slow, fast = fleet.host("one").append(upload, HOUR), fleet.host("two").append(upload, HOUR)
     slow.write(b"slow" * 5)
@@ -203,7 +203,7 @@ def test_of_two_who_send_the_same_bytes_one_is_told_so(fleet: Fleet) -> None:
     assert len(fleet.names()) == 1
 
 
-def test_what_is_kept_for_later_makes_room(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_is_evicted_for_incoming_files(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     host = fleet.host("one")
     used, kept = (fleet.take(host, os.urandom(size)) for size in (3000, 5000))
     folder = fleet.folder / "one" / "cache" / "files"
@@ -222,7 +222,7 @@ def test_what_is_kept_for_later_makes_room(fleet: Fleet, monkeypatch: pytest.Mon
     host.ensure_room(10_000)
 
 
-def test_a_disk_without_inodes_takes_nothing_in(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disk_without_inodes_rejects_files(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     host = fleet.host("one")
     disk = os.statvfs(host.incoming)
 
@@ -241,7 +241,7 @@ def test_a_disk_without_inodes_takes_nothing_in(fleet: Fleet, monkeypatch: pytes
     host.ensure_room(0)
 
 
-def test_a_half_upload_is_collected(fleet: Fleet) -> None:
+def test_unfinished_upload_is_collected(fleet: Fleet) -> None:
     upload = fleet.upload(100)
     fleet.append(fleet.host("one"), upload, bytes(60))
     assert len(fleet.names()) == 1
@@ -252,7 +252,7 @@ def test_a_half_upload_is_collected(fleet: Fleet) -> None:
     assert fleet.store.inputs.parts(upload.id) == []
 
 
-def test_what_a_local_folder_held_moves_into_the_store(fleet: Fleet) -> None:
+def test_local_blobs_move_into_the_store(fleet: Fleet) -> None:
     folder = BlobFolder(fleet.folder / "one", fleet.store.inputs, 0)
     data = b"taken in before"
     sha256 = folder.keep(_file(fleet.folder, data))
@@ -262,7 +262,7 @@ def test_what_a_local_folder_held_moves_into_the_store(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("fault", ["slow-down", "reset", "cut-off"])
-def test_a_store_that_fails_for_a_moment_costs_a_moment(fleet: Fleet, fault: Fault) -> None:
+def test_short_store_failure_is_retried(fleet: Fleet, fault: Fault) -> None:
     data = os.urandom(100_000)
     if fault != "cut-off":
         fleet.s3.fail(fault, 2, lambda method, path: method == "PUT")
@@ -271,7 +271,7 @@ def test_a_store_that_fails_for_a_moment_costs_a_moment(fleet: Fleet, fault: Fau
     assert fleet.read(fleet.host("two"), sha256) == data
 
 
-def test_of_a_large_file_what_was_cut_off_is_fetched_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_interrupted_chunk_is_fetched_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     data = os.urandom(100_001)
     sha256 = fleet.take(fleet.host("one"), data)
     monkeypatch.setattr("service.files.objects._PIECE_BYTES", 10_000)
@@ -281,7 +281,7 @@ def test_of_a_large_file_what_was_cut_off_is_fetched_again(fleet: Fleet, monkeyp
     assert sum(method == "GET" for method, _ in fleet.s3.asked[before:]) == 11 + 2
 
 
-def test_a_store_that_stays_away_is_not_the_users_fault(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_store_outage_is_reported_as_unavailable(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"the scene"
     sha256 = fleet.take(fleet.host("one"), data)
     fleet.s3.fail("reset", 10**6)
@@ -299,7 +299,7 @@ def test_a_store_that_stays_away_is_not_the_users_fault(fleet: Fleet, monkeypatc
     assert fleet.read(two, sha256) == data
 
 
-def test_a_store_that_is_silent_is_asked_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_store_is_retried(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"the scene"
     sha256 = fleet.take(fleet.host("one"), data)
     monkeypatch.setattr("service.files.objects._ANSWER_SECONDS", 1.0)

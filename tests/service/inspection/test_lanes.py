@@ -46,7 +46,7 @@ async def start(work: Work, *names: str) -> list[asyncio.Task[None]]:
     return tasks
 
 
-def test_owners_take_turns_at_one_place() -> None:
+def test_owners_take_turns_on_one_slot() -> None:
     async def run() -> list[str]:
         work = Work(Lanes(["place"]))
         tasks = await start(work, "a1", "a2", "a3", "b1", "b2", "c1")
@@ -58,7 +58,7 @@ def test_owners_take_turns_at_one_place() -> None:
     assert asyncio.run(run()) == ["a1", "b1", "c1", "a2", "b2", "a3"]
 
 
-def test_one_owner_never_has_both_places() -> None:
+def test_owner_never_occupies_two_slots() -> None:
     async def run() -> None:
         work = Work(Lanes(["one", "two"]))
         tasks = await start(work, *(f"a{number}" for number in range(5)))
@@ -76,7 +76,7 @@ def test_one_owner_never_has_both_places() -> None:
     asyncio.run(run())
 
 
-def test_a_full_waiting_room_is_the_owners_own() -> None:
+def test_queue_limit_applies_per_owner() -> None:
     async def run() -> None:
         work = Work(Lanes(["one", "two"]))
         tasks = await start(work, *(f"a{number}" for number in range(1 + MAX_WAITING)))
@@ -96,7 +96,7 @@ def test_a_full_waiting_room_is_the_owners_own() -> None:
     asyncio.run(run())
 
 
-def test_every_place_comes_back_whoever_gives_up() -> None:
+def test_every_slot_is_returned_after_cancellations() -> None:
     """For random requests, ends and cancellations: at most one slot per owner; no slot is lost or assigned twice."""
 
     async def run(seed: int) -> None:

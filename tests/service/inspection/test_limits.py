@@ -60,13 +60,13 @@ def large(path: Path, side: int) -> Path:
     return path
 
 
-def test_a_large_scene_may_take_what_its_size_asks_for(files: dict[str, Path], tmp_path: Path) -> None:
+def test_limits_grow_with_the_size_of_a_scene(files: dict[str, Path], tmp_path: Path) -> None:
     files["scene"] = large(tmp_path / "large.ply", 300)
     found = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
     assert (found["gaussians"], found["sh_degree"]) == (90_000, 3)
 
 
-def test_a_small_file_that_becomes_large_may_not(files: dict[str, Path], tmp_path: Path) -> None:
+def test_small_file_that_expands_exceeds_the_memory_limit(files: dict[str, Path], tmp_path: Path) -> None:
     Image.new("RGB", (6000, 6000)).save(files["style"])  # 432 MB as float32, 100 kB as a file
     assert files["style"].stat().st_size < 1_000_000
     with pytest.raises(RefusedInputError, match="memory") as caught:
@@ -75,7 +75,7 @@ def test_a_small_file_that_becomes_large_may_not(files: dict[str, Path], tmp_pat
 
 
 @pytest.mark.slow
-def test_a_quarter_of_a_gigabyte_is_read_with_little_more_than_its_size(files: dict[str, Path], tmp_path: Path) -> None:
+def test_large_scene_is_read_within_its_memory_limit(files: dict[str, Path], tmp_path: Path) -> None:
     files["scene"] = large(tmp_path / "large.ply", 1010)
     assert files["scene"].stat().st_size > 250_000_000
     found = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)

@@ -79,7 +79,7 @@ def allowed(outcomes: dict[str, str]) -> set[str]:
     return {name for name, outcome in outcomes.items() if outcome == "done"}
 
 
-def test_a_reader_that_is_taken_over_reaches_nothing(
+def test_compromised_reader_reaches_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
     found = attacked(monkeypatch, tmp_path, files, target)
@@ -93,7 +93,7 @@ def test_a_reader_that_is_taken_over_reaches_nothing(
     assert sorted(path.name for path in Path(target["outside"]).iterdir()) == ["there"]
 
 
-def test_without_landlock_network_and_processes_are_out_of_reach(
+def test_seccomp_alone_blocks_network_and_processes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
     target["data"] = target["outside"]  # whatever can be written to is worthless and grows by at most one byte
@@ -104,7 +104,7 @@ def test_without_landlock_network_and_processes_are_out_of_reach(
     assert "secret" not in found["environment"].values()
 
 
-def test_without_seccomp_files_and_signals_are_out_of_reach(
+def test_landlock_alone_blocks_files_and_signals(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
     found = attacked(monkeypatch, tmp_path, files, target, "seccomp")
@@ -129,7 +129,7 @@ def test_without_seccomp_files_and_signals_are_out_of_reach(
         '{"found": {}}\n{"found": {"gaussians": 7}}',
     ],
 )
-def test_forged_answers_reach_nobody_else(
+def test_forged_response_affects_only_its_own_request(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], answer: str
 ) -> None:
     monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED)))
@@ -146,7 +146,7 @@ def test_forged_answers_reach_nobody_else(
     assert inspect(tmp_path, files)["gaussians"] == 616
 
 
-def test_what_the_kernel_lacks_is_logged_at_start(
+def test_missing_kernel_features_are_logged(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     settings = ServiceSettings(data=tmp_path)
@@ -197,7 +197,7 @@ def verdict(program: bytes, architecture: int, number: int, argument: int = 0) -
         ),
     ],
 )
-def test_the_filter_of_each_architecture(machine: str, architecture: int, numbers: dict[str, int]) -> None:
+def test_filter_of_each_architecture(machine: str, architecture: int, numbers: dict[str, int]) -> None:
     program, own, other = sandbox.seccomp_program(machine, 4711), 4711, 4712
     allow, refuse, absent = 0x7FFF0000, 0x50000 | errno.EPERM, 0x50000 | errno.ENOSYS
 

@@ -64,7 +64,7 @@ def leased(store: Store, dispatcher: str) -> Lease:
     return found
 
 
-def test_it_is_known_while_it_is_at_work(settings: ServiceSettings, store: Store) -> None:
+def test_running_dispatcher_is_registered(settings: ServiceSettings, store: Store) -> None:
     with at_work(settings, store) as dispatcher:
         found = wait_for(store.operations.dispatchers, "the dispatcher to be known")
         assert [(row.name, row.places, row.free) for row in found] == [(dispatcher.name, 2, 2)]
@@ -79,7 +79,7 @@ def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Stor
     return RunningAttempt(held, grant, folder, settings, store, artifacts, stager)
 
 
-def test_an_attempt_tells_when_it_will_end(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
+def test_attempt_reports_its_expected_end(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
     held = leased(store, "one")
     attempt = attempt_of(held, Grant(1, ("0",)), settings, store, tmp_path)
     for stage in ("planning", "preparing"):  # the remaining seconds of these stages are not the job's
@@ -95,7 +95,7 @@ def test_an_attempt_tells_when_it_will_end(settings: ServiceSettings, store: Sto
     assert attempt.holding.pace is None
 
 
-def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
+def test_released_gpus_are_free_for_other_jobs(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
     held = leased(store, "one")
     grant = Grant(3, ("5", "6", "7"))
     attempt = attempt_of(held, grant, settings, store, tmp_path)
@@ -110,9 +110,7 @@ def test_gpus_that_a_job_gives_back_are_free(settings: ServiceSettings, store: S
     assert (following.ranks, following.gpus) == (2, ("5", "7"))
 
 
-def test_a_job_with_parameters_of_an_earlier_version_fails_with_a_sentence(
-    settings: ServiceSettings, store: Store
-) -> None:
+def test_job_with_unsupported_stored_parameters_fails_with_a_message(settings: ServiceSettings, store: Store) -> None:
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     told = {"sharpness": 3, "workers": "many", "memory_limit": "all"}
     job, _ = store.jobs.create(NewJob("local", "", 0, told, [scene]), limit=10)
@@ -125,7 +123,7 @@ def test_a_job_with_parameters_of_an_earlier_version_fails_with_a_sentence(
     assert "stored by an earlier version" in ended.error["message"]
 
 
-def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store: Store) -> None:
+def test_jobs_of_a_dead_dispatcher_are_taken_over_at_once(settings: ServiceSettings, store: Store) -> None:
     script = "from service.scheduling.machine import own_name; print(own_name())"
     dead = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
     assert is_dead(dead)
@@ -141,7 +139,9 @@ def test_those_that_are_gone_are_not_waited_for(settings: ServiceSettings, store
         )
 
 
-def test_leases_that_cannot_be_renewed_end_their_jobs_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attempt_is_abandoned_before_an_unrenewed_lease_expires(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The database does not respond: the thread that renews leases waits for it, and others will take over the job."""
     settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, lease_seconds=4)
     store = open_store(settings)
@@ -188,7 +188,7 @@ def test_leases_that_cannot_be_renewed_end_their_jobs_in_time(tmp_path: Path, mo
     store.close()
 
 
-def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_dispatcher_are_swept(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
     """The dispatcher died after its job had succeeded, so nobody else would handle the job again."""
     artifacts = Artifacts(settings.artifacts_url)
     source = tmp_path / "stylized.ply"
@@ -208,7 +208,7 @@ def test_what_a_killed_dispatcher_left_behind_is_swept(settings: ServiceSettings
 
 
 @pytest.mark.parametrize(("damage", "code"), [("lost", "file-lost"), ("flipped", "file-damaged")])
-def test_a_job_whose_input_is_gone_fails(tmp_path: Path, damage: str, code: str) -> None:
+def test_job_with_a_lost_or_damaged_input_fails(tmp_path: Path, damage: str, code: str) -> None:
     """The job is retried as often as any other job without progress, and not forever."""
     settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, retry_seconds=0.01, max_attempts=2)
     store = open_store(settings)

@@ -35,12 +35,12 @@ def ending(
 
 
 @pytest.mark.parametrize("requested", REQUESTS)
-def test_who_is_done_has_succeeded_even_if_the_end_was_wanted(requested: StopRequest | None) -> None:
+def test_finished_attempt_beats_stop_request(requested: StopRequest | None) -> None:
     assert ending(requested, DONE) == Ending(AttemptOutcome.SUCCEEDED)
 
 
 @pytest.mark.parametrize("requested", REQUESTS)
-def test_without_a_result_nobody_has_succeeded(requested: StopRequest | None) -> None:
+def test_finished_attempt_without_a_result_fails(requested: StopRequest | None) -> None:
     found = ending(requested, DONE, has_result=False)
     assert (found.outcome, found.permanent) == (AttemptOutcome.FAILED, False)
     assert found.error == {"code": "internal", "message": "The job ended without a result."}
@@ -51,13 +51,11 @@ def test_without_a_result_nobody_has_succeeded(requested: StopRequest | None) ->
 )
 @pytest.mark.parametrize("last", [INTERRUPTED, FAILED, None])
 @pytest.mark.parametrize("code", [0, 1, -signal.SIGKILL])
-def test_an_end_that_was_wanted_is_no_failure(
-    requested: StopRequest, outcome: str, last: Message | None, code: int
-) -> None:
+def test_requested_stop_is_not_a_failure(requested: StopRequest, outcome: str, last: Message | None, code: int) -> None:
     assert ending(requested, last, code) == Ending(AttemptOutcome(outcome))
 
 
-def test_on_a_cluster_a_process_that_ray_ended_is_an_outage() -> None:
+def test_process_ended_by_ray_is_an_outage() -> None:
     """When the cluster's head dies, Ray terminates connected processes with exit code 1 and without a message."""
     found = ending(None, None, 1, "raylet has died", cluster=True)
     assert (found.outcome, found.error, found.permanent) == (AttemptOutcome.FAILED, OUTAGE, False)
@@ -69,7 +67,7 @@ def test_on_a_cluster_a_process_that_ray_ended_is_an_outage() -> None:
 
 
 @pytest.mark.parametrize("permanent", [False, True])
-def test_a_failure_is_told_as_its_process_tells_it(permanent: bool) -> None:
+def test_reported_failure_is_recorded_unchanged(permanent: bool) -> None:
     last: Message = {"kind": "failed", "error": ERROR, "permanent": permanent}
     assert ending(None, last) == Ending(AttemptOutcome.FAILED, ERROR, permanent)
 
@@ -84,7 +82,7 @@ def test_a_failure_is_told_as_its_process_tells_it(permanent: bool) -> None:
         (0, "ended with code 0"),
     ],
 )
-def test_a_process_without_a_last_word_has_crashed(last: Message | None, code: int, told: str) -> None:
+def test_process_without_a_final_message_has_crashed(last: Message | None, code: int, told: str) -> None:
     found = ending(None, last, code)
     assert (found.outcome, found.permanent) == (AttemptOutcome.FAILED, False)
     error: dict[str, Any] = found.error or {}
@@ -108,7 +106,7 @@ def test_a_process_without_a_last_word_has_crashed(last: Message | None, code: i
         (RanksFailedError("3 attempts in a row came no further than step 0."), False),
     ],
 )
-def test_a_machines_failure_is_not_told_as_the_users(error: Exception, outage: bool) -> None:
+def test_machine_failures_are_reported_as_outages(error: Exception, outage: bool) -> None:
     assert is_outage(error) == outage
     told = failure(error)
     assert (told["error"] == OUTAGE) == outage

@@ -17,7 +17,7 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 
 
-def test_a_dispatcher_is_well_as_long_as_it_is_heard_of(tmp_path: Path) -> None:
+def test_dispatcher_is_healthy_while_it_sends_heartbeats(tmp_path: Path) -> None:
     now = 1000.0
     store = open_store(ServiceSettings(data=tmp_path, lease_seconds=30), lambda: now)
     assert not dispatcher_is_well(store)
@@ -30,13 +30,13 @@ def test_a_dispatcher_is_well_as_long_as_it_is_heard_of(tmp_path: Path) -> None:
     store.close()
 
 
-def test_a_dispatcher_is_not_to_blame_for_its_database() -> None:
+def test_dispatcher_is_healthy_during_a_database_outage() -> None:
     url = "postgresql+psycopg://nobody@127.0.0.1:1/none"
     pytest.importorskip("psycopg", reason="psycopg is not installed: see the extra [postgresql]")
     assert dispatcher_is_well(Store(ServiceSettings(database=url)))
 
 
-def test_names_tell_the_machine() -> None:
+def test_dispatcher_names_identify_the_machine() -> None:
     assert is_of_this_machine(own_name())
     assert not is_dead(own_name())
     for name in ("", "host", "host-01234567-1-1", "a-b-c-d-e"):
@@ -44,7 +44,7 @@ def test_names_tell_the_machine() -> None:
         assert not is_dead(name)
 
 
-def test_a_database_is_asked_again_for_as_long_as_the_settings_say() -> None:
+def test_unavailable_database_is_retried_for_the_given_time() -> None:
     pytest.importorskip("psycopg", reason="psycopg is not installed: see the extra [postgresql]")
     asked: list[float] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -68,7 +68,7 @@ def test_a_database_is_asked_again_for_as_long_as_the_settings_say() -> None:
         assert len(asked) >= 3 * once
 
 
-def test_prepare_makes_the_tables_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepare_creates_the_tables_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SGSST_DATA", str(tmp_path))
     assert prepare() == prepare() == 0
     store = Store(ServiceSettings())

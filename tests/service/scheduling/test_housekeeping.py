@@ -24,7 +24,7 @@ def lease(store: Store) -> Lease:
     return found
 
 
-def test_what_comes_too_late_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = ServiceSettings(data=tmp_path / "data")
     store, artifacts = open_store(settings), Artifacts(settings.artifacts_url)
     store.inputs.add_blob(SHA, "aa/blob", 3)

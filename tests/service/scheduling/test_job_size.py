@@ -20,7 +20,7 @@ def size_of(scene: int = GB, name: str = "scene.ply", photos: int = 0, **paramet
 
 @pytest.mark.parametrize("name", forecast.JOBS)
 @pytest.mark.parametrize("precision", forecast.PRECISIONS)
-def test_the_seconds_are_those_of_the_forecast(name: str, precision: str) -> None:
+def test_estimated_seconds_agree_with_the_forecast(name: str, precision: str) -> None:
     job = forecast.JOBS[name]
     parts = forecast.step_parts(job, precision)
     step = forecast.step_seconds(parts, forecast.SHARES["likely"], precision, forecast.LAUNCHES)["total"]
@@ -28,7 +28,7 @@ def test_the_seconds_are_those_of_the_forecast(name: str, precision: str) -> Non
     assert step / 1.6 < estimated < step * 1.6
 
 
-def test_a_scene_of_another_format_is_as_large() -> None:
+def test_estimated_gaussians_do_not_depend_on_the_format() -> None:
     found = size_of(248_000_000).gaussians
     assert found == 1e6
     for name, scene in (
@@ -40,7 +40,7 @@ def test_a_scene_of_another_format_is_as_large() -> None:
         assert size_of(scene, name).gaussians == found
 
 
-def test_views_are_as_asked_for_or_as_photos_tell() -> None:
+def test_view_size_follows_the_resolution_or_the_photos() -> None:
     assert size_of(resolution=1000).pixels == 625_000
     assert size_of(photos=6_000_000, resolution=1000).pixels == 625_000
     assert size_of(photos=6_000_000).pixels == pytest.approx(6_000_000 / 0.35)
@@ -48,12 +48,12 @@ def test_views_are_as_asked_for_or_as_photos_tell() -> None:
     assert size_of(max_resolution=800, resolution=1000).pixels == 0.625 * 800**2
 
 
-def test_steps_are_the_presets_unless_given() -> None:
+def test_steps_default_to_the_preset() -> None:
     assert (size_of().steps_coarse, size_of().steps_sos) == (100, 200)
     assert size_of(preset="paper", steps_sos=7, views_per_step=3).steps_sos == 21
 
 
-def test_what_another_version_has_stored_is_taken_for_usual() -> None:
+def test_unknown_stored_parameters_are_estimated_as_defaults() -> None:
     assert size_of(steps_sos="many", preset="unknown", resolution="large", bygone=1) == size_of()
 
 
@@ -61,11 +61,11 @@ def test_what_another_version_has_stored_is_taken_for_usual() -> None:
     ("parameters", "gpus"),
     [({"preset": "preview"}, [1]), ({"preset": "paper", "resolution": 5187}, [8]), ({"resolution": 5187}, range(6, 9))],
 )
-def test_more_gpus_for_more_work(parameters: dict[str, Any], gpus: Any) -> None:
+def test_larger_jobs_get_more_gpus(parameters: dict[str, Any], gpus: Any) -> None:
     assert size_of(**parameters).gpus(8) in gpus
 
 
-def test_never_none_and_never_more_than_there_are() -> None:
+def test_gpu_count_is_between_one_and_the_maximum() -> None:
     for steps in (0, 1, 10_000_000):
         for most in (1, 3, 64):
             assert 1 <= size_of(steps_sos=steps).gpus(most) <= most

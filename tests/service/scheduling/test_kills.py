@@ -104,9 +104,7 @@ def check_published_once(service: Service, job_id: str) -> bytes:
     return answer.content
 
 
-def test_a_job_outlives_the_death_of_all_its_processes(
-    service: Service, files: dict[str, Path], expected: Path
-) -> None:
+def test_job_survives_kills_of_all_its_processes(service: Service, files: dict[str, Path], expected: Path) -> None:
     job_id = submit(service, files, "all").json()["id"]
     service.kill(API)  # just after it has accepted the job
     wait_for(lambda: look(service, job_id)["attempt"] == 1, "the first attempt", service.said)
@@ -129,7 +127,7 @@ def test_a_job_outlives_the_death_of_all_its_processes(
     assert check_published_once(service, job_id) == expected.read_bytes()
 
 
-def test_a_request_that_the_api_dies_in_can_be_sent_again(service: Service, files: dict[str, Path]) -> None:
+def test_request_interrupted_by_an_api_kill_can_be_repeated(service: Service, files: dict[str, Path]) -> None:
     def names() -> list[str]:
         return [entry["name"] for entry in httpx.get(f"{service.url}/v1/jobs", timeout=30).json()["jobs"]]
 
@@ -150,7 +148,7 @@ def test_a_request_that_the_api_dies_in_can_be_sent_again(service: Service, file
         httpx.post(f"{service.url}/v1/jobs/{answer.json()['id']}/cancel", timeout=30)
 
 
-def test_killed_ranks_cost_time_only(service: Service, files: dict[str, Path], expected: Path) -> None:
+def test_job_survives_kills_of_its_ranks(service: Service, files: dict[str, Path], expected: Path) -> None:
     job_id = submit(service, files, "ranks", workers=2).json()["id"]
     at_step(service, job_id, 3, attempt=1)
     # the plan may leave out a rank, so every participant is killed

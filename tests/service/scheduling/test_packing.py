@@ -89,7 +89,7 @@ def eight(tmp_path: Path) -> Iterator[Queue]:
     queue.store.close()
 
 
-def test_a_job_that_is_alone_is_offered_everything_and_gives_back_what_its_plan_does_without(eight: Queue) -> None:
+def test_single_job_gets_all_gpus_and_releases_unused_ones(eight: Queue) -> None:
     big = eight.add()
     assert eight.start() == [big]
     assert eight.ranks() == [8]
@@ -102,20 +102,20 @@ def test_a_job_that_is_alone_is_offered_everything_and_gives_back_what_its_plan_
 
 
 @pytest.mark.parametrize(("jobs", "ranks"), [(2, [4, 4]), (3, [2, 3, 3]), (8, [1] * 8), (20, [1] * 8)])
-def test_jobs_that_wait_share_the_gpus(eight: Queue, jobs: int, ranks: list[int]) -> None:
+def test_waiting_jobs_share_the_gpus(eight: Queue, jobs: int, ranks: list[int]) -> None:
     added = [eight.add() for _ in range(jobs)]
     assert eight.start() == added[:8]
     assert eight.ranks() == ranks
 
 
-def test_a_small_job_that_is_alone_leaves_gpus_to_others(eight: Queue) -> None:
+def test_small_job_gets_only_the_gpus_it_is_worth(eight: Queue) -> None:
     small = [eight.add(preset="preview") for _ in range(2)]
     large = eight.add()
     assert eight.start() == [*small, large]
     assert eight.ranks() == [1, 1, 6]
 
 
-def test_a_dispatcher_without_room_asks_nothing(eight: Queue) -> None:
+def test_dispatcher_without_capacity_sends_no_query(eight: Queue) -> None:
     eight.add()
     eight.start()
     eight.add()
@@ -125,7 +125,7 @@ def test_a_dispatcher_without_room_asks_nothing(eight: Queue) -> None:
     assert not asked
 
 
-def test_a_user_decides_for_a_job(eight: Queue) -> None:
+def test_requested_workers_are_granted(eight: Queue) -> None:
     for workers in (2, 5, 100):
         eight.add(workers=workers)
     eight.start()
@@ -135,7 +135,7 @@ def test_a_user_decides_for_a_job(eight: Queue) -> None:
     assert eight.ranks() == [8], "no more than there are"
 
 
-def test_a_big_job_waits_for_its_gpus_and_nothing_overtakes_it(eight: Queue) -> None:
+def test_large_job_is_not_overtaken_while_it_waits_for_gpus(eight: Queue) -> None:
     small = [eight.add(workers=1) for _ in range(7)]
     assert eight.start() == small
     big = eight.add(workers=8)
@@ -149,7 +149,7 @@ def test_a_big_job_waits_for_its_gpus_and_nothing_overtakes_it(eight: Queue) -> 
     assert eight.start()[0] == urgent, "but for one of a higher priority"
 
 
-def test_a_big_job_holds_up_one_machine_and_not_all(tmp_path: Path) -> None:
+def test_large_job_blocks_only_one_machine(tmp_path: Path) -> None:
     here, there = (Queue(tmp_path, gpus=8, name=name) for name in ("here", "there"))
     running = [here.add(workers=1), here.add(workers=1)]
     assert [*here.start(), *there.start()] == running
@@ -166,7 +166,7 @@ def test_a_big_job_holds_up_one_machine_and_not_all(tmp_path: Path) -> None:
         queue.store.close()
 
 
-def test_what_ends_in_time_uses_the_room_that_is_kept_for_a_big_job(eight: Queue) -> None:
+def test_short_jobs_backfill_gpus_reserved_for_a_large_job(eight: Queue) -> None:
     long = [eight.add("a", workers=1) for _ in range(8)]
     assert eight.start() == long
     big = eight.add("b", workers=8)
@@ -184,7 +184,7 @@ def test_what_ends_in_time_uses_the_room_that_is_kept_for_a_big_job(eight: Queue
     assert eight.start() == [big]
 
 
-def test_nothing_is_let_in_before_a_pace_is_known_nor_what_takes_too_long_at_it(eight: Queue) -> None:
+def test_backfilling_requires_a_known_pace_and_a_short_job(eight: Queue) -> None:
     long = [eight.add("a", workers=1) for _ in range(8)]
     assert eight.start() == long
     big, short = eight.add("b", workers=8), eight.add("c", preset="preview", resolution=640)
@@ -198,7 +198,7 @@ def test_nothing_is_let_in_before_a_pace_is_known_nor_what_takes_too_long_at_it(
     assert kept_for(eight) == [big]
 
 
-def test_a_kept_job_waits_no_longer_than_was_foreseen_at_first(eight: Queue) -> None:
+def test_reserved_job_waits_no_longer_than_its_first_forecast(eight: Queue) -> None:
     """Running jobs that exceed their forecasts do not let further jobs be backfilled."""
     long = [eight.add("a", workers=1) for _ in range(8)]
     assert eight.start() == long
@@ -214,7 +214,7 @@ def test_a_kept_job_waits_no_longer_than_was_foreseen_at_first(eight: Queue) -> 
     assert eight.start() == []
 
 
-def test_the_machine_that_has_room_first_keeps_it(tmp_path: Path) -> None:
+def test_machine_with_the_earliest_capacity_reserves_it(tmp_path: Path) -> None:
     """A machine whose capacity is freed late leaves a large job to others until the job has waited long enough."""
     late, soon = (Queue(tmp_path, gpus=8, name=name) for name in ("late", "soon"))
     for queue in (late, soon):
@@ -245,7 +245,7 @@ def test_the_machine_that_has_room_first_keeps_it(tmp_path: Path) -> None:
         queue.store.close()
 
 
-def test_a_job_of_more_than_the_usual_priority_takes_kept_room(eight: Queue) -> None:
+def test_job_of_higher_priority_takes_reserved_gpus(eight: Queue) -> None:
     long = [eight.add("a", workers=1) for _ in range(8)]
     assert eight.start() == long
     big = eight.add("b", workers=8)
@@ -257,7 +257,7 @@ def test_a_job_of_more_than_the_usual_priority_takes_kept_room(eight: Queue) -> 
     assert eight.start() == [big]
 
 
-def test_keys_take_turns_whatever_they_get(eight: Queue) -> None:
+def test_owners_take_turns_regardless_of_granted_gpus(eight: Queue) -> None:
     alice = [eight.add("alice", workers=2) for _ in range(4)]
     bob = [eight.add("bob", workers=2) for _ in range(2)]
     assert eight.start() == [alice[0], bob[0], alice[1], bob[1]]
@@ -272,7 +272,7 @@ def test_dispatchers_share_the_queue(eight: Queue) -> None:
     assert (found[0].job_id, found[1].ranks) == (first, 8), "the other job is for the other dispatcher"
 
 
-def test_no_more_jobs_than_the_operator_wants(tmp_path: Path) -> None:
+def test_number_of_jobs_is_limited_by_parallel_jobs(tmp_path: Path) -> None:
     queue = Queue(tmp_path, gpus=8, parallel_jobs=2)
     for _ in range(5):
         queue.add()
@@ -281,7 +281,7 @@ def test_no_more_jobs_than_the_operator_wants(tmp_path: Path) -> None:
     queue.store.close()
 
 
-def test_jobs_on_gpus_wait_for_memory_of_the_machine() -> None:
+def test_gpu_jobs_wait_for_host_memory() -> None:
     capacity = Capacity(machine(8), None)
     alone = capacity.grant(job(200 * GB, workers=1), [], 1)
     assert alone is not None, "were it too big: it may try"
@@ -298,7 +298,7 @@ def test_jobs_on_gpus_wait_for_memory_of_the_machine() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(1, 60 * GB), st.integers(1, 8)), max_size=12))
-def test_jobs_on_gpus_never_take_more_memory_than_there_is(jobs: list[tuple[int, int]]) -> None:
+def test_gpu_jobs_never_exceed_host_memory(jobs: list[tuple[int, int]]) -> None:
     held: list[Any] = []
     capacity = Capacity(machine(8), None)
     for scene, workers in jobs:
@@ -309,7 +309,7 @@ def test_jobs_on_gpus_never_take_more_memory_than_there_is(jobs: list[tuple[int,
     assert len(held) < 2 or sum(grant.beside_gpus for grant in held) <= 80 * GB
 
 
-def test_without_gpus_one_job_at_a_time_has_the_machine(tmp_path: Path) -> None:
+def test_one_job_at_a_time_runs_without_gpus(tmp_path: Path) -> None:
     queue = Queue(tmp_path, gpus=0)
     first = queue.add()
     queue.add()
@@ -326,11 +326,11 @@ def job(scene: int, **parameters: Any) -> QueuedJob:
     return QueuedJob("job", 0.0, parameters, [{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}])
 
 
-def test_a_cluster_gives_its_memory_out_itself() -> None:
+def test_memory_of_a_cluster_is_not_packed() -> None:
     assert Capacity(machine(0, cluster=True), 4).grant(job(50 * GB, workers=3), [], 1) == Grant(3)
 
 
-def test_places_are_parts_of_cores_and_memory() -> None:
+def test_slots_are_fractions_of_cores_and_memory() -> None:
     capacity = Capacity(machine(0), 4)
     small = capacity.grant(job(GB), [], 9)
     assert small is not None
@@ -351,9 +351,7 @@ def test_places_are_parts_of_cores_and_memory() -> None:
     st.integers(1, 9),
     st.lists(st.tuples(st.integers(1, 60 * GB), st.none() | st.integers(1, 200 * GB)), max_size=12),
 )
-def test_jobs_side_by_side_never_plan_with_more_memory_than_there_is(
-    places: int, jobs: list[tuple[int, int | None]]
-) -> None:
+def test_concurrent_cpu_jobs_never_exceed_host_memory(places: int, jobs: list[tuple[int, int | None]]) -> None:
     held: list[Any] = []
     capacity, planned = Capacity(machine(0), places), []
     for scene, limit in jobs:
@@ -365,7 +363,7 @@ def test_jobs_side_by_side_never_plan_with_more_memory_than_there_is(
     assert len(held) < 2 or sum(planned) <= 100 * GB
 
 
-def test_gpus_of_the_machine_and_of_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_machine_lists_its_own_gpus_or_those_of_the_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,GPU-1f")
     assert Machine.find(ServiceSettings()).gpus == ("4", "GPU-1f")
@@ -376,7 +374,7 @@ def test_gpus_of_the_machine_and_of_a_cluster(monkeypatch: pytest.MonkeyPatch) -
     assert (len(found.gpus), found.cluster) == (3, True)
 
 
-def test_the_store_counts_what_could_be_started(eight: Queue) -> None:
+def test_waiting_counts_jobs_that_can_be_leased_now(eight: Queue) -> None:
     store: Store = eight.store
     assert store.leases.waiting() == 0
     eight.add()

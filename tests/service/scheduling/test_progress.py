@@ -29,7 +29,7 @@ def records(channel: io.StringIO) -> list[dict[str, Any]]:
     return [progress_record(json.loads(line), 2) for line in channel.getvalue().splitlines()]
 
 
-def test_planning_is_a_stage_whose_steps_are_views(channel: io.StringIO) -> None:
+def test_planning_counts_views_as_steps(channel: io.StringIO) -> None:
     tell_planning(PlanningProgress(0, 8))
     tell_planning(PlanningProgress(2, 8, 31.5))
     nothing = {"loss": None, "scales": None, "seconds": None, "attempt": 2}
@@ -39,7 +39,7 @@ def test_planning_is_a_stage_whose_steps_are_views(channel: io.StringIO) -> None
     ]
 
 
-def test_steps_follow_where_the_job_goes_on(channel: io.StringIO, capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_starts_at_the_resumed_step(channel: io.StringIO, capsys: pytest.CaptureFixture[str]) -> None:
     tell_prepared(Prepared([("scene", "616 Gaussians")], 3, 12))
     tell_progress(Progress("sos", 6, 12, 0.5, 20.0, 10.0, (None, 0.5)))
     starting, step = records(channel)
@@ -48,5 +48,5 @@ def test_steps_follow_where_the_job_goes_on(channel: io.StringIO, capsys: pytest
     assert "scene: 616 Gaussians" in capsys.readouterr().err
 
 
-def test_a_job_that_runs_for_long_writes_its_progress_less_often() -> None:
+def test_long_running_job_writes_progress_less_often() -> None:
     assert [progress_seconds(elapsed) for elapsed in (0, 30, 60, 120, 300, 1e6)] == [1, 1, 1, 2, 5, 5]

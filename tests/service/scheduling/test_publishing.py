@@ -68,7 +68,7 @@ def places(settings: ServiceSettings) -> list[str]:
     return sorted(path.name for path in (settings.folder / "artifacts").rglob("*") if path.is_file())
 
 
-def test_files_are_published_once_they_are_there_and_again_once_they_change(
+def test_new_and_changed_files_are_published(
     publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
 ) -> None:
     publisher.publish_unfinished(whole_log=True)
@@ -86,7 +86,7 @@ def test_files_are_published_once_they_are_there_and_again_once_they_change(
     assert places(settings) == ["log.txt", "plan.json", "step_000010.jpg"], "the older plan is still there"
 
 
-def test_a_log_is_copied_once_in_a_while_and_whole_at_the_end(
+def test_log_is_copied_periodically_and_completely_at_the_end(
     publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
 ) -> None:
     publisher.publish_unfinished(whole_log=True)
@@ -100,9 +100,7 @@ def test_a_log_is_copied_once_in_a_while_and_whole_at_the_end(
     assert publisher.log_tail() is None
 
 
-def test_a_checkpoint_tells_how_far_the_job_is_saved(
-    publisher: Publisher, folder: Path, store: Store, lease: Lease
-) -> None:
+def test_published_checkpoint_records_its_step(publisher: Publisher, folder: Path, store: Store, lease: Lease) -> None:
     checkpoint = folder / "out" / "stylized.checkpoint.safetensors"
     for step, saved in ((10, 10), (25, 25), (None, 25)):
         if step is None:
@@ -114,7 +112,7 @@ def test_a_checkpoint_tells_how_far_the_job_is_saved(
     assert told(store, lease) == ["log.txt"], "nobody is told of checkpoints"
 
 
-def test_the_end_publishes_results_and_sweeps_what_no_row_refers_to(
+def test_success_publishes_results_and_sweeps_leftovers(
     publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
 ) -> None:
     save_file({"x": np.zeros(1)}, folder / "out" / "stylized.checkpoint.safetensors", metadata={"step": "1"})

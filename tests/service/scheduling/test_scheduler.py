@@ -88,7 +88,7 @@ def test_backfilling_needs_a_pace_a_forecast_and_enough_time(
     assert (decision.job_id is None) == (reason != Reason.ENDS_IN_TIME)
 
 
-def test_backfilling_doubts_estimates_by_half() -> None:
+def test_backfilling_adds_a_safety_margin_of_half() -> None:
     short = job("short", **SHORT)
     seconds = estimated_seconds(short.parameters, short.inputs)
     queue = [job("large", 8), short]
@@ -113,7 +113,7 @@ def test_forecast_survives_decisions_without_one() -> None:
     assert next_job([job("large", 8)], snapshot(None, forecast=earlier)).forecast == earlier
 
 
-def test_one_of_several_dispatchers_skips_a_job_that_would_wait_longer_than_it_has_waited() -> None:
+def test_one_of_several_dispatchers_skips_a_job_with_a_longer_remaining_wait() -> None:
     queue = [job("large", 8, waited=59.0), job("small")]
     decision = next_job(queue, snapshot(60.0, dispatchers=2))
     assert (decision.job_id, decision.reserved_for) == ("small", None)
@@ -123,7 +123,7 @@ def test_one_of_several_dispatchers_skips_a_job_that_would_wait_longer_than_it_h
 @pytest.mark.parametrize(
     ("waited", "more"), [(60.0, {}), (59.0, {"forecast": Forecast("large", NOW + 60)}), (59.0, {"dispatchers": 1})]
 )
-def test_capacity_is_reserved_after_an_equal_wait_for_a_job_reserved_before_or_by_the_only_dispatcher(
+def test_capacity_is_reserved_by_the_only_dispatcher_or_after_an_equal_wait(
     waited: float, more: dict[str, Any]
 ) -> None:
     decision = next_job([job("large", 8, waited)], snapshot(60.0, **({"dispatchers": 2} | more)))

@@ -92,7 +92,7 @@ def checkpoint(folder: Path, step: int) -> None:
     path.with_suffix(".new").replace(path)
 
 
-def test_a_job_is_laid_out_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: StoreWorkplace, tmp_path: Path) -> None:
+def test_files_are_fetched_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: StoreWorkplace, tmp_path: Path) -> None:
     job = pickle.loads(pickle.dumps(StoreWorkplace.from_json(json.loads(json.dumps(job.as_json())))))
     before = len(s3.asked)
     ranks = [job.open(number, Heard()) for number in (1, 2)]
@@ -106,7 +106,7 @@ def test_a_job_is_laid_out_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: St
     assert not [path for path in (tmp_path / "node" / "ranks").iterdir() if path.is_dir()]
 
 
-def test_what_the_first_rank_makes_is_stored_while_it_makes_it(job: StoreWorkplace) -> None:
+def test_first_rank_uploads_files_while_it_runs(job: StoreWorkplace) -> None:
     heard = Heard()
     rank = job.open(0, heard)
     out = rank.folder / "out"
@@ -132,7 +132,7 @@ def test_what_the_first_rank_makes_is_stored_while_it_makes_it(job: StoreWorkpla
     assert job.after([]) == job
 
 
-def test_a_damaged_checkpoint_is_not_used(job: StoreWorkplace, tmp_path: Path) -> None:
+def test_damaged_checkpoint_is_not_used(job: StoreWorkplace, tmp_path: Path) -> None:
     saved = put(job.url, "job_1/1/x/checkpoint", b"state", tmp_path)
     for sha256, used in ((saved.sha256, True), ("e" * 64, False)):
         rank = replace(job, checkpoint=replace(saved, sha256=sha256)).open(0, Heard())
@@ -140,7 +140,7 @@ def test_a_damaged_checkpoint_is_not_used(job: StoreWorkplace, tmp_path: Path) -
         rank.close()
 
 
-def test_a_store_that_is_away_for_a_while_loses_nothing(s3: FaultyS3, job: StoreWorkplace) -> None:
+def test_no_file_is_lost_during_a_store_outage(s3: FaultyS3, job: StoreWorkplace) -> None:
     heard = Heard()
     rank = job.open(0, heard)
     s3.fail("reset", 10**6)
@@ -156,7 +156,7 @@ def test_a_store_that_is_away_for_a_while_loses_nothing(s3: FaultyS3, job: Store
     rank.close()
 
 
-def test_what_a_machine_lacks_is_the_machines_fault(
+def test_staging_failures_are_infrastructure_errors(
     s3: FaultyS3, job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gone = replace(job, files=(*job.files[:2], StoredFile("blobs/none", "e" * 64, 3)))
@@ -174,7 +174,7 @@ def test_what_a_machine_lacks_is_the_machines_fault(
         job.open(1, Heard())
 
 
-def test_weights_come_by_digest(
+def test_weights_are_fetched_by_digest(
     job: StoreWorkplace, tiny_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SGSST_CACHE", str(tiny_cache))
@@ -197,7 +197,7 @@ def _open_and_wait(job: StoreWorkplace, ready: Any) -> None:
 
 
 @pytest.mark.parametrize("alone", [True, False])
-def test_what_a_killed_rank_leaves_is_removed(job: StoreWorkplace, tmp_path: Path, alone: bool) -> None:
+def test_folder_of_a_killed_rank_is_removed(job: StoreWorkplace, tmp_path: Path, alone: bool) -> None:
     """The helper process removes the folder; if it is killed too, the next rank on this machine does."""
     spawned = multiprocessing.get_context("spawn")
     ready = spawned.Event()

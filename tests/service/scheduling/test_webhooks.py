@@ -151,7 +151,7 @@ def _tries(store: Store) -> list[int]:
 # --- messages -----------------------------------------------------------------------------------------------------
 
 
-def test_a_message_is_signed_by_the_convention(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+def test_message_is_signed_as_in_standard_webhooks(tmp_path: Path, store: Store, receiver: Receiver) -> None:
     job_id = _end_job(store, receiver.url)
     _deliver(store, tmp_path)
     ((headers, body),) = receiver.heard
@@ -166,7 +166,7 @@ def test_a_message_is_signed_by_the_convention(tmp_path: Path, store: Store, rec
     assert len(receiver.heard) == 1
 
 
-def test_a_message_that_is_refused_is_kept(tmp_path: Path, store: Store, receiver: Receiver, clock: Clock) -> None:
+def test_rejected_message_is_retried(tmp_path: Path, store: Store, receiver: Receiver, clock: Clock) -> None:
     _end_job(store, receiver.url)
     receiver.status = 500
     _deliver(store, tmp_path)
@@ -193,7 +193,7 @@ def test_redirects_are_not_followed(tmp_path: Path, store: Store, receiver: Rece
 UNUSABLE = ["http://127.0.0.1:99999/", "http://[::1", "http://℀.com/", "http://[v1.x]/", "\ud800", ""]
 
 
-def test_bad_rows_stop_no_other_message(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+def test_invalid_rows_do_not_block_other_messages(tmp_path: Path, store: Store, receiver: Receiver) -> None:
     """An older version without validation may have stored such rows. The newest message must still be sent."""
     for url in UNUSABLE[:4]:
         _end_job(store, url)
@@ -203,7 +203,7 @@ def test_bad_rows_stop_no_other_message(tmp_path: Path, store: Store, receiver: 
     assert _tries(store) == [1] * 4
 
 
-def test_a_message_that_always_fails_is_given_up(
+def test_message_that_always_fails_is_given_up(
     tmp_path: Path, store: Store, clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     job_id = _end_job(store, "http://127.0.0.1:99999/")
@@ -219,7 +219,7 @@ def test_a_message_that_always_fails_is_given_up(
     assert "port" in last.getMessage()
 
 
-def test_only_the_head_of_an_answer_is_read(tmp_path: Path, store: Store, start: Start) -> None:
+def test_only_the_head_of_a_response_is_read(tmp_path: Path, store: Store, start: Start) -> None:
     sent, cut_off = [0], threading.Event()
 
     def endless(handler: Any) -> None:
@@ -237,7 +237,7 @@ def test_only_the_head_of_an_answer_is_read(tmp_path: Path, store: Store, start:
     assert _tries(store) == []
 
 
-def test_a_head_without_end_is_not_kept(tmp_path: Path, store: Store, start: Start) -> None:
+def test_endless_response_head_is_not_buffered(tmp_path: Path, store: Store, start: Start) -> None:
     sent, cut_off = [0], threading.Event()
 
     def endless(handler: Any) -> None:
@@ -255,7 +255,7 @@ def test_a_head_without_end_is_not_kept(tmp_path: Path, store: Store, start: Sta
 
 
 @pytest.mark.parametrize("head", [b"", b"HTTP/1.1 200 OK\r\nX: "], ids=["100-continue", "head"])
-def test_a_receiver_that_drips_is_cut_off(
+def test_slow_receiver_is_cut_off_at_the_deadline(
     head: bytes, tmp_path: Path, store: Store, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No single read takes long, but the deadline covers the whole delivery."""
@@ -278,7 +278,7 @@ def test_a_receiver_that_drips_is_cut_off(
     assert _tries(store) == [1]
 
 
-def test_the_deadline_includes_lookup_and_tls(
+def test_deadline_includes_lookup_and_tls(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The receivers are a host name whose lookup hangs, and a server that accepts connections, but never responds."""
@@ -301,7 +301,7 @@ def test_the_deadline_includes_lookup_and_tls(
     assert [record.getMessage().count("no answer within") for record in caplog.records] == [1, 1]
 
 
-def test_slow_receivers_hold_no_other_message(tmp_path: Path, store: Store, start: Start) -> None:
+def test_slow_receivers_do_not_delay_other_messages(tmp_path: Path, store: Store, start: Start) -> None:
     """One owner has many messages to one unresponsive receiver, another one to many such receivers."""
     release = threading.Event()
     slow = start(lambda handler: release.wait(PATIENCE))
@@ -332,7 +332,7 @@ def test_slow_receivers_hold_no_other_message(tmp_path: Path, store: Store, star
 
 
 @pytest.mark.parametrize("backend", ["sqlite", "postgresql"])
-def test_messages_are_taken_in_turns_and_once(backend: str, tmp_path: Path, clock: Clock) -> None:
+def test_messages_are_claimed_fairly_and_once(backend: str, tmp_path: Path, clock: Clock) -> None:
     if backend == "postgresql" and not is_installed():
         pytest.skip("PostgreSQL's server is not installed")
     if backend == "sqlite":
@@ -364,7 +364,7 @@ def _check_turns(store: Store) -> None:
 # --- addresses ----------------------------------------------------------------------------------------------------
 
 
-def test_private_addresses_are_not_called(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+def test_private_addresses_are_refused(tmp_path: Path, store: Store, receiver: Receiver) -> None:
     _end_job(store, receiver.url)
     _end_job(store, f"http://localhost:{receiver.port}/")
     _end_job(store, f"http://2130706433:{receiver.port}/")  # 127.0.0.1 to the system's resolver
@@ -393,16 +393,16 @@ def test_private_addresses_are_not_called(tmp_path: Path, store: Store, receiver
         *("2001:0:7f00:1::", "2001:0:4136:e378:8000:63bf:80ff:fffe"),
     ],
 )
-def test_what_counts_as_private(address: str) -> None:
+def test_private_addresses(address: str) -> None:
     assert not is_public(ipaddress.ip_address(address))
 
 
 @pytest.mark.parametrize("address", ["8.8.8.8", "2606:4700::1111", "64:ff9b::808:808", "::ffff:8.8.8.8"])
-def test_what_counts_as_public(address: str) -> None:
+def test_public_addresses(address: str) -> None:
     assert is_public(ipaddress.ip_address(address))
 
 
-def test_the_checked_address_is_the_one_that_is_called(
+def test_connection_uses_the_checked_address(
     tmp_path: Path, store: Store, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A second DNS lookup would return another address, so there must not be one."""
@@ -423,7 +423,7 @@ def test_the_checked_address_is_the_one_that_is_called(
 
 
 @pytest.mark.parametrize(("name", "delivered"), [("localhost", True), ("other.example", False)])
-def test_certificates_are_verified_for_the_name(
+def test_certificate_is_verified_for_the_host_name(
     name: str, delivered: bool, tmp_path: Path, store: Store, start: Start
 ) -> None:
     """The connection goes to an address; SNI, certificate and `Host` use the name."""
@@ -479,7 +479,7 @@ def _certificate(folder: Path, name: str) -> Path:
         "https://example.com/" + "a" * 2000,
     ],
 )
-def test_urls_that_are_refused(url: str, tmp_path: Path) -> None:
+def test_invalid_urls_are_refused(url: str, tmp_path: Path) -> None:
     with pytest.raises(RefusedInputError) as caught:
         check_url(url, _settings(tmp_path))
     assert caught.value.code == "invalid-webhook"
@@ -493,13 +493,13 @@ def test_urls_that_are_refused(url: str, tmp_path: Path) -> None:
         *("http://localhost:8080/", "http://my_host/", "http://[2606:4700::1111]:8080/hook", "http://example.com./"),
     ],
 )
-def test_urls_that_are_accepted(url: str, tmp_path: Path) -> None:
+def test_valid_urls_are_accepted(url: str, tmp_path: Path) -> None:
     check_url(url, _settings(tmp_path))
     with pytest.raises(RefusedInputError, match="switched off"):
         check_url(url, ServiceSettings(data=tmp_path))
 
 
-def test_the_thread_delivers_until_it_is_stopped(tmp_path: Path, store: Store, receiver: Receiver) -> None:
+def test_thread_delivers_until_it_is_stopped(tmp_path: Path, store: Store, receiver: Receiver) -> None:
     deliverer = Deliverer(_settings(tmp_path), store)
     deliverer.start()
     _end_job(store, receiver.url)

@@ -112,7 +112,7 @@ def wrong_dispatcher(settings: ServiceSettings, seconds: float) -> Iterator[subp
 
 
 @pytest.mark.parametrize("seconds", [31 * DAY, -31 * DAY], ids=["ahead", "behind"])
-def test_a_dispatcher_a_month_off_deletes_nothing(
+def test_dispatcher_with_a_wrong_clock_deletes_nothing(
     settings: ServiceSettings, store: Store, tmp_path: Path, seconds: float
 ) -> None:
     artifacts = Artifacts(settings.artifacts_url)
@@ -148,7 +148,7 @@ def test_a_dispatcher_a_month_off_deletes_nothing(
 
 
 @pytest.mark.slow
-def test_a_dispatcher_two_minutes_ahead_takes_no_healthy_lease(settings: ServiceSettings, store: Store) -> None:
+def test_dispatcher_with_a_fast_clock_takes_no_live_lease(settings: ServiceSettings, store: Store) -> None:
     held = leased(store, "healthy-00000000-1-1")
     with healthy(store, held) as statuses, wrong_dispatcher(settings, 120.0) as process:
         beats = set[float]()
@@ -177,7 +177,7 @@ def store_with_clock(settings: ServiceSettings, wrong_by: float) -> Iterator[tup
         store.close()
 
 
-def test_a_lease_is_lost_once_it_is_silent_for_long_enough(tmp_path: Path) -> None:
+def test_lease_is_lost_after_a_lease_duration_without_renewal(tmp_path: Path) -> None:
     settings = ServiceSettings(data=tmp_path, lease_seconds=LEASE)
     with store_with_clock(settings, 0.0) as (store, _, _), store_with_clock(settings, 120.0) as (ahead, watch, clock):
         store.inputs.add_blob(SHA, "aa/blob", 3)
@@ -191,7 +191,7 @@ def test_a_lease_is_lost_once_it_is_silent_for_long_enough(tmp_path: Path) -> No
         assert ahead.leases.take("wrong", is_lost=watch.is_lost) is not None
 
 
-def test_a_dead_dispatcher_of_this_machine_is_not_waited_for(tmp_path: Path) -> None:
+def test_lease_of_a_dead_local_dispatcher_is_lost_at_once(tmp_path: Path) -> None:
     with store_with_clock(ServiceSettings(data=tmp_path, lease_seconds=LEASE), 0.0) as (store, watch, _):
         store.inputs.add_blob(SHA, "aa/blob", 3)
         leased(store, "dead")
@@ -200,7 +200,7 @@ def test_a_dead_dispatcher_of_this_machine_is_not_waited_for(tmp_path: Path) -> 
         assert store.leases.take("new", is_lost=watch.is_lost) is not None
 
 
-def test_what_a_clock_ahead_has_written_waits_for_nothing(settings: ServiceSettings, store: Store) -> None:
+def test_times_written_by_a_fast_clock_delay_nothing(settings: ServiceSettings, store: Store) -> None:
     """Neither the lease of its dead dispatcher nor a job queued by it has to wait."""
     with (
         store_with_clock(settings, 31 * DAY) as (ahead, _, _),
@@ -219,7 +219,7 @@ def test_what_a_clock_ahead_has_written_waits_for_nothing(settings: ServiceSetti
         assert found.job_id == queued.id
 
 
-def test_what_is_due_is_deleted_after_some_hours_of_work_and_not_at_once(settings: ServiceSettings) -> None:
+def test_overdue_data_are_deleted_gradually(settings: ServiceSettings) -> None:
     """A machine that was off for 40 days cannot be distinguished from one whose clock is ahead."""
     clock = Clock()
     store = open_store(settings, clock)
@@ -242,7 +242,7 @@ def test_what_is_due_is_deleted_after_some_hours_of_work_and_not_at_once(setting
     store.close()
 
 
-def test_results_that_a_clock_behind_has_finished_are_kept_as_long(settings: ServiceSettings, store: Store) -> None:
+def test_slow_clock_does_not_shorten_retention(settings: ServiceSettings, store: Store) -> None:
     store.retention.advance(0.0)
     held = leased(store, "behind")
     with store_with_clock(settings, -31 * DAY) as (behind, _, _):
@@ -253,7 +253,7 @@ def test_results_that_a_clock_behind_has_finished_are_kept_as_long(settings: Ser
 
 
 @pytest.mark.parametrize("wrong_by", [120.0, -120.0, 31 * DAY])
-def test_nothing_is_deleted_while_live_dispatchers_disagree(
+def test_nothing_is_deleted_while_live_clocks_disagree(
     settings: ServiceSettings, store: Store, wrong_by: float
 ) -> None:
     with store_with_clock(settings, wrong_by) as (wrong, watch, clock):

@@ -50,7 +50,7 @@ def test_migrations_only_add(tmp_path: Path) -> None:
     database.close()
 
 
-def test_versions_are_numbered_in_their_order() -> None:
+def test_migrations_are_numbered_in_order() -> None:
     assert VERSIONS[-1] == SCHEMA
     assert [f"{number:04d}" for number in range(1, len(VERSIONS) + 1)] == VERSIONS
 
@@ -74,7 +74,7 @@ def next_version(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_this_version_goes_on_and_starts_on_the_next_ones_tables(tmp_path: Path, tiny_installed: Path) -> None:
+def test_this_version_runs_on_tables_of_the_next_one(tmp_path: Path, tiny_installed: Path) -> None:
     code = next_version(tmp_path / "next")
     files = dict(zip(("scene", "cameras", "style"), write_files(tmp_path, wall()), strict=True))
 

@@ -22,7 +22,7 @@ def sorted_queue(jobs: list[JobRow], served: dict[str, int], now: float) -> JobR
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_order_is_that_of_a_plain_sort(store: Store, clock: Clock, seed: int) -> None:
+def test_queue_order_equals_a_plain_sort(store: Store, clock: Clock, seed: int) -> None:
     chance = random.Random(seed)
     served: dict[str, int] = {}
     for turn in range(1, 60):
@@ -44,7 +44,7 @@ def test_the_order_is_that_of_a_plain_sort(store: Store, clock: Clock, seed: int
             store.leases.succeed(found, [], {})  # in the fourth case the job is lost
 
 
-def test_who_keeps_room_takes_nothing_else_and_others_pass_it_over(store: Store, clock: Clock) -> None:
+def test_reserving_dispatcher_takes_no_other_job(store: Store, clock: Clock) -> None:
     big = queue(store, "a")
     small = []
     for owner in "bca":
@@ -61,7 +61,7 @@ def test_who_keeps_room_takes_nothing_else_and_others_pass_it_over(store: Store,
     assert lease(store, "one").job_id == small[2]
 
 
-def test_a_job_that_no_room_is_kept_for_is_passed_over(store: Store, clock: Clock) -> None:
+def test_job_without_a_reservation_is_skipped(store: Store, clock: Clock) -> None:
     big = queue(store, "a")
     clock.now += 1
     small = queue(store, "b")
@@ -74,7 +74,7 @@ def test_a_job_that_no_room_is_kept_for_is_passed_over(store: Store, clock: Cloc
     assert store.leases.take("one", lambda job: job.id != big) is None, "and now it is kept"
 
 
-def test_what_is_no_hindrance_is_taken_before_what_room_is_kept_for(store: Store, clock: Clock) -> None:
+def test_harmless_jobs_run_before_the_reserved_job(store: Store, clock: Clock) -> None:
     big = queue(store, "a", priority=1)
     others = []
     for owner in "bcbd":
@@ -99,7 +99,7 @@ def test_what_is_no_hindrance_is_taken_before_what_room_is_kept_for(store: Store
     assert lease(store, "one").job_id == big
 
 
-def test_a_job_that_room_is_kept_for_goes_where_it_fits_first(store: Store) -> None:
+def test_reserved_job_runs_where_it_fits_first(store: Store) -> None:
     big = queue(store)
     assert store.leases.take("one", lambda job: False) is None
     assert lease(store, "two").job_id == big
@@ -107,7 +107,7 @@ def test_a_job_that_room_is_kept_for_goes_where_it_fits_first(store: Store) -> N
     assert lease(store, "one").job_id == other, "and nothing is kept any more"
 
 
-def test_room_is_not_kept_by_the_dead(store: Store, clock: Clock) -> None:
+def test_reservation_of_a_dead_dispatcher_expires(store: Store, clock: Clock) -> None:
     big = queue(store, "a")
     clock.now += 1
     small = queue(store, "b")
@@ -127,7 +127,7 @@ def test_room_is_not_kept_by_the_dead(store: Store, clock: Clock) -> None:
     assert found is not None
 
 
-def test_a_higher_priority_goes_before_what_room_is_kept_for(store: Store, clock: Clock) -> None:
+def test_higher_priority_runs_before_the_reserved_job(store: Store, clock: Clock) -> None:
     big = queue(store)
     assert store.leases.take("one", lambda job: False) is None
     urgent = queue(store, "b", priority=1)
@@ -135,7 +135,7 @@ def test_a_higher_priority_goes_before_what_room_is_kept_for(store: Store, clock
     assert lease(store, "one").job_id == big
 
 
-def test_what_waits_is_counted_no_further_than_asked(store: Store, clock: Clock) -> None:
+def test_waiting_jobs_are_counted_up_to_a_maximum(store: Store, clock: Clock) -> None:
     for _ in range(5):
         queue(store)
     lease(store)

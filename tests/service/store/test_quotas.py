@@ -28,7 +28,7 @@ def refusal(store: Store, quotas: Quotas, owner: str = "local") -> dict[str, obj
     return caught.value.extra
 
 
-def test_jobs_of_a_day(store: Store, clock: Clock) -> None:
+def test_daily_jobs_are_limited(store: Store, clock: Clock) -> None:
     clock.now = 100 * DAY + 80_000
     quotas = Quotas(jobs_a_day=2)
     first = submit(store, quotas)
@@ -42,7 +42,7 @@ def test_jobs_of_a_day(store: Store, clock: Clock) -> None:
     submit(store, quotas)
 
 
-def test_gpu_seconds_are_those_that_were_held(store: Store, clock: Clock) -> None:
+def test_gpu_seconds_count_held_gpus(store: Store, clock: Clock) -> None:
     quotas = Quotas(gpu_seconds_a_day=100)
     submit(store, quotas)
     held = lease(store)
@@ -61,7 +61,7 @@ def test_gpu_seconds_are_those_that_were_held(store: Store, clock: Clock) -> Non
 
 
 @pytest.mark.parametrize("ending", ["fail", "release", "stop"])
-def test_every_end_of_an_attempt_counts(store: Store, clock: Clock, ending: str) -> None:
+def test_gpu_seconds_count_for_every_outcome(store: Store, clock: Clock, ending: str) -> None:
     queue(store)
     held = lease(store)
     store.leases.hold_gpus(held, 3)
@@ -73,7 +73,7 @@ def test_every_end_of_an_attempt_counts(store: Store, clock: Clock, ending: str)
     assert store.usage.of("local").gpu_seconds == 15
 
 
-def test_a_machine_that_died_is_not_its_users_doing(store: Store, clock: Clock) -> None:
+def test_lost_attempt_charges_no_gpu_seconds(store: Store, clock: Clock) -> None:
     queue(store)
     store.leases.hold_gpus(lease(store), 8)
     clock.now += LEASE + 1
@@ -81,7 +81,7 @@ def test_a_machine_that_died_is_not_its_users_doing(store: Store, clock: Clock) 
     assert store.usage.of("local").gpu_seconds == 0
 
 
-def test_bytes_are_of_uploads_inputs_and_results(store: Store, clock: Clock) -> None:
+def test_stored_bytes_count_uploads_inputs_and_results(store: Store, clock: Clock) -> None:
     """An input of three bytes counts once, however many jobs use it."""
     quotas = Quotas(stored_bytes=10)
     job_id = submit(store, quotas)
@@ -103,7 +103,7 @@ def test_bytes_are_of_uploads_inputs_and_results(store: Store, clock: Clock) -> 
     submit(store, quotas)
 
 
-def test_an_upload_that_has_become_an_input_counts_once(store: Store) -> None:
+def test_upload_used_as_an_input_counts_once(store: Store) -> None:
     row = store.inputs.create_upload("local", 3, "scene.ply", "", 1000)
     store.inputs.finish_upload(row.id, SHA, 1000)
     queue(store)
@@ -160,7 +160,7 @@ def at_once(work: Callable[[], object], times: int) -> int:
     return len(passed)
 
 
-def test_no_limit_is_passed_by_requests_at_once(store: Store) -> None:
+def test_concurrent_requests_exceed_no_limit(store: Store) -> None:
     """On PostgreSQL, transactions do not see each other's rows, so without a lock, all requests would be accepted."""
     bytes_of_two = Quotas(stored_bytes=10)
     assert at_once(lambda: store.jobs.create(new_job("a"), limit=5), 30) == 5
@@ -178,7 +178,7 @@ def test_no_limit_is_passed_by_requests_at_once(store: Store) -> None:
         assert store.usage.of(owner).stored_bytes == kept
 
 
-def test_limits_name_what_is_too_much(store: Store) -> None:
+def test_quota_errors_name_the_quota(store: Store) -> None:
     store.inputs.create_upload("local", 4, "x", "", 1000, most=1)
     with pytest.raises(ConflictError, match="1 unfinished uploads"):
         store.inputs.create_upload("local", 4, "x", "", 1000, most=1)
@@ -193,7 +193,7 @@ def test_limits_name_what_is_too_much(store: Store) -> None:
 OTHER = "b" * 64
 
 
-def test_receipt_charges_until_a_job_takes_its_files_over(store: Store) -> None:
+def test_receipt_charges_until_its_job_is_created(store: Store) -> None:
     quotas = Quotas(stored_bytes=100)
     receipt = store.inputs.open_receipt("me", 90, quotas)
     assert store.usage.of("me").stored_bytes == 90
@@ -206,7 +206,7 @@ def test_receipt_charges_until_a_job_takes_its_files_over(store: Store) -> None:
     assert store.usage.of("me").stored_bytes == 0
 
 
-def test_files_of_an_ended_request_go_unless_others_use_them(store: Store) -> None:
+def test_unused_files_of_an_ended_request_are_deleted(store: Store) -> None:
     mine, others = store.inputs.open_receipt("me", 10, NO_QUOTAS), store.inputs.open_receipt("other", 10, NO_QUOTAS)
     store.inputs.add_blob(OTHER, "bb/blob", 5, mine)
     store.inputs.add_blob(SHA, "aa/again", 3, mine)
@@ -221,7 +221,7 @@ def test_files_of_an_ended_request_go_unless_others_use_them(store: Store) -> No
     assert store.jobs.get(job.id, "other").status == "queued"
 
 
-def test_last_of_many_that_let_go_at_once_deletes(store: Store) -> None:
+def test_last_of_concurrent_releases_deletes_the_blob(store: Store) -> None:
     for _ in range(5):
         digests = [f"{number:064x}" for number in range(10)]
         receipts = [store.inputs.open_receipt("me", 100, NO_QUOTAS) for _ in range(6)]
@@ -257,7 +257,7 @@ def test_job_whose_input_was_deleted_meanwhile_is_refused(store: Store) -> None:
     assert store.jobs.page("local") == []
 
 
-def test_a_keys_own_quotas_go_before_the_services() -> None:
+def test_quotas_of_a_key_override_the_defaults() -> None:
     settings = ServiceSettings(max_jobs_a_day_per_key=5, max_bytes_per_key=7)
     service = Quotas.of_settings(settings)
     assert service == Quotas(5, None, 7, None)
@@ -265,7 +265,7 @@ def test_a_keys_own_quotas_go_before_the_services() -> None:
     assert service.with_own(None) == service
 
 
-def test_keys_keep_their_quotas(store: Store) -> None:
+def test_quotas_of_a_key_are_stored(store: Store) -> None:
     quotas = Quotas(jobs_a_day=3, requests_a_second=0.5)
     _, text = store.keys.create("alice", quotas=quotas)
     _, plain = store.keys.create("bob")

@@ -29,18 +29,18 @@ def test_failures_count_only_without_progress(before: FailureCount, saved: int |
 
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST, AttemptOutcome.RELEASED])
 @pytest.mark.parametrize("permanent", [False, True])
-def test_a_job_that_is_being_canceled_is_stopped(outcome: AttemptOutcome, permanent: bool) -> None:
+def test_canceling_job_is_stopped(outcome: AttemptOutcome, permanent: bool) -> None:
     found = POLICY.after_attempt(outcome, JobStatus.CANCELING, FailureCount(2, 3), 3, permanent=permanent)
     assert found == Verdict(Transition.STOP, FailureCount(2, 3))
 
 
 @pytest.mark.parametrize("status", [JobStatus.STARTING, JobStatus.RUNNING])
-def test_a_released_job_is_queued_at_once_and_nothing_counts(status: JobStatus) -> None:
+def test_released_job_is_requeued_without_a_failure(status: JobStatus) -> None:
     found = POLICY.after_attempt(AttemptOutcome.RELEASED, status, FailureCount(2, 3), 9)
     assert found == Verdict(Transition.REQUEUE, FailureCount(2, 3), 0.0)
 
 
-def test_waits_double_up_to_the_longest() -> None:
+def test_retry_delay_doubles_up_to_its_maximum() -> None:
     policy = RetryPolicy(max_attempts=100, retry_seconds=5.0)
     count, waits = FRESH, []
     for _ in range(9):
@@ -51,18 +51,18 @@ def test_waits_double_up_to_the_longest() -> None:
     assert waits == [5, 10, 20, 40, 80, 160, MAX_RETRY_SECONDS, MAX_RETRY_SECONDS, MAX_RETRY_SECONDS]
 
 
-def test_progress_makes_the_wait_short_again() -> None:
+def test_progress_resets_the_retry_delay() -> None:
     found = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, FailureCount(2, 10), 20)
     assert found == Verdict(Transition.REQUEUE, FailureCount(0, 20), POLICY.retry_seconds)
 
 
-def test_nobody_waits_after_a_loss() -> None:
+def test_lost_attempt_is_retried_without_delay() -> None:
     found = POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.RUNNING, FailureCount(1, None), None)
     assert found == Verdict(Transition.REQUEUE, FailureCount(2, None), 0.0)
 
 
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST])
-def test_attempts_in_a_row_without_progress_are_bounded(outcome: AttemptOutcome) -> None:
+def test_attempts_without_progress_are_limited(outcome: AttemptOutcome) -> None:
     count, found = FRESH, []
     for _ in range(POLICY.max_attempts):
         verdict = POLICY.after_attempt(outcome, JobStatus.STARTING, count, None)
@@ -71,7 +71,7 @@ def test_attempts_in_a_row_without_progress_are_bounded(outcome: AttemptOutcome)
     assert found == [Transition.REQUEUE, Transition.REQUEUE, Transition.FAIL]
 
 
-def test_what_would_fail_again_is_not_tried_again() -> None:
+def test_permanent_failure_is_not_retried() -> None:
     found = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, FRESH, 50, permanent=True)
     assert found.transition == Transition.FAIL
 
@@ -79,14 +79,14 @@ def test_what_would_fail_again_is_not_tried_again() -> None:
 @pytest.mark.parametrize("status", [JobStatus.STARTING, JobStatus.RUNNING, JobStatus.CANCELING])
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST, AttemptOutcome.RELEASED])
 @pytest.mark.parametrize("permanent", [False, True])
-def test_every_verdict_is_a_way_that_there_is(status: JobStatus, outcome: AttemptOutcome, permanent: bool) -> None:
+def test_every_verdict_is_an_allowed_transition(status: JobStatus, outcome: AttemptOutcome, permanent: bool) -> None:
     for failures in range(POLICY.max_attempts + 1):
         count = FailureCount(failures, None)
         verdict = POLICY.after_attempt(outcome, status, count, None, permanent=permanent)
         assert status in TRANSITIONS[verdict.transition]
 
 
-def test_an_outage_is_waited_out_and_counts_as_no_failure() -> None:
+def test_outage_does_not_count_as_a_failure() -> None:
     count = FailureCount(2, 10)
     waits = []
     for outages in range(1, 12):

@@ -69,13 +69,13 @@ def collect(settings: ServiceSettings) -> bool:
     return rolled_back
 
 
-def test_a_crash_alone_loses_nothing(settings: ServiceSettings) -> None:
+def test_crash_is_not_a_rollback(settings: ServiceSettings) -> None:
     assert not collect(settings)
     assert files_of(settings) == {b"scene", b"plan"}
     assert not collect(settings)
 
 
-def test_a_lost_log_is_reported_and_no_file_is_deleted(
+def test_rollback_is_reported_and_no_file_is_deleted(
     settings: ServiceSettings, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (settings.folder / "sgsst.db-wal").unlink()

@@ -45,7 +45,7 @@ def expected() -> dict[tuple[JobStatus, Transition], JobStatus | None]:
 
 
 @pytest.mark.parametrize(("status", "transition"), list(product(JobStatus, Transition)))
-def test_every_pair(status: JobStatus, transition: Transition) -> None:
+def test_every_transition_of_every_state(status: JobStatus, transition: Transition) -> None:
     wanted = expected()[status, transition]
     assert allowed(status, transition) == (wanted is not None)
     if wanted is not None:
@@ -61,20 +61,20 @@ def test_every_state_is_in_one_group() -> None:
     assert set(FINISHED) == set(ENDED) - {JobStatus.EXPIRED}
 
 
-def test_every_state_is_reached_from_the_first_one() -> None:
+def test_every_state_is_reachable() -> None:
     reached = {JobStatus.QUEUED}
     while new := {way[start] for way in TRANSITIONS.values() for start in reached & way.keys()} - reached:
         reached |= new
     assert reached == set(JobStatus)
 
 
-def test_a_job_that_is_being_canceled_can_only_end() -> None:
+def test_canceling_job_can_only_end() -> None:
     """Such a job never returns to the queue and never fails, because its user has given it up."""
     ways = {way[JobStatus.CANCELING] for way in TRANSITIONS.values() if JobStatus.CANCELING in way}
     assert ways == {JobStatus.CANCELING, JobStatus.CANCELED, JobStatus.SUCCEEDED}
 
 
-def test_actions_are_offered_where_they_change_the_status() -> None:
+def test_actions_apply_to_states_that_they_change() -> None:
     assert ACTIONS == {
         Transition.CANCEL: (JobStatus.QUEUED, JobStatus.STARTING, JobStatus.RUNNING),
         Transition.RETRY: (JobStatus.FAILED, JobStatus.CANCELED),
@@ -86,7 +86,7 @@ def test_every_state_has_a_title() -> None:
     assert (TITLES[JobStatus.SUCCEEDED], TITLES[JobStatus.CANCELING]) == ("Done", "Canceling")
 
 
-def test_names_are_stored_as_text() -> None:
+def test_states_are_plain_strings() -> None:
     """The database and the API use plain strings."""
     assert [str(status) for status in JobStatus] == [status.value for status in JobStatus]
     assert next_status("queued", Transition.TAKE) == "starting"

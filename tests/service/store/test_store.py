@@ -39,7 +39,7 @@ from tests.service.store.helpers import (
 )
 
 
-def test_the_migrations_make_the_tables_that_the_code_describes(store: Store, tmp_path: Path) -> None:
+def test_migrations_create_the_tables_of_the_models(store: Store, tmp_path: Path) -> None:
     found = inspect(store.database.engine)
     for table in Base.metadata.sorted_tables:
         columns = {column["name"]: column["nullable"] for column in found.get_columns(table.name)}
@@ -49,7 +49,7 @@ def test_the_migrations_make_the_tables_that_the_code_describes(store: Store, tm
     Base.metadata.create_all(store.database.engine)  # finds that all tables exist
 
 
-def test_sqlite_is_safe_against_power_cuts(tmp_path: Path) -> None:
+def test_sqlite_commits_are_durable(tmp_path: Path) -> None:
     store = open_store(store_settings(tmp_path, None))
     with store.database.reading() as session:
         pragmas = {
@@ -60,7 +60,7 @@ def test_sqlite_is_safe_against_power_cuts(tmp_path: Path) -> None:
     store.close()
 
 
-def test_the_same_idempotency_key_creates_one_job(store: Store) -> None:
+def test_idempotency_key_creates_one_job(store: Store) -> None:
     first, created = store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "f" * 64))
     again, created_again = store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "f" * 64))
     assert (created, created_again, first.id) == (True, False, again.id)
@@ -71,7 +71,7 @@ def test_the_same_idempotency_key_creates_one_job(store: Store) -> None:
     assert other.id != first.id
 
 
-def test_places_in_the_queue_are_the_order_of_leases(store: Store, clock: Clock) -> None:
+def test_queue_positions_match_the_order_of_leases(store: Store, clock: Clock) -> None:
     ids = []
     for number, priority in enumerate([0, 5, 0, 5, -1, 0]):
         clock.now += number % 2  # two jobs at a time
@@ -82,7 +82,7 @@ def test_places_in_the_queue_are_the_order_of_leases(store: Store, clock: Clock)
     assert store.jobs.detail(ids[0], "local")[1] is None
 
 
-def test_of_many_requests_at_once_with_one_key_one_creates(store: Store) -> None:
+def test_concurrent_requests_with_one_idempotency_key_create_one_job(store: Store) -> None:
     found: list[tuple[str, bool]] = []
 
     def create() -> None:
@@ -94,7 +94,7 @@ def test_of_many_requests_at_once_with_one_key_one_creates(store: Store) -> None
     assert sum(created for _, created in found) == 1
 
 
-def test_many_dispatchers_lease_every_job_once(store: Store) -> None:
+def test_concurrent_dispatchers_lease_every_job_once(store: Store) -> None:
     expected = {queue(store) for _ in range(12)}
     found: list[str] = []
 
@@ -117,7 +117,7 @@ def _at_once(work: Callable[[], None], count: int) -> None:
         thread.join()
 
 
-def test_priority_then_turns_then_age(store: Store, clock: Clock) -> None:
+def test_queue_order_is_priority_then_turn_then_age(store: Store, clock: Clock) -> None:
     order = []
     for owner, priority in (("a", 0), ("a", 0), ("a", 0), ("b", 0), ("c", 1)):
         order.append(queue(store, owner, priority))
@@ -127,7 +127,7 @@ def test_priority_then_turns_then_age(store: Store, clock: Clock) -> None:
     assert [job.id for job in taken if job.owner == "a"] == order[:3]
 
 
-def test_a_big_job_is_not_overtaken_for_ever(store: Store, clock: Clock) -> None:
+def test_large_job_is_not_overtaken_forever(store: Store, clock: Clock) -> None:
     big = queue(store)
     clock.now += 1
     queue(store)
@@ -135,7 +135,7 @@ def test_a_big_job_is_not_overtaken_for_ever(store: Store, clock: Clock) -> None
     assert lease(store).job_id == big
 
 
-def test_who_lost_the_lease_cannot_write(store: Store, clock: Clock) -> None:
+def test_lost_lease_cannot_write(store: Store, clock: Clock) -> None:
     queue(store)
     late = lease(store, "late")
     clock.now += LEASE + 1
@@ -162,7 +162,7 @@ def test_who_lost_the_lease_cannot_write(store: Store, clock: Clock) -> None:
         store.leases.succeed(new, [file], {})
 
 
-def test_a_poisonous_job_is_given_up(store: Store, clock: Clock) -> None:
+def test_job_that_kills_its_dispatchers_fails(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     for attempt in range(1, ATTEMPTS + 1):
         assert lease(store).job.attempt == attempt
@@ -173,7 +173,7 @@ def test_a_poisonous_job_is_given_up(store: Store, clock: Clock) -> None:
     assert [row.outcome for row in store.jobs.detail(job_id, None)[2]] == ["lost"] * ATTEMPTS
 
 
-def test_a_lost_job_that_finds_no_room_is_lost_once(store: Store, clock: Clock) -> None:
+def test_loss_counts_once_without_free_capacity(store: Store, clock: Clock) -> None:
     """The loss counts once, however often a dispatcher without free capacity examines the job."""
     job_id = queue(store)
     lease(store, "late")
@@ -185,7 +185,7 @@ def test_a_lost_job_that_finds_no_room_is_lost_once(store: Store, clock: Clock) 
     assert [row.outcome for row in store.jobs.detail(job_id, None)[2]] == ["lost", None]
 
 
-def test_failed_attempts_wait_longer_each_time(store: Store, clock: Clock) -> None:
+def test_retry_delay_grows_with_each_failure(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     error = {"code": "x", "message": "x"}
     for wait in (RETRY, 2 * RETRY):
@@ -197,7 +197,7 @@ def test_failed_attempts_wait_longer_each_time(store: Store, clock: Clock) -> No
     assert store.jobs.get(job_id, "local").status == "failed"
 
 
-def test_an_outage_is_waited_out_however_long_it_takes(store: Store, clock: Clock) -> None:
+def test_outages_never_fail_a_job(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     outage, error = {"code": "infrastructure", "message": "x"}, {"code": "x", "message": "x"}
     assert store.leases.fail(lease(store), error, permanent=False)
@@ -232,14 +232,14 @@ def fail_at(store: Store, clock: Clock, saved: int | None, *, lost: bool = False
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_a_long_job_outlives_accidents_between_which_it_comes_on(store: Store, clock: Clock, lost: bool) -> None:
+def test_job_with_progress_between_failures_is_retried(store: Store, clock: Clock, lost: bool) -> None:
     queue(store)
     for step in range(10, 100, 10):
         assert fail_at(store, clock, step, lost=lost)
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_a_job_that_always_breaks_at_the_same_step_is_given_up(store: Store, clock: Clock, lost: bool) -> None:
+def test_job_that_fails_at_the_same_step_is_given_up(store: Store, clock: Clock, lost: bool) -> None:
     job_id = queue(store)
     assert fail_at(store, clock, None, lost=lost)
     assert fail_at(store, clock, 90, lost=lost), "this one came on"
@@ -252,7 +252,7 @@ def test_a_job_that_always_breaks_at_the_same_step_is_given_up(store: Store, clo
     assert [fail_at(store, clock, 90, lost=lost) for _ in range(ATTEMPTS)] == [True, True, False]
 
 
-def test_what_was_saved_before_a_shutdown_is_progress_too(store: Store, clock: Clock) -> None:
+def test_checkpoint_before_a_shutdown_counts_as_progress(store: Store, clock: Clock) -> None:
     queue(store)
     assert [fail_at(store, clock, None) for _ in range(ATTEMPTS - 1)] == [True, True]
     clock.now += 1000
@@ -262,7 +262,7 @@ def test_what_was_saved_before_a_shutdown_is_progress_too(store: Store, clock: C
     assert [fail_at(store, clock, None) for _ in range(ATTEMPTS + 1)] == [True, True, True, False]
 
 
-def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
+def test_ended_jobs_are_swept_once(store: Store, clock: Clock) -> None:
     error = {"code": "x", "message": "x"}
     jobs = []
     for _ in range(3):
@@ -291,7 +291,7 @@ def test_jobs_that_ended_are_swept_once(store: Store, clock: Clock) -> None:
     assert store.retention.unswept(10) == [(third, 1)], "it has run again since"
 
 
-def test_dispatchers_are_alive_as_long_as_they_are_heard_of(store: Store, clock: Clock) -> None:
+def test_dispatchers_are_alive_while_they_send_heartbeats(store: Store, clock: Clock) -> None:
     operations = store.operations
     operations.beat("one", 8, 8)
     clock.now += LEASE / 2
@@ -309,7 +309,7 @@ def test_dispatchers_are_alive_as_long_as_they_are_heard_of(store: Store, clock:
         assert session.connection().exec_driver_sql("SELECT name FROM dispatchers").scalars().all() == ["three"]
 
 
-def test_the_migrations_keep_what_is_there(database: str | None, tmp_path: Path) -> None:
+def test_migrations_preserve_data(database: str | None, tmp_path: Path) -> None:
     from alembic import command
     from alembic.config import Config
 
@@ -331,14 +331,14 @@ def test_the_migrations_keep_what_is_there(database: str | None, tmp_path: Path)
     store.close()
 
 
-def test_release_does_not_count_as_failure(store: Store) -> None:
+def test_release_is_not_a_failure(store: Store) -> None:
     queue(store)
     for _ in range(2 * ATTEMPTS):
         store.leases.release(lease(store))
     assert lease(store).job.failures == 0
 
 
-def test_another_owners_job_is_not_there(store: Store) -> None:
+def test_job_of_another_owner_is_not_found(store: Store) -> None:
     job_id = queue(store, "a")
     for use in (store.jobs.get, store.jobs.detail, store.jobs.cancel, store.jobs.delete):
         with pytest.raises(NotFoundError):
@@ -348,7 +348,7 @@ def test_another_owners_job_is_not_there(store: Store) -> None:
     assert store.jobs.page("b") == []
 
 
-def test_the_queue_of_one_key_is_bounded(store: Store) -> None:
+def test_unfinished_jobs_of_a_key_are_limited(store: Store) -> None:
     for _ in range(3):
         store.jobs.create(new_job("a"), limit=3)
     with pytest.raises(QueueFullError):
@@ -356,7 +356,7 @@ def test_the_queue_of_one_key_is_bounded(store: Store) -> None:
     store.jobs.create(new_job("b"), limit=3)
 
 
-def test_old_progress_is_forgotten_but_no_status(store: Store) -> None:
+def test_old_progress_events_are_deleted_but_not_status_events(store: Store) -> None:
     queue(store)
     held = lease(store)
     for step in range(KEPT_PROGRESS + 20):
@@ -372,7 +372,7 @@ def step_of(job: Lease, step: int, seconds: float, **more: Any) -> dict[str, Any
     return {**known, "step": step, "seconds": seconds, "loss": 1e6 / step, "attempt": job.job.attempt, **more}
 
 
-def test_the_course_of_a_loss_is_kept_from_its_beginning(store: Store, clock: Clock) -> None:
+def test_loss_history_covers_the_whole_job(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     held = lease(store)
     store.leases.report_progress(held, {"stage": "planning", "step": 1, "total": 3, "attempt": 1})
@@ -397,7 +397,7 @@ def test_the_course_of_a_loss_is_kept_from_its_beginning(store: Store, clock: Cl
     assert [point.step for point in few] == sorted({point.step for point in few})
 
 
-def test_the_course_goes_on_over_attempts_and_goes_with_its_job(store: Store, clock: Clock) -> None:
+def test_loss_history_continues_across_attempts(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     held = lease(store)
     for step in (1, 2, 3, 4):
@@ -419,7 +419,7 @@ def test_the_course_goes_on_over_attempts_and_goes_with_its_job(store: Store, cl
         assert connection.execute(select(func.count()).select_from(ProgressPointRow)).scalar() == 0
 
 
-def test_the_course_of_many_attempts_is_halved(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_loss_history_is_thinned(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.store.history.MOST_POINTS", 40)
     job_id = queue(store)
     for _ in range(12):
@@ -433,7 +433,7 @@ def test_the_course_of_many_attempts_is_halved(store: Store, monkeypatch: pytest
     assert (found[-1].attempt, found[-1].step) == (12, 20)
 
 
-def test_the_newest_picture_of_each_job(store: Store) -> None:
+def test_newest_preview_of_each_job(store: Store) -> None:
     jobs = sorted(queue(store) for _ in range(3))  # created at the same moment, so their ids define the order
     for number in range(2):
         held = lease(store)
@@ -446,7 +446,7 @@ def test_the_newest_picture_of_each_job(store: Store) -> None:
     assert store.jobs.previews([]) == {}
 
 
-def test_blobs_go_when_nothing_needs_them(store: Store, clock: Clock) -> None:
+def test_unused_blobs_are_deleted(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     clock.now += 2 * GRACE_SECONDS
     assert store.inputs.collect() == []
@@ -458,7 +458,7 @@ def test_blobs_go_when_nothing_needs_them(store: Store, clock: Clock) -> None:
     assert store.inputs.collect() == []  # just touched
 
 
-def test_held_blobs_stay(store: Store, clock: Clock) -> None:
+def test_held_blobs_are_not_collected(store: Store, clock: Clock) -> None:
     for wait in (0.0, 0.05 * GRACE_SECONDS, 0.5 * GRACE_SECONDS):
         clock.now += wait
         assert store.inputs.hold([SHA])[SHA].location == "aa/blob"
@@ -470,7 +470,7 @@ def test_held_blobs_stay(store: Store, clock: Clock) -> None:
         store.inputs.hold([SHA])
 
 
-def test_expired_jobs_lose_their_results_then_themselves(store: Store, clock: Clock) -> None:
+def test_expired_job_is_deleted_after_its_results(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     store.leases.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {})
     clock.now += RETENTION + 1
@@ -483,7 +483,7 @@ def test_expired_jobs_lose_their_results_then_themselves(store: Store, clock: Cl
         store.jobs.get(job_id, "local")
 
 
-def test_however_a_job_ends_it_is_kept_as_long(store: Store, clock: Clock) -> None:
+def test_retention_does_not_depend_on_the_outcome(store: Store, clock: Clock) -> None:
     ends: dict[str, Callable[[], Any]] = {
         "succeeded": lambda: store.leases.succeed(lease(store), [], {}),
         "failed": lambda: store.leases.fail(lease(store), {"code": "x", "message": "x"}, permanent=True),
@@ -496,7 +496,7 @@ def test_however_a_job_ends_it_is_kept_as_long(store: Store, clock: Clock) -> No
         assert (job.status, job.expires_at) == (status, pytest.approx(clock.now + RETENTION))
 
 
-def test_revoked_keys_are_unknown(store: Store) -> None:
+def test_revoked_key_is_rejected(store: Store) -> None:
     row, text = store.keys.create("me")
     assert store.keys.find(text) is not None
     assert store.keys.find(text + "x") is None
