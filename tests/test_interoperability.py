@@ -5,9 +5,11 @@ They come from npm and PyPI at fixed versions. Without either, the tests are ski
 
 from __future__ import annotations
 
+import json
 import shutil
+import struct
 import subprocess
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ from tests.sgsst_core.splat_scenes import cloud
 
 pytestmark = pytest.mark.slow
 
-PACKAGE = "@playcanvas/splat-transform@3.7.0"
+PACKAGES = ("@playcanvas/splat-transform@3.7.0", "gltf-validator@2.0.0-dev.3.10")
 #: Formats that splat-transform reads; its name ends with this suffix for each of ours.
 READ_BY_SPLAT_TRANSFORM = ("ply", "compressed.ply", "spz", "v4.spz", "sog")
 #: Largest differences of opacities after the sigmoid, and of other values, from what another program reads. Compressed
@@ -33,19 +35,19 @@ OPACITIES, VALUES = 1.1e-3, {"compressed.ply": 0.02}
 
 @pytest.fixture(scope="session")
 def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the package of npm."""
+    """Return a folder with the packages of npm."""
     if not shutil.which("npm") or not shutil.which("node"):
         pytest.skip("npm is not installed")
     folder = tmp_path_factory.mktemp("npm")
     (folder / "package.json").write_text("{}")
     done = subprocess.run(
-        ["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", PACKAGE],
+        ["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", *PACKAGES],
         cwd=folder,
         capture_output=True,
         text=True,
     )
     if done.returncode:
-        pytest.skip(f"npm cannot install splat-transform: {done.stderr[-300:]}")
+        pytest.skip(f"npm cannot install the packages: {done.stderr[-300:]}")
     return folder
 
 
@@ -112,6 +114,50 @@ def test_what_splat_transform_writes_is_read(
     assert_same(read_scene(theirs).scene, read_scene(back).scene, 0.02 if "compressed" in name else 1e-4)
 
 
+def test_glb_is_that_of_splat_transform(modules: Path, scene: Scene, tmp_path: Path) -> None:
+    """All attributes have the same values, up to the last bit of normalized quaternions, and those of the PLY."""
+    ply, ours, theirs = (tmp_path / name for name in ("ours.ply", "ours.glb", "theirs.glb"))
+    unit = replace(scene, quats=torch.nn.functional.normalize(scene.quats, dim=1))
+    write_scene(ply, unit)
+    write_scene(ours, unit, by_name("glb"))
+    splat_transform(modules, ply, theirs)
+    found, expected = (attributes_of(path) for path in (ours, theirs))
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        tolerance = 1 if name == "COLOR_0" else 2e-7
+        np.testing.assert_allclose(found[name].astype(float), values.astype(float), rtol=2e-7, atol=tolerance)
+    assert_same(read_scene(theirs).scene, scene, 1e-6)
+
+
+def test_glb_is_valid(modules: Path, scene: Scene, tmp_path: Path) -> None:
+    """The only errors of Khronos' validator are about the attributes of an extension that it does not know."""
+    write_scene(tmp_path / "ours.glb", scene, by_name("glb"))
+    script = (
+        "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
+        ".then((found) => console.log(JSON.stringify(found)))"
+    )
+    command = ["node", "-e", script, str(tmp_path / "ours.glb")]
+    done = subprocess.run(command, cwd=modules, capture_output=True, text=True, check=True)
+    issues = json.loads(done.stdout)["issues"]
+    known = {"MESH_PRIMITIVE_INVALID_ATTRIBUTE", "UNSUPPORTED_EXTENSION"}
+    assert {message["code"] for message in issues["messages"]} <= known, issues
+
+
+def attributes_of(path: Path) -> dict[str, np.ndarray]:
+    """Return the values of all attributes of a GLB, without gaps and interleaving."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    found = {}
+    for name, index in document["meshes"][0]["primitives"][0]["attributes"].items():
+        entry = document["accessors"][index]
+        view = document["bufferViews"][entry["bufferView"]]
+        kind = np.dtype({5126: "<f4", 5121: "u1"}[entry["componentType"]])
+        count = view["byteLength"] // kind.itemsize
+        found[name] = np.frombuffer(data, kind, count, 28 + size + view["byteOffset"])
+    return found
+
+
 @pytest.mark.parametrize("name", ["ply", "compressed.ply", "spz", "v4.spz", "sog"])
 def test_gaussforge_reads_what_is_written(scene: Scene, tmp_path: Path, name: str) -> None:
     gaussforge = pytest.importorskip("gaussforge", reason="gaussforge is not installed")
@@ -127,4 +173,4 @@ def test_gaussforge_reads_what_is_written(scene: Scene, tmp_path: Path, name: st
 
 def test_no_format_is_forgotten() -> None:
     """A new format is added to the lists above, or here if no other program reads it."""
-    assert {each.name for each in RESULT_FORMATS} - {"glb"} == set(READ_BY_SPLAT_TRANSFORM)
+    assert {each.name for each in RESULT_FORMATS} == {*READ_BY_SPLAT_TRANSFORM, "glb"}

@@ -24,7 +24,7 @@ import torch
 from plyfile import PlyData
 
 from api.client import AsyncClient, Client, Job
-from sgsst_core.files.formats import EXTRA_FORMATS
+from sgsst_core.files.formats import EXTRA_FORMATS, by_name
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from tests.api.service import ROOT, Service, wait_for
@@ -236,7 +236,7 @@ def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: d
             first = client.get(where, params={"format": form})
             assert first.status_code == 200, first.text
             assert first.headers["content-disposition"] == f'attachment; filename="stylized.{form}"'
-            assert first.headers["content-type"] == "application/octet-stream"
+            assert first.headers["content-type"] == by_name(form).media_type
             found = read(tmp_path, first.content)
             assert (found.format, len(found.scene)) == (form, len(ply.scene))
             again = client.get(where, params={"format": form}, headers={"If-None-Match": first.headers["etag"]})

@@ -16,7 +16,9 @@ from sgsst_core.bench.stability.case import Case, CaseResult, Group, ordinary, r
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import InvalidInputError
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
+from sgsst_core.files.formats.glb import GLB
 from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.choice import OrbitRequest, make_orbit
@@ -32,7 +34,7 @@ def cases() -> list[Case]:
     """Return all cases of this group."""
     found = [
         Case(f"{name}, as {format.name}", _GROUP, _AGAIN, partial(_compressed, make, format))
-        for format in (COMPRESSED_PLY, SPZ)
+        for format in (COMPRESSED_PLY, SPZ, SOG, GLB)
         for name, make in _SCENES.items()
     ]
     found += [

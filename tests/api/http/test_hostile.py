@@ -277,6 +277,14 @@ SCENES: list[tuple[str, Make]] = [
     ("SOG, half of it", lambda f: f["sog"][: len(f["sog"]) // 2]),
     ("SOG, files of another folder", lambda f: f["sog"].replace(b"quats.webp", b"../../a.sh")),
     ("SOG, a gigabyte in an image", lambda f: zipped("meta.json", bytes(1 << 30))),
+    ("GLB, half of it", lambda f: f["glb"][: len(f["glb"]) // 2]),
+    ("GLB of 4 billion Gaussians", lambda f: f["glb"].replace(b'"count": 616', b'"count": 4294967295')),
+    (
+        "GLB with data in another file",
+        lambda f: f["glb"].replace(b'"byteLength"', b'"uri": "/etc/passwd", "byteLength"'),
+    ),
+    ("GLB with deep JSON", lambda f: glb(b"[" * 500_000)),
+    ("GLB of a mesh", lambda f: glb(b'{"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}')),
     ("SOG without images", lambda f: zipped("meta.json", b'{"version": 2, "means": {"files": ["means_l.webp"]}}')),
 ]
 
@@ -304,6 +312,10 @@ def spz_4(size: int) -> bytes:
     sizes = [9, 1, 3, 3, 4]
     head = b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, 0, 5, 32) + bytes(12)
     return head + b"".join(struct.pack("<QQ", size, becomes) for becomes in sizes)
+
+
+def glb(document: bytes) -> bytes:
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(document), len(document), b"JSON") + document
 
 
 def zipped(name: str, data: bytes) -> bytes:

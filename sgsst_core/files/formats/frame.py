@@ -1,0 +1,97 @@
+"""Rotation, scaling and translation of a scene's arrays, for formats whose axes are not those of a PLY.
+
+A PLY has the axes of its cameras: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgsst_core.constants import SH_C1, SH_C2, SH_C3
+from sgsst_core.files.formats.scene_format import Arrays
+
+#: Number of directions from which the matrices of spherical harmonics are computed; 15 determine degree 3.
+_DIRECTIONS = 64
+#: Decimals of a matrix of spherical harmonics: float64 leaves more, and a rotation by 180 degrees gets exact signs.
+_DECIMALS = 12
+#: Largest factor, whose third power does not overflow.
+_LARGEST = 1e30
+#: Maximum deviation of a matrix from a rotation, relative to its scale.
+_TOLERANCE = 1e-4
+
+_BLOCK_ROWS = 1 << 16
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Similarity transformation of a scene: x becomes scale * rotation x + translation.
+
+    Attributes:
+        rotation: Rotation, [3, 3] float64.
+        scale: Positive factor.
+        translation: Translation, [3] float64.
+    """
+
+    rotation: NDArray[np.float64]
+    scale: float
+    translation: NDArray[np.float64]
+
+    @staticmethod
+    def of(matrix: NDArray[np.float64]) -> Frame:
+        """Split an affine transformation [4, 4].
+
+        Raises:
+            ValueError: If it mirrors or distorts.
+        """
+        linear = matrix[:3, :3]
+        if not np.isfinite(matrix).all() or np.abs(linear).max() > _LARGEST:
+            raise ValueError("the transformation is not finite")
+        scale = float(np.cbrt(np.linalg.det(linear)))
+        if scale <= 0 or np.abs(linear @ linear.T - scale**2 * np.eye(3)).max() > _TOLERANCE * scale**2:
+            raise ValueError("the transformation mirrors or distorts the scene")
+        return Frame(linear / scale, scale, matrix[:3, 3])
+
+    def apply(self, arrays: Arrays) -> None:
+        """Transform the arrays of a scene in place. Computes in float64; rotations by 180 degrees are exact."""
+        turn, harmonics = self._quaternion(), self._harmonics(arrays["sh_rest"].shape[1])
+        for start in range(0, len(arrays["means"]), _BLOCK_ROWS):
+            block = {name: array[start : start + _BLOCK_ROWS] for name, array in arrays.items()}
+            means = block["means"].astype(np.float64)
+            block["means"][:] = self.scale * (means @ self.rotation.T) + self.translation
+            if self.scale != 1:
+                block["scales"] += np.float32(np.log(self.scale))
+            block["quats"][:] = block["quats"].astype(np.float64) @ turn.T
+            rest = block["sh_rest"].astype(np.float64)
+            block["sh_rest"][:] = np.einsum("ij,njc->nic", harmonics, rest)
+
+    def _quaternion(self) -> NDArray[np.float64]:
+        """Return the matrix [4, 4] that multiplies a quaternion (wxyz) by that of the rotation, from the left."""
+        from scipy.spatial.transform import Rotation  # the API process, which only reads headers, needs no SciPy
+
+        x, y, z, w = Rotation.from_matrix(self.rotation).as_quat()
+        return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+
+    def _harmonics(self, coefficients: int) -> NDArray[np.float64]:
+        """Return the matrix of SH coefficients above degree 0, [coefficients, coefficients].
+
+        A rotated function has the value at d that the original has at the inversely rotated d, for all directions d.
+        """
+        directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        new, old = (basis(each)[:, :coefficients] for each in (directions, directions @ self.rotation))
+        matrix: NDArray[np.float64] = np.round(np.linalg.lstsq(new, old, rcond=None)[0], _DECIMALS)
+        return matrix
+
+
+def basis(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the real spherical harmonics of degree 1 to 3 at unit vectors [n, 3], as [n, 15]."""
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+    polynomials = [y, z, x, x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy]
+    polynomials += [y * (3 * xx - yy), x * y * z, y * (4 * zz - xx - yy), z * (2 * zz - 3 * xx - 3 * yy)]
+    polynomials += [x * (4 * zz - xx - yy), z * (xx - yy), x * (xx - 3 * yy)]
+    values: NDArray[np.float64] = np.stack(polynomials, axis=1) * np.array([-SH_C1, SH_C1, -SH_C1, *SH_C2, *SH_C3])
+    return values

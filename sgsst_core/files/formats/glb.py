@@ -1,0 +1,379 @@
+"""Reader and writer of GLB with the glTF extension KHR_gaussian_splatting.
+
+A GLB is a JSON document followed by binary data. The Gaussians are a mesh primitive of points: each attribute is an
+accessor, which states offset, stride and type of its values in the data. Standard deviations and opacities are stored
+as they are, rotations as xyzw. The ratified specification is
+https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting.
+
+glTF has y up, z forward and x left. Scenes are rotated by 180 degrees about z from and to the axes of a PLY, after the
+transformation of the node that holds them.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.files.formats.frame import Frame
+from sgsst_core.files.formats.quantized import SH_C0
+from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+
+_MAGIC = b"glTF"
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_MAX_JSON_BYTES = 1 << 20
+_MAX_BYTES = (1 << 32) - 1
+_EXTENSION = "KHR_gaussian_splatting"
+#: Extensions that change nothing in what is read. Files that require another one are refused.
+_KNOWN_EXTENSIONS = {_EXTENSION, "KHR_mesh_quantization"}
+_SUPPORTED = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "projection": "perspective",
+    "sortingMethod": "cameraDistance",
+}
+
+#: NumPy type codes of component types, and largest values of normalized integers.
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_LARGEST = {"<i1": 127, "<u1": 255, "<i2": 32767, "<u2": 65535}
+_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_FLOAT, _BYTE, _POINTS, _ARRAY_BUFFER = 5126, 5121, 0, 34962
+_MAX_STRIDE = 252
+
+#: Attributes of the scene's tensors other than spherical harmonics, and their types.
+_ATTRIBUTES = {
+    "means": ("POSITION", "VEC3"),
+    "quats": (f"{_EXTENSION}:ROTATION", "VEC4"),
+    "scales": (f"{_EXTENSION}:SCALE", "VEC3"),
+    "opacities": (f"{_EXTENSION}:OPACITY", "SCALAR"),
+    "sh_dc": (f"{_EXTENSION}:SH_DEGREE_0_COEF_0", "VEC3"),
+}
+_HARMONICS = [f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3) for i in range(2 * degree + 1)]
+#: Rotation by 180 degrees about z, which converts between the axes of glTF and of a PLY.
+_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+#: Range of written log scales, within that of float32, and largest written opacity, the last one below 1.
+_LOG_SCALES = (-87.0, 88.0)
+_LARGEST_OPACITY = 1 - 2.0**-24
+_BLOCK_ROWS = 1 << 16
+#: Errors of a JSON document with missing or wrong values.
+_WRONG_JSON = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, OverflowError)
+
+
+@dataclass(frozen=True)
+class Accessor:
+    """Checked place of an attribute's values in the file.
+
+    Attributes:
+        offset: Byte offset of the first value.
+        stride: Bytes from one value to the next.
+        components: Number of components of a value.
+        kind: NumPy type code of a component.
+        normalized: Whether integers stand for -1 to 1, or 0 to 1.
+    """
+
+    offset: int
+    stride: int
+    components: int
+    kind: str
+    normalized: bool
+
+    @property
+    def value_bytes(self) -> int:
+        """Return the bytes of one value."""
+        return self.components * np.dtype(self.kind).itemsize
+
+
+@dataclass(frozen=True)
+class GlbHeader(SceneHeader):
+    """Header of a GLB scene.
+
+    Attributes:
+        accessors: Accessors by the names of the scene's tensors.
+        harmonics: Accessors of the SH coefficients above degree 0.
+        frame: Transformation to the axes of a PLY.
+    """
+
+    accessors: dict[str, Accessor]
+    harmonics: list[Accessor]
+    frame: Frame
+
+
+def _read_header(start: FileStart) -> GlbHeader:
+    path = start.path
+    text, data_offset, data_bytes = _chunks(start)
+    try:
+        document = json.loads(text)
+        required = set(document.get("extensionsRequired", [])) - _KNOWN_EXTENSIONS
+        mesh, primitive = _splats(path, document)
+        if required or primitive["extensions"][_EXTENSION].get("extensions"):
+            names = sorted({*required, *primitive["extensions"][_EXTENSION].get("extensions", {})})
+            raise SceneError(
+                f"{path}: its Gaussians need the glTF extension {', '.join(map(str, names))[:80]}, which cannot be "
+                "read. Export the GLB without compression."
+            )
+        return _parsed(path, document, mesh, primitive, data_offset, data_bytes)
+    except _WRONG_JSON as error:
+        raise SceneError(f"{path}: is not a valid GLB scene ({error!r}). Export it again.") from error
+
+
+def _chunks(start: FileStart) -> tuple[bytes, int, int]:
+    """Return the JSON document, and the offset and size in bytes of the binary data."""
+    path, truncated = start.path, "the file is truncated or its header is wrong. Copy or export it again."
+    head = start.head.ljust(_HEADER.size + _CHUNK.size, b"\0")
+    (_, version, length), (json_bytes, kind) = _HEADER.unpack_from(head), _CHUNK.unpack_from(head, _HEADER.size)
+    if version != 2:
+        raise SceneError(f"{path}: is GLB of version {version}; version 2 can be read. Export it again.")
+    if length > start.size:
+        raise SceneError(f"{path}: the GLB header declares {length} bytes of {start.size}: {truncated}")
+    first = _HEADER.size + _CHUNK.size
+    if kind != b"JSON" or json_bytes > min(_MAX_JSON_BYTES, start.size - first):
+        raise SceneError(f"{path}: the GLB header declares {json_bytes} bytes of JSON: {truncated}")
+    try:
+        with path.open("rb") as file:
+            file.seek(first)
+            text, chunk = file.read(json_bytes), file.read(_CHUNK.size)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    offset = first + json_bytes + _CHUNK.size
+    size, kind = _CHUNK.unpack(chunk) if len(chunk) == _CHUNK.size else (0, b"BIN\0")
+    if kind != b"BIN\0" or offset + size > max(start.size, offset):
+        raise SceneError(f"{path}: the GLB declares {size} bytes of data after its JSON: {truncated}")
+    return text, offset, size
+
+
+def _splats(path: Path, document: dict[str, Any]) -> tuple[int, dict[str, Any]]:
+    """Return the only primitive of Gaussians, and the index of its mesh."""
+    meshes = document.get("meshes", [])
+    found = [
+        (index, primitive)
+        for index, mesh in enumerate(meshes)
+        for primitive in mesh["primitives"]
+        if _EXTENSION in primitive.get("extensions", {})
+    ]
+    if not found:
+        raise SceneError(
+            f"{path}: holds {len(meshes)} meshes but no Gaussians ({_EXTENSION}). Train Gaussians on the object first."
+        )
+    if len(found) > 1:
+        raise SceneError(f"{path}: holds {len(found)} sets of Gaussians; one can be read. Merge them first.")
+    return found[0]
+
+
+def _parsed(
+    path: Path, document: dict[str, Any], mesh: int, primitive: dict[str, Any], data_offset: int, data_bytes: int
+) -> GlbHeader:
+    """Parse a glTF document. Errors of `_WRONG_JSON` mean that a value is missing or wrong."""
+    declared = primitive["extensions"][_EXTENSION]
+    for name, supported in _SUPPORTED.items():
+        if declared.get(name, supported) != supported:
+            raise SceneError(
+                f"{path}: its Gaussians have {name} {str(declared[name])[:40]!r}; only {supported!r} can be read. "
+                "Export it again."
+            )
+    attributes = primitive["attributes"]
+    count = document["accessors"][attributes["POSITION"]]["count"]
+    if type(count) is not int or count < 1:
+        raise ValueError(f"count: {count}")
+
+    def accessor(name: str, kind: str) -> Accessor:
+        if name not in attributes:
+            raise SceneError(f"{path}: its Gaussians have no attribute {name}. Export it again.")
+        return _accessor(document, attributes[name], kind, count, data_offset, data_bytes)
+
+    present = sum(name in attributes for name in _HARMONICS)
+    coefficients = min(number for number in COEFFICIENTS.values() if number >= present)
+    return GlbHeader(
+        GLB,
+        count,
+        coefficients,
+        {name: accessor(*attribute) for name, attribute in _ATTRIBUTES.items()},
+        [accessor(name, "VEC3") for name in _HARMONICS[:coefficients]],
+        Frame.of(_AXES @ _node_matrix(document, mesh)),
+    )
+
+
+def _accessor(
+    document: dict[str, Any], index: int, kind: str, count: int, data_offset: int, data_bytes: int
+) -> Accessor:
+    """Check that the values of an accessor lie in the binary data."""
+    entry = document["accessors"][index]
+    if entry["type"] != kind or entry["count"] != count or "sparse" in entry:
+        raise ValueError(f"accessor {index}: {entry}")
+    view = document["bufferViews"][entry["bufferView"]]
+    if view.get("buffer") != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
+        raise ValueError(f"buffer view {entry['bufferView']} is not in the file, or compressed")
+    code = _TYPES[entry["componentType"]]
+    value_bytes = _COMPONENTS[kind] * np.dtype(code).itemsize
+    stride = view.get("byteStride", value_bytes)
+    first, start, size = entry.get("byteOffset", 0), view.get("byteOffset", 0), view["byteLength"]
+    if any(type(number) is not int or number < 0 for number in (stride, first, start, size)):
+        raise ValueError(f"accessor {index}: {entry}, {view}")
+    inside = start + size <= data_bytes and first + (count - 1) * stride + value_bytes <= size
+    if not inside or not value_bytes <= stride <= _MAX_STRIDE:
+        raise ValueError(f"accessor {index}: {count} values are more than its {size} bytes can hold")
+    normalized = bool(entry.get("normalized", False)) and code in _LARGEST
+    return Accessor(data_offset + start + first, stride, _COMPONENTS[kind], code, normalized)
+
+
+def _node_matrix(document: dict[str, Any], mesh: int) -> NDArray[np.float64]:
+    """Return the transformation [4, 4] of the only node that shows a mesh; identity if no node does."""
+    nodes = document.get("nodes", [])
+    showing = [index for index, node in enumerate(nodes) if node.get("mesh") == mesh]
+    if len(showing) > 1:
+        raise ValueError(f"{len(showing)} nodes show the Gaussians")
+    parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
+    matrix, node = np.eye(4), showing[0] if showing else None
+    for _ in nodes:
+        if node is None:
+            break
+        matrix, node = _local_matrix(nodes[node]) @ matrix, parents.get(node)
+    if node is not None:
+        raise ValueError("the nodes form a cycle")
+    return matrix
+
+
+def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+    """Return a node's own transformation [4, 4]: a matrix in column order, or translation, rotation and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    quat = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
+    if not 0.5 < np.linalg.norm(quat) < 2:
+        raise ValueError(f"rotation: {quat}")
+    x, y, z, w = quat / np.linalg.norm(quat)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
+    matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64).reshape(3)
+    return matrix
+
+
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+    """Fill the arrays of a scene. Opacities of 0 and 1 and standard deviations of 0 become infinite."""
+    assert isinstance(header, GlbHeader)
+    found = header.accessors
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # invalid values are reported later
+        for name in ("means", "sh_dc"):
+            for block, values in _values(file, found[name], header.count):
+                into[name][block] = values
+        for block, values in _values(file, found["quats"], header.count):
+            into["quats"][block] = np.roll(values, 1, axis=1)
+        for block, values in _values(file, found["scales"], header.count):
+            into["scales"][block] = np.log(values)
+        for block, values in _values(file, found["opacities"], header.count):
+            into["opacities"][block] = (np.log(values) - np.log1p(-values))[:, 0]
+        for index, accessor in enumerate(header.harmonics):
+            for block, values in _values(file, accessor, header.count):
+                into["sh_rest"][block, index] = values
+        header.frame.apply(into)
+
+
+def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+    """Yield the values of an accessor block by block, as slices of Gaussians and [n, components]."""
+    kind = np.dtype(accessor.kind)
+    for start in range(0, count, _BLOCK_ROWS):
+        stop = min(start + _BLOCK_ROWS, count)
+        data = np.empty((stop - start - 1) * accessor.stride + accessor.value_bytes, np.uint8)
+        file.read(accessor.offset + start * accessor.stride, data)
+        shape, strides = (stop - start, accessor.components), (accessor.stride, kind.itemsize)
+        values = np.ndarray(shape, kind, data, 0, strides).astype(np.float64)
+        if accessor.normalized:
+            values = np.maximum(values / _LARGEST[accessor.kind], -1)
+        yield slice(start, stop), values
+
+
+def _write(output: BinaryIO, arrays: Arrays) -> None:
+    """Write a GLB with float32 attributes, and colors for programs that show only points.
+
+    Raises:
+        OutputError: If the file would exceed 4 GB.
+    """
+    arrays = {name: array.copy() for name, array in arrays.items()}
+    Frame.of(_AXES).apply(arrays)
+    columns = _columns(arrays)
+    data_bytes = sum(column.nbytes for _, column in columns)
+    document = _document(columns, data_bytes)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    length = _HEADER.size + 2 * _CHUNK.size + len(text) + data_bytes
+    if length > _MAX_BYTES:
+        raise OutputError(f"GLB cannot hold {len(arrays['means'])} Gaussians, which take {length} bytes. Write a PLY.")
+    output.write(_HEADER.pack(_MAGIC, 2, length) + _CHUNK.pack(len(text), b"JSON") + text)
+    output.write(_CHUNK.pack(data_bytes, b"BIN\0"))
+    for _, column in columns:
+        output.write(np.ascontiguousarray(column).data)
+
+
+def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
+    """Return the attributes of a scene in glTF's axes and their values, [n, components]."""
+    with np.errstate(over="ignore"):
+        opacities = np.clip(1 / (1 + np.exp(-arrays["opacities"].astype(np.float64))), 1e-37, _LARGEST_OPACITY)
+    quats = np.roll(arrays["quats"].astype(np.float64), -1, axis=1)
+    colors = np.column_stack([np.clip(0.5 + SH_C0 * arrays["sh_dc"].astype(np.float64), 0, 1), opacities])
+    values = {
+        "means": arrays["means"],
+        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": np.exp(np.clip(arrays["scales"].astype(np.float64), *_LOG_SCALES)),
+        "opacities": opacities[:, None],
+        "sh_dc": arrays["sh_dc"],
+    }
+    found: list[tuple[str, NDArray[Any]]] = [
+        (_ATTRIBUTES[name][0], each.astype("<f4")) for name, each in values.items()
+    ]
+    harmonics = arrays["sh_rest"].shape[1]
+    found += [(_HARMONICS[index], arrays["sh_rest"][:, index].astype("<f4")) for index in range(harmonics)]
+    return [*found, ("COLOR_0", np.rint(255 * colors).astype(np.uint8))]
+
+
+def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int) -> dict[str, Any]:
+    """Return the glTF document of a scene whose columns follow each other in the data."""
+    accessors: list[dict[str, Any]] = []
+    views, offset = [], 0
+    names = {components: name for name, components in _COMPONENTS.items()}
+    for index, (_, column) in enumerate(columns):
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": column.nbytes, "target": _ARRAY_BUFFER})
+        kind = names[column.shape[1]]
+        accessors.append({"bufferView": index, "componentType": _FLOAT, "count": len(column), "type": kind})
+        offset += column.nbytes
+    accessors[0] |= {"min": columns[0][1].min(axis=0).tolist(), "max": columns[0][1].max(axis=0).tolist()}
+    accessors[-1] |= {"componentType": _BYTE, "normalized": True}
+    primitive = {
+        "attributes": {name: index for index, (name, _) in enumerate(columns)},
+        "mode": _POINTS,
+        "extensions": {_EXTENSION: _SUPPORTED},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": "sgsst"},
+        "extensionsUsed": [_EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": data_bytes}],
+    }
+
+
+GLB = SceneFormat(
+    name="glb",
+    title="GLB",
+    matches=lambda start: start.head.startswith(_MAGIC),
+    read_header=_read_header,
+    bytes_per_gaussian=240,
+    read=_read,
+    write=_write,
+    magic=_MAGIC,
+    media_type="model/gltf-binary",
+)

@@ -1,0 +1,76 @@
+"""Tests of transformed scenes: renders are those of a transformed camera."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from sgsst_core.files.formats.frame import Frame, basis
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene import spherical_harmonics
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import scene_colors
+from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
+
+
+def matrix(scale: float = 1.0) -> np.ndarray:
+    found = rotated_pose(2.1).numpy()
+    found[:3, :3] *= scale
+    return found
+
+
+def applied(frame: Frame, scene: Scene) -> Scene:
+    arrays = {field.name: getattr(scene, field.name).numpy().copy() for field in fields(scene)}
+    frame.apply(arrays)
+    return Scene(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
+def test_basis_is_that_of_the_renderer() -> None:
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1)
+    torch.testing.assert_close(torch.from_numpy(basis(directions.numpy())), spherical_harmonics.basis(directions, 3))
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_transformed_scene_looks_the_same_to_a_transformed_camera(scale: float) -> None:
+    scene, view = cloud(300, degree=3), camera(90, 70)
+    moved = matrix(scale)
+    pose = view.world_to_camera.clone()
+    pose[:3, :3] = pose[:3, :3] @ torch.from_numpy(moved[:3, :3].T / scale)
+    pose[:3, 3] = scale * view.world_to_camera[:3, 3] - pose[:3, :3] @ torch.from_numpy(moved[:3, 3])
+    images = []
+    for each, seen in (
+        (scene, view),
+        (applied(Frame.of(moved), scene), replace(view, world_to_camera=pose)),
+    ):
+        near = 0.2 if seen is view else 0.2 * scale
+        images.append(make_rasterizer("reference", each, near=near).render(scene_colors(each, seen), seen))
+    assert float((images[0] - images[1]).abs().max()) < 2e-4
+
+
+def test_rotation_by_180_degrees_is_exact() -> None:
+    scene = cloud(100, degree=3)
+    frame = Frame.of(np.diag([-1.0, -1.0, 1.0, 1.0]))
+    once = applied(frame, scene)
+    assert torch.equal(once.means, scene.means * torch.tensor([-1.0, -1.0, 1.0]))
+    assert torch.equal(held_abs(once), held_abs(scene))
+    twice = applied(frame, once)
+    for name in ("means", "scales", "sh_rest"):
+        assert torch.equal(getattr(twice, name), getattr(scene, name))
+    assert torch.equal(twice.quats, -scene.quats)
+
+
+def held_abs(scene: Scene) -> torch.Tensor:
+    return torch.as_tensor(scene.sh_rest).abs()
+
+
+@pytest.mark.parametrize(
+    "linear", [np.diag([1.0, 1.0, -1.0]), np.diag([1.0, 2.0, 1.0]), np.zeros((3, 3)), np.full((3, 3), np.nan)]
+)
+def test_mirrors_and_distortions_are_refused(linear: np.ndarray) -> None:
+    distorted = np.eye(4)
+    distorted[:3, :3] = linear
+    with pytest.raises(ValueError, match="the transformation"):
+        Frame.of(distorted)
