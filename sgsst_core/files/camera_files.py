@@ -25,10 +25,8 @@ from sgsst_core.files.images import image_size
 from sgsst_core.files.photos import PhotoFolder
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import Lens, fisheye_lens, other_lens, radial_lens
+from sgsst_core.scene.rotations import exact_rotation
 
-#: Largest entry of R R^T - I that is attributed to rounding in the file. Such a matrix R is replaced by the nearest
-#: rotation.
-ROTATION_TOLERANCE = 1e-3
 #: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
 QUATERNION_TOLERANCE = 0.01
 
@@ -264,7 +262,7 @@ def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
     scale = _number(str(dataparser), values, "scale")
     if "applied_scale" in content:
         scale /= _positive(str(path), "applied_scale", _number(str(path), content, "applied_scale"))
-    change = stored @ np.linalg.inv(_exact_rotation(f"{path}: applied_transform", applied))
+    change = stored @ np.linalg.inv(exact_rotation(f"{path}: applied_transform", applied))
     _positive(str(dataparser), "scale", scale)
 
     def apply(pose: NDArray[Any]) -> NDArray[Any]:
@@ -343,24 +341,8 @@ def _camera(
         _positive(where, key, value)
     if not (np.isfinite(world_to_camera).all() and np.isfinite(intrinsics).all()):
         raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
-    matrix = torch.from_numpy(_exact_rotation(where, world_to_camera))
+    matrix = torch.from_numpy(exact_rotation(where, world_to_camera))
     return Camera(name, size[0], size[1], fx, fy, cx, cy, matrix)
-
-
-def _exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
-    """Return `matrix` [4, 4] with its upper left 3x3 replaced by the nearest rotation (polar decomposition).
-
-    The original 3x3 matrix must be a rotation within `ROTATION_TOLERANCE`.
-    """
-    rotation = matrix[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if not error <= ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        what = "mirrors" if error <= ROTATION_TOLERANCE else f"is {error:.2g} off a rotation (allowed: 1e-3)"
-        raise CameraError(f"{where}: its 3x3 matrix {what}. Export the cameras again, without scale or shear.")
-    left, _, right = np.linalg.svd(rotation)
-    exact = matrix.copy()
-    exact[:3, :3] = left @ right
-    return exact
 
 
 def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
@@ -370,7 +352,7 @@ def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
     """
     if not np.isfinite(pose).all():
         raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
-    rotation = _exact_rotation(where, pose)[:3, :3]
+    rotation = exact_rotation(where, pose)[:3, :3]
     inverse = np.eye(4)
     inverse[:3, :3] = rotation.T
     inverse[:3, 3] = -rotation.T @ pose[:3, 3]

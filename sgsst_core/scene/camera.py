@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from sgsst_core.errors import CameraError, SettingsError
+from sgsst_core.scene.rotations import exact_rotation
 
 if TYPE_CHECKING:
     from sgsst_core.scene.lens import Lens
@@ -50,6 +53,48 @@ class Camera:
     resolution: int | None = None
     lens: Lens | None = None
 
+    @staticmethod
+    def from_matrix(
+        viewmat: Tensor | ArrayLike, K: Tensor | ArrayLike, width: int, height: int, name: str = "camera"
+    ) -> Camera:
+        """Return the camera of a view matrix and an intrinsic matrix, as gsplat's `rasterization` takes them.
+
+        Args:
+            viewmat: [4, 4] or [3, 4], world-to-camera transform; its 3x3 matrix must be a rotation within 1e-3.
+            K: [3, 3], rows (fx, 0, cx), (0, fy, cy), (0, 0, 1), in pixels.
+            width: Width in pixels.
+            height: Height in pixels.
+            name: Name of the camera.
+
+        Raises:
+            CameraError: If a shape or value is wrong.
+
+        Example:
+            >>> K = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+            >>> Camera.from_matrix(torch.eye(4), K, 640, 480).fx
+            500.0
+        """
+        pose = np.eye(4)
+        given = _matrix(name, "viewmat", viewmat, (4, 4), (3, 4))
+        pose[: len(given)] = given
+        if not np.array_equal(pose[3], (0, 0, 0, 1)):
+            raise CameraError(
+                f"{name}: the last row of `viewmat` is {pose[3].tolist()}, not [0, 0, 0, 1]. Give the world-to-camera "
+                "matrix of column vectors; transpose one of row vectors."
+            )
+        intrinsics = _matrix(name, "K", K, (3, 3))
+        (fx, skew, cx), (below, fy, cy) = intrinsics[:2].tolist()
+        if skew or below or not np.array_equal(intrinsics[2], (0, 0, 1)) or not (fx > 0 and fy > 0):
+            raise CameraError(
+                f"{name}: `K` is {intrinsics.tolist()}. Give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, with "
+                "fx and fy above 0; undistort images of cameras with skew."
+            )
+        for side, value in (("width", width), ("height", height)):
+            if not (math.isfinite(value) and value > 0 and value == int(value)):
+                raise CameraError(f"{name}: `{side}` is {value}. Give the number of pixels.")
+        rigid = torch.from_numpy(exact_rotation(name, pose))
+        return Camera(name, int(width), int(height), fx, fy, cx, cy, rigid)
+
     @property
     def side(self) -> int:
         """Length in pixels that resolution limits apply to: `resolution`, or the longer side if that is None."""
@@ -60,6 +105,43 @@ class Camera:
         """Camera position in the world, [3] float64."""
         rotation = self.world_to_camera[:3, :3]
         return -rotation.T @ self.world_to_camera[:3, 3]
+
+
+def _matrix(name: str, argument: str, values: Tensor | ArrayLike, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return an argument as a finite float64 matrix of one of the shapes."""
+    try:
+        matrix = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise CameraError(f"{name}: `{argument}` is not a matrix of numbers. Give a tensor or array.") from error
+    if matrix.shape not in shapes:
+        wanted = " or ".join(str(list(shape)) for shape in shapes)
+        raise CameraError(
+            f"{name}: `{argument}` has shape {list(matrix.shape)}. Give {wanted}, for one camera at a time."
+        )
+    if not np.isfinite(matrix).all():
+        raise CameraError(f"{name}: `{argument}` holds NaN or infinite values. Use other values.")
+    return matrix
+
+
+def checked_cameras(cameras: Sequence[Camera]) -> list[Camera]:
+    """Check cameras that a caller of the library passes, and move their transforms to float64 on the CPU.
+
+    Raises:
+        CameraError: If there is anything but cameras, or a transform is not a [4, 4] tensor.
+    """
+    if not isinstance(cameras, Sequence) or not all(isinstance(camera, Camera) for camera in cameras):
+        raise CameraError(
+            f"The cameras are a {type(cameras).__name__}, not a list of `Camera`. Read them with `load_cameras`, or "
+            "make each with `Camera.from_matrix`."
+        )
+    checked = []
+    for camera in cameras:
+        transform = camera.world_to_camera
+        if not isinstance(transform, Tensor) or transform.shape != (4, 4):
+            raise CameraError(f"{camera.name}: its transform is not a [4, 4] tensor. Use `Camera.from_matrix`.")
+        exact = transform.to("cpu", torch.float64)
+        checked.append(camera if exact is transform else replace(camera, world_to_camera=exact))
+    return checked
 
 
 def resized(camera: Camera, side: int) -> Camera:

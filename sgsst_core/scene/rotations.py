@@ -1,10 +1,40 @@
-"""Rotation matrices of quaternions."""
+"""Rotation matrices: those of quaternions, and checks of given ones."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+
+from sgsst_core.errors import CameraError
+
+#: Largest entry of R R^T - I that is attributed to rounding. Such a matrix R is replaced by the nearest rotation.
+ROTATION_TOLERANCE = 1e-3
+
+
+def exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
+    """Return `matrix` [4, 4] with its upper left 3x3 replaced by the nearest rotation (polar decomposition).
+
+    Args:
+        where: Origin of the matrix, for messages.
+        matrix: Rigid transform, whose 3x3 matrix must be a rotation within `ROTATION_TOLERANCE`.
+
+    Raises:
+        CameraError: If the 3x3 matrix is no rotation.
+    """
+    rotation = matrix[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not error <= ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        what = "mirrors" if error <= ROTATION_TOLERANCE else f"is {error:.2g} off a rotation (allowed: 1e-3)"
+        raise CameraError(f"{where}: its 3x3 matrix {what}. Export the cameras again, without scale or shear.")
+    left, _, right = np.linalg.svd(rotation)
+    exact = matrix.copy()
+    exact[:3, :3] = left @ right
+    return exact
 
 
 def rotations(quats: Tensor) -> Tensor:

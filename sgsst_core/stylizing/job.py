@@ -25,7 +25,7 @@ from sgsst_core.planning.planner import make_plan
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions
-from sgsst_core.scene.camera import Camera, fit_cameras, spread
+from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
@@ -193,10 +193,11 @@ def plan_job(
 ) -> StylizationJob:
     """Plan and prepare a job; see `make_plan` for `weights`, `rasterizer` and exceptions.
 
-    Styles are checked and converted by `Style.given`. If the settings request refinement, the job contains the refined
-    scene.
+    Styles and cameras are checked, and converted if necessary. If the settings request refinement, the job contains the
+    refined scene.
     """
     style, regions = Style.given(style), regions and regions.with_checked_styles()
+    cameras = checked_cameras(cameras)
     weights = weights or load_network_weights("auto")
     refinement = refine(
         scene,

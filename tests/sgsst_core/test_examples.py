@@ -19,7 +19,17 @@ from sgsst_core.orbit.cameras import orbit
 from sgsst_core.rasterizer import make_rasterizer
 from tests.small_scenes import wall, write_files
 
-PUBLIC: list[Any] = [Callbacks, Camera, Scene, Stylizer.planned, load_image, make_rasterizer, make_settings, orbit]
+PUBLIC: list[Any] = [
+    Callbacks,
+    Camera,
+    Camera.from_matrix,
+    Scene,
+    Stylizer.planned,
+    load_image,
+    make_rasterizer,
+    make_settings,
+    orbit,
+]
 PUBLIC += [read_cameras, read_scene, run, stylize, write_stylized]
 
 
@@ -27,7 +37,7 @@ PUBLIC += [read_cameras, read_scene, run, stylize, write_stylized]
 def test_example(item: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_files(tmp_path, wall())
     monkeypatch.chdir(tmp_path)
-    names = {each.__name__: each for each in PUBLIC if each is not Stylizer.planned}
+    names = {each.__name__: each for each in PUBLIC if "." not in each.__qualname__}
     names |= {"Stylizer": Stylizer, "Path": Path, "torch": torch}
     examples = doctest.DocTestFinder(recurse=False).find(item, item.__qualname__, globs=names)
     assert sum(len(each.examples) for each in examples) > 1

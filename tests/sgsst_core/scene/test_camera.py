@@ -5,13 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from sgsst_core.errors import CameraError, SettingsError
-from sgsst_core.scene.camera import Camera, fit_cameras, look_at, resized, spread
+from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras, look_at, resized, spread
 from sgsst_core.settings import make_settings
 
 
@@ -88,3 +89,55 @@ def test_look_at_centers_target_with_up_at_the_top() -> None:
     for wrong in (target - position, torch.zeros(3)):
         with pytest.raises(CameraError, match="its up direction"):
             look_at("a", position, target, wrong, width=3, height=2, focal=2.0)
+
+
+K = torch.tensor([[820.0, 0, 490], [0, 810, 380], [0, 0, 1]])
+
+
+def viewmat() -> Tensor:
+    return look_at(
+        "a", torch.tensor([1.0, 2, 3]), torch.zeros(3), torch.tensor([0.0, 0, 1]), width=9, height=7, focal=5
+    ).world_to_camera
+
+
+@pytest.mark.parametrize("form", [torch.Tensor.float, torch.Tensor.numpy, torch.Tensor.tolist, lambda view: view[:3]])
+def test_cameras_are_made_from_matrices(form: Any) -> None:
+    found = Camera.from_matrix(form(viewmat()), form(K.double()), 990, 742, name="a")
+    assert (found.name, found.width, found.height) == ("a", 990, 742)
+    assert (found.fx, found.fy, found.cx, found.cy) == (820, 810, 490, 380)
+    torch.testing.assert_close(found.world_to_camera, viewmat(), rtol=0, atol=2e-7)
+    rotation = found.world_to_camera[:3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3).double(), rtol=0, atol=1e-15)
+
+
+MIRRORED, SKEWED = torch.diag(torch.tensor([-1.0, 1, 1, 1])), K + torch.eye(3).roll(1, 1)
+WRONG: dict[str, tuple[Any, Any, Any, str]] = {
+    "scaled": (2 * torch.eye(4)[:3], K, 990, "is 3 off a rotation"),
+    "mirrored": (MIRRORED, K, 990, "mirrors"),
+    "transposed": (viewmat().T, K, 990, r"last row of `viewmat`.*transpose"),
+    "batch": (torch.eye(4)[None], K, 990, r"shape \[1, 4, 4\].*one camera at a time"),
+    "nan": (torch.full((4, 4), torch.nan), K, 990, "holds NaN"),
+    "text": ("front", K, 990, "not a matrix of numbers"),
+    "skew": (torch.eye(4), SKEWED, 990, "undistort"),
+    "focal": (torch.eye(4), -K, 990, "above 0"),
+    "size": (torch.eye(4), K, 99.5, "`width` is 99.5. Give the number of pixels"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_matrices_that_are_no_camera_are_refused(case: str) -> None:
+    view, intrinsics, width, problem = WRONG[case]
+    with pytest.raises(CameraError, match=problem):
+        Camera.from_matrix(view, intrinsics, width, 742)
+
+
+def test_cameras_of_callers_are_checked() -> None:
+    good = camera()
+    assert checked_cameras([good])[0] is good
+    single = replace(good, world_to_camera=good.world_to_camera.float())
+    assert checked_cameras((single,))[0].world_to_camera.dtype == torch.float64
+    for wrong in ("cameras.json", good, [good, "b"], torch.eye(4)[None]):
+        with pytest.raises(CameraError, match="Read them with `load_cameras`"):
+            checked_cameras(wrong)  # type: ignore[arg-type]
+    with pytest.raises(CameraError, match="a: its transform is not"):
+        checked_cameras([replace(good, world_to_camera=torch.eye(3))])
