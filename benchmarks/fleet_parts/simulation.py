@@ -338,7 +338,7 @@ class Fleet:
     def _run_out(self, host: Host) -> None:
         self._do("failure")
         held = self.store.leases.waiting()
-        self.store.leases.run_out(host.selector.dispatcher)
+        self.store.leases.expire(host.selector.dispatcher)
         self.store.operations.gone(host.selector.dispatcher)
         self._waiting += self.store.leases.waiting() - held
         self._at(self._soon(), self._somebody_looks)

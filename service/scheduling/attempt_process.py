@@ -89,20 +89,20 @@ class AttemptProcess:
     def run(self) -> None:
         """Run the attempt and report how it ended, whatever the reason."""
         signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
-        tell({"kind": "stage", "stage": "reading"})
+        send({"kind": "stage", "stage": "reading"})
         try:
             result = self._run_on_ranks() if self._task.workers > 1 or self._task.cluster else self._run_alone()
         except Exception as error:
-            tell(failure(error))
+            send(failure(error))
             if is_outage(error):
                 log(OUTAGE["message"])  # the details are for the operator only
             else:
                 traceback.print_exc()
             return
         if result is None or result.stopped == "interrupted":
-            tell({"kind": "interrupted"})
+            send({"kind": "interrupted"})
         else:
-            tell({"kind": "done", "result": summary(result)})
+            send({"kind": "done", "result": summary(result)})
 
     def _request(self) -> StylizeRequest:
         from dataclasses import replace
@@ -119,15 +119,15 @@ class AttemptProcess:
         from worker.request import Resume
 
         resume = Resume(self._task.resume, required=False)
-        job = prepare(self._request(), resume=resume, warn=log, show_planning=tell_planning)
-        tell_prepared(describe(job))
+        job = prepare(self._request(), resume=resume, warn=log, show_planning=report_planning)
+        report_prepared(describe(job))
 
         return execute(
             job,
-            progress=tell_progress,
+            progress=report_progress,
             stop=self._stopping.is_set,
             warn=log,
-            preview=Previews(_PREVIEWS, self._task.preview_seconds, tell_preview, log),
+            preview=Previews(_PREVIEWS, self._task.preview_seconds, report_preview, log),
             checkpoint_seconds=self._task.checkpoint_seconds,
         )
 
@@ -136,15 +136,15 @@ class AttemptProcess:
         from worker.ranks.listener import Listener
 
         listener = Listener(
-            planning=tell_planning,
-            prepared=tell_prepared,
-            progress=tell_progress,
+            planning=report_planning,
+            prepared=report_prepared,
+            progress=report_progress,
             happened=log,
             warn=log,
             stop=self._stopping.is_set,
-            preview=tell_preview,
-            left_out=tell_left_out,
-            stored=tell_stored,
+            preview=report_preview,
+            left_out=report_left_out,
+            stored=report_stored,
         )
         options = WorkerOptions(
             checkpoint_seconds=self._task.checkpoint_seconds,
@@ -156,9 +156,9 @@ class AttemptProcess:
         return stylize_on_ranks(self._request(), self._task.workers, listener, options=options).result
 
 
-def tell_planning(now: PlanningProgress) -> None:
+def report_planning(now: PlanningProgress) -> None:
     """Report the progress of planning; one step is one view."""
-    tell(
+    send(
         {
             "kind": "stage",
             "stage": "planning",
@@ -169,16 +169,16 @@ def tell_planning(now: PlanningProgress) -> None:
     )
 
 
-def tell_prepared(prepared: Prepared) -> None:
+def report_prepared(prepared: Prepared) -> None:
     """Log the decisions of the plan and report the first step."""
     for heading, line in prepared.lines:
         log(f"{heading}: {line}")
-    tell({"kind": "prepared", "step": prepared.step, "total": prepared.total})
+    send({"kind": "prepared", "step": prepared.step, "total": prepared.total})
 
 
-def tell_progress(now: Progress) -> None:
+def report_progress(now: Progress) -> None:
     """Report a step."""
-    tell(
+    send(
         {
             "kind": "progress",
             "stage": now.stage,
@@ -192,19 +192,19 @@ def tell_progress(now: Progress) -> None:
     )
 
 
-def tell_left_out(gpus: Sequence[str]) -> None:
+def report_left_out(gpus: Sequence[str]) -> None:
     """Report GPUs that the plan does not use."""
-    tell({"kind": "left-out", "gpus": list(gpus)})
+    send({"kind": "left-out", "gpus": list(gpus)})
 
 
-def tell_stored(file: Published) -> None:
+def report_stored(file: Published) -> None:
     """Report a file that a rank has put into the file store."""
-    tell({"kind": "stored", "file": asdict(file)})
+    send({"kind": "stored", "file": asdict(file)})
 
 
-def tell_preview(path: Path) -> None:
+def report_preview(path: Path) -> None:
     """Report a preview image of the running job."""
-    tell({"kind": "preview", "path": str(path)})
+    send({"kind": "preview", "path": str(path)})
 
 
 def summary(result: Result) -> dict[str, Any]:
@@ -244,7 +244,7 @@ def log(line: str) -> None:
     print(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}", file=sys.stderr, flush=True)
 
 
-def tell(message: Message) -> None:
+def send(message: Message) -> None:
     """Send a message to the dispatcher."""
     _channel.write(json.dumps(message) + "\n")
     _channel.flush()

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from service.store import Store
-from service.store.leases import RUN_OUT
+from service.store.leases import EXPIRED
 from service.store.tables import JobRow
 
 #: Tolerated difference between the clocks of cooperating machines, in seconds.
@@ -32,24 +32,24 @@ class ClockWatch:
 
     def __init__(self, store: Store, lease_seconds: float, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._store, self._lease_seconds, self._monotonic = store, lease_seconds, monotonic
-        self._run_out: dict[str, tuple[tuple[int, float], float]] = {}
-        self._heard: dict[str, float] = {}
-        self._heard_at: float | None = None
+        self._expired: dict[str, tuple[tuple[int, float], float]] = {}
+        self._heartbeats: dict[str, float] = {}
+        self._compared_at: float | None = None
 
     def is_lost(self, job: JobRow) -> bool:
         """Return whether a job whose lease has expired by the database's times may be taken over."""
         expires, database = job.lease_expires_at, self._store.database
-        if expires is None or expires == RUN_OUT:
+        if expires is None or expires == EXPIRED:
             return True
         if not database.sqlite and expires < database.clock():
             return True
         lease, now = (job.lease_epoch, expires), self._monotonic()
-        seen, since = self._run_out.get(job.id, (None, now))
+        seen, since = self._expired.get(job.id, (None, now))
         if seen == lease and now - since >= self._lease_seconds:
-            del self._run_out[job.id]
+            del self._expired[job.id]
             return True
         if seen != lease:
-            self._run_out[job.id] = lease, now
+            self._expired[job.id] = lease, now
         return False
 
     def confirm(self) -> bool:
@@ -58,20 +58,20 @@ class ClockWatch:
         Only heartbeats that were sent since the last call are compared with this clock; older ones may come from dead
         dispatchers. Heartbeats of this dispatcher are compared too, which detects a change of this machine's clock.
         """
-        before, now = self._heard_at, self._monotonic()
+        before, now = self._compared_at, self._monotonic()
         since = 0.0 if before is None else now - before
-        clock, known = self._store.database.clock(), self._heard
-        self._heard, self._heard_at = self._store.operations.heartbeats(), now
-        off = {
+        clock, known = self._store.database.clock(), self._heartbeats
+        self._heartbeats, self._compared_at = self._store.operations.heartbeats(), now
+        offsets = {
             name: seen - clock
-            for name, seen in self._heard.items()
+            for name, seen in self._heartbeats.items()
             if name in known and seen != known[name] and not -since - _TOLERANCE <= seen - clock <= _TOLERANCE
         }
-        if off:
-            name, seconds = max(off.items(), key=lambda item: abs(item[1]))
+        if offsets:
+            name, seconds = max(offsets.items(), key=lambda item: abs(item[1]))
             _log.error(
-                "the clock of dispatcher %s is %+.0f s off this one's: nothing is deleted until both agree. "
-                "Set the clocks of all machines by NTP.",
+                "clocks disagree, nothing is deleted: dispatcher=%s offset_seconds=%+.0f. "
+                "Synchronize the clocks of all machines by NTP.",
                 name,
                 seconds,
             )

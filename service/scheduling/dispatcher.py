@@ -93,7 +93,7 @@ class Dispatcher:
         for name in sorted(known.union(self._store.leases.holders())):
             if is_dead(name):
                 _log.info("taking over jobs of a dead dispatcher: name=%s", name)
-                self._store.leases.run_out(name)
+                self._store.leases.expire(name)
                 self._store.operations.gone(name)
         if self._work.parent.is_dir():
             for path in self._work.parent.iterdir():

@@ -24,12 +24,12 @@ _LONGER_SIDE, _ASPECT = 1600, 0.625
 _PIXEL_SECONDS = {"float32": 5.5e-8, "tf32": 1.6e-8, "bfloat16": 9e-9}
 _GAUSSIAN_SECONDS, _FIXED_SECONDS = 2e-9, 2.1e-3
 #: Network time of a step in phase 1, which optimizes only the coarsest scale, as a fraction of that in phase 2.
-_COARSE_SHARE = 0.1
+_COARSE_FRACTION = 0.1
 #: Communication between ranks: bytes per second that one rank sends, and seconds of latency per message.
 _LINK_BYTES, _LINK_SECONDS = 3e11, 1e-5
 #: Minimum parallel efficiency with an additional GPU, and minimum duration of all steps per additional GPU in seconds
 #: (starting a job takes as long). Both err toward too many GPUs, because the plan releases superfluous ones.
-_LEAST_SHARE, _LEAST_SECONDS = 0.6, 10.0
+_MIN_EFFICIENCY, _MIN_SECONDS = 0.6, 10.0
 #: Seconds before a job's first step (process, CUDA, network and plan), and bytes per second at which its files are
 #: staged.
 _START_SECONDS, _STAGING_BYTES = 18.0, 1e9
@@ -56,26 +56,26 @@ class JobSize:
         """Return the duration of all steps on this number of GPUs, in seconds."""
         raster = _GAUSSIAN_SECONDS * self.gaussians
         network = _PIXEL_SECONDS[self.precision] * self.pixels
-        beside = _FIXED_SECONDS + self._talking(gpus)
-        coarse = (raster + _COARSE_SHARE * network) / gpus + beside
-        return self.steps_coarse * coarse + self.steps_sos * ((raster + network) / gpus + beside)
+        overhead = _FIXED_SECONDS + self._communication(gpus)
+        coarse = (raster + _COARSE_FRACTION * network) / gpus + overhead
+        return self.steps_coarse * coarse + self.steps_sos * ((raster + network) / gpus + overhead)
 
-    def _talking(self, gpus: int) -> float:
+    def _communication(self, gpus: int) -> float:
         """Return the communication time per step in seconds: images, gradients of images and colors, and statistics."""
         if gpus == 1:
             return 0.0
-        moved = 2 * 12 * (self.pixels + self.gaussians)
-        return 6 * (gpus - 1) * _LINK_SECONDS + moved / _LINK_BYTES
+        sent = 2 * 12 * (self.pixels + self.gaussians)
+        return 6 * (gpus - 1) * _LINK_SECONDS + sent / _LINK_BYTES
 
     def gpus(self, most: int) -> int:
         """Return the number of GPUs that the job should get, between 1 and `most`."""
-        alone, found = self.seconds(), 1
+        single, count = self.seconds(), 1
         for gpus in range(2, most + 1):
             seconds = self.seconds(gpus)
-            if alone < _LEAST_SHARE * gpus * seconds or seconds * gpus < _LEAST_SECONDS * (gpus - 1):
+            if single < _MIN_EFFICIENCY * gpus * seconds or seconds * gpus < _MIN_SECONDS * (gpus - 1):
                 break
-            found = gpus
-        return found
+            count = gpus
+        return count
 
 
 def estimated_size(parameters: Mapping[str, Any], inputs: Sequence[Mapping[str, Any]]) -> JobSize:
@@ -119,9 +119,9 @@ def _gaussians(entry: Mapping[str, Any]) -> float:
 
 def _view_pixels(parameters: Mapping[str, Any], settings: Settings, inputs: Sequence[Mapping[str, Any]]) -> float:
     photos = [entry["size"] for entry in inputs if entry["role"] == "photos"]
-    asked = parameters.get("resolution")
-    side = float(asked) if isinstance(asked, int) and asked > 0 else _LONGER_SIDE
-    if photos and not asked:
+    resolution = parameters.get("resolution")
+    side = float(resolution) if isinstance(resolution, int) and resolution > 0 else _LONGER_SIDE
+    if photos and not resolution:
         side = (sum(photos) / len(photos) / _PHOTO_BYTES / _ASPECT) ** 0.5
     if settings.max_resolution is not None:
         side = min(side, settings.max_resolution)

@@ -24,11 +24,11 @@ from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 
 #: Maximum fractions of the machine's memory that all concurrent jobs together, and each of them, may plan with. The
 #: latter equals the default of a job that runs alone (`sgsst_core.budget`), so that both round in the same way.
-_MEMORY_SHARE, _JOB_SHARE = 0.8, 0.4
+_MEMORY_FRACTION, _JOB_FRACTION = 0.8, 0.4
 #: Minimum memory of a job besides its scene, and number of copies of the scene: as read, as rendered, and twice for
 #: what the views and the optimizer store per Gaussian. Measured peaks: 5.8 GB for 4 million Gaussians (1 GB), 0.95 GB
 #: for 50,000.
-_LEAST_MEMORY = 1_000_000_000
+_MIN_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4
 
 
@@ -55,7 +55,7 @@ class Grant:
     Attributes:
         ranks: Maximum number of ranks; the plan may use fewer.
         gpus: Names of GPUs; empty without GPUs.
-        places: Number of slots.
+        slots: Number of slots.
         threads: Number of CPU threads; None for all.
         memory: Memory to plan with in bytes; None for the default of a job that runs alone.
         scene: Size of the job's scene in memory, in bytes.
@@ -63,7 +63,7 @@ class Grant:
 
     ranks: int
     gpus: tuple[str, ...] = ()
-    places: int = 1
+    slots: int = 1
     threads: int | None = None
     memory: int | None = None
     scene: int = 0
@@ -84,17 +84,17 @@ class Capacity:
 
     def __init__(self, machine: Machine, parallel_jobs: int | None) -> None:
         self._machine = machine
-        self._places = parallel_jobs or max(1, len(machine.gpus))
+        self._slots = parallel_jobs or max(1, len(machine.gpus))
 
     @property
     def size(self) -> int:
         """Number of GPUs, or of slots without GPUs."""
-        return len(self._machine.gpus) or self._places
+        return len(self._machine.gpus) or self._slots
 
     def free(self, held: Iterable[Grant]) -> int:
         """Return the free portion of `size`."""
         held = list(held)
-        return len(self._free_gpus(held)) if self._machine.gpus else self._free_places(held)
+        return len(self._free_gpus(held)) if self._machine.gpus else self._free_slots(held)
 
     def grant(self, job: QueuedJob, held: Iterable[Grant], waiting: int) -> Grant | None:
         """Return the capacity that a job gets beside the running jobs; None if it has to wait.
@@ -104,48 +104,48 @@ class Capacity:
             waiting: Number of jobs that this machine could start now, including this one.
         """
         held = list(held)
-        places = self._free_places(held)
-        if places < 1:
+        slots = self._free_slots(held)
+        if slots < 1:
             return None
-        asked = _asked(job, "workers")
+        requested = _requested(job, "workers")
         if self._machine.gpus:
-            return self._on_gpus(job, asked, held, min(max(waiting, 1), places))
-        return self._on_cores(job, asked or 1, places)
+            return self._on_gpus(job, requested, held, min(max(waiting, 1), slots))
+        return self._on_cores(job, requested or 1, slots)
 
     def _free_gpus(self, held: list[Grant]) -> list[str]:
         taken = {gpu for grant in held for gpu in grant.gpus}
         return [gpu for gpu in self._machine.gpus if gpu not in taken]
 
-    def _free_places(self, held: list[Grant]) -> int:
-        return self._places - sum(grant.places for grant in held)
+    def _free_slots(self, held: list[Grant]) -> int:
+        return self._slots - sum(grant.slots for grant in held)
 
-    def _on_gpus(self, job: QueuedJob, asked: int, held: list[Grant], sharers: int) -> Grant | None:
+    def _on_gpus(self, job: QueuedJob, requested: int, held: list[Grant], sharers: int) -> Grant | None:
         free = self._free_gpus(held)
-        if asked:
-            ranks = min(asked, len(self._machine.gpus))
+        if requested:
+            ranks = min(requested, len(self._machine.gpus))
         else:
-            share = max(1, len(free) // sharers)
-            ranks = estimated_size(job.parameters, job.inputs).gpus(share) if share > 1 else 1
+            portion = max(1, len(free) // sharers)
+            ranks = estimated_size(job.parameters, job.inputs).gpus(portion) if portion > 1 else 1
         if ranks > len(free):
             return None
         grant = Grant(ranks, tuple(free[:ranks]), scene=_scene_bytes(job))
         if not held or self._machine.cluster:  # a job that runs alone is started even if memory may be short
             return grant
         together = sum(each.beside_gpus for each in (grant, *held))
-        return grant if together <= _MEMORY_SHARE * self._machine.memory else None
+        return grant if together <= _MEMORY_FRACTION * self._machine.memory else None
 
     def _on_cores(self, job: QueuedJob, ranks: int, free: int) -> Grant | None:
-        if self._places == 1 or self._machine.cluster:
+        if self._slots == 1 or self._machine.cluster:
             return Grant(ranks)
-        share = _MEMORY_SHARE * self._machine.memory / self._places
-        asked = _asked(job, "memory_limit")
+        portion = _MEMORY_FRACTION * self._machine.memory / self._slots
+        requested = _requested(job, "memory_limit")
         scene = _SCENE_COPIES * _scene_bytes(job)
-        places = min(math.ceil((scene + (asked or _LEAST_MEMORY)) / share), self._places)
-        if places > free:
+        slots = min(math.ceil((scene + (requested or _MIN_MEMORY)) / portion), self._slots)
+        if slots > free:
             return None
-        limit = max(int(min(_JOB_SHARE * self._machine.memory, places * share - scene)), _LEAST_MEMORY)
-        threads = max(1, self._machine.cores * places // self._places)
-        return Grant(ranks, (), places, threads, min(asked or limit, limit))
+        limit = max(int(min(_JOB_FRACTION * self._machine.memory, slots * portion - scene)), _MIN_MEMORY)
+        threads = max(1, self._machine.cores * slots // self._slots)
+        return Grant(ranks, (), slots, threads, min(requested or limit, limit))
 
 
 def _scene_bytes(job: QueuedJob) -> int:
@@ -156,7 +156,7 @@ def _scene_bytes(job: QueuedJob) -> int:
     return int(size * growth) if isinstance(growth, int | float) and growth > 1 else size
 
 
-def _asked(job: QueuedJob, name: str) -> int:
+def _requested(job: QueuedJob, name: str) -> int:
     """Return an integer parameter of a job; 0 if it is missing or has another type.
 
     Other types were stored by an earlier version of the service. The attempt will reject them, so they need no

@@ -23,7 +23,7 @@ from service.store.leases import Lease, Published
 _LOG_TAIL = 2000
 #: Delay in seconds before a failed upload is retried, and time in seconds after which an attempt fails if its results
 #: cannot be uploaded. The latter is long enough for a restart of the file store, which must not lose a finished job.
-_AGAIN_SECONDS, PATIENCE_SECONDS = 5.0, 600.0
+_RETRY_SECONDS, PATIENCE_SECONDS = 5.0, 600.0
 
 _log = logging.getLogger(__name__)
 _STEM = Path(RESULT).stem
@@ -49,7 +49,7 @@ class Outbox:
     def __init__(self, job_id: str, epoch: int, out: Path, artifacts: Artifacts) -> None:
         self._job_id, self._epoch = job_id, epoch
         self._out, self._artifacts = out, artifacts
-        self._put: dict[str, tuple[int, int]] = {}
+        self._uploaded: dict[str, tuple[int, int]] = {}
 
     def unfinished(self) -> dict[str, Path]:
         """Return the files that are visible while the job runs; some may not exist yet."""
@@ -75,13 +75,13 @@ class Outbox:
             with contextlib.suppress(FileNotFoundError):
                 status = path.stat()
                 stamp = (status.st_size, status.st_mtime_ns)
-                if self._put.get(name) == stamp:
+                if self._uploaded.get(name) == stamp:
                     continue
                 try:
                     done.append(self._put_file(name, path))
                 except StoreError as error:
                     return done, error
-                self._put[name] = stamp
+                self._uploaded[name] = stamp
         return done, None
 
     def _put_file(self, name: str, path: Path) -> Published:
@@ -130,16 +130,16 @@ class Publisher:
         Args:
             whole_log: Whether to publish the current log even if it has just been copied.
         """
-        if time.monotonic() - self._refused_at < _AGAIN_SECONDS and not whole_log:
+        if time.monotonic() - self._refused_at < _RETRY_SECONDS and not whole_log:
             return
         put, refused = self._outbox.put(self._outbox.unfinished() | self._grown_log(now=whole_log))
         self.publish(put)
         if refused is not None:
             self._refused_at = time.monotonic()
-            _log.warning("%s: some files could not be stored: %s", self._lease.job_id, _reason(refused))
+            _log.warning("upload failed, retrying: %s", _reason(refused), extra=self._lease.log_fields)
 
     def publish(self, files: Sequence[Published]) -> None:
-        """Make stored files visible; results are held back until the end."""
+        """Make stored files visible, except for results, which become visible at the end."""
         self._results |= {file.name: file for file in files if file.name in RESULTS}
         now = [file for file in files if file.name not in RESULTS]
         if now:
@@ -151,7 +151,7 @@ class Publisher:
             for location in locations:
                 self._artifacts.remove(location)
         except StoreError as error:
-            _log.warning("%s: replaced files could not be deleted yet: %s", self._lease.job_id, _reason(error))
+            _log.warning("replaced files not deleted yet: %s", _reason(error), extra=self._lease.log_fields)
 
     def _grown_log(self, *, now: bool) -> dict[str, Path]:
         """Return a copy of the log if one is due, because the process keeps writing to the log itself."""
@@ -187,7 +187,7 @@ class Publisher:
         try:
             sweep(self._store, self._artifacts, self._lease.job_id, self._lease.epoch)
         except StoreError as error:
-            _log.warning("%s: leftover files could not be deleted: %s", self._lease.job_id, _reason(error))
+            _log.warning("leftover files not deleted yet: %s", _reason(error), extra=self._lease.log_fields)
 
     def log_tail(self) -> str | None:
         """Return the end of the log; None if there is no log."""
@@ -212,8 +212,8 @@ def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Publishe
             return done
         if given_up() or time.monotonic() - started > PATIENCE_SECONDS:
             raise refused
-        _log.warning("results could not be stored; retrying: %s", _reason(refused))
-        time.sleep(_AGAIN_SECONDS)
+        _log.warning("upload of results failed, retrying: %s", _reason(refused))
+        time.sleep(_RETRY_SECONDS)
 
 
 def _reason(error: StoreError) -> str:

@@ -39,9 +39,9 @@ from worker.ranks.host_memory import scene_bytes
 from worker.workplace import Stored
 
 #: Interval between checks for new files to upload, in seconds.
-_LOOK_SECONDS = 0.5
+_SCAN_SECONDS = 0.5
 #: Delay in seconds before files that the store rejected are uploaded again.
-_AGAIN_SECONDS = 5.0
+_RETRY_SECONDS = 5.0
 #: Prefix of the names of feature network weights in the store.
 _WEIGHTS_FOLDER = "weights"
 
@@ -122,14 +122,14 @@ class StoreWorkplace:
 
     def after(self, stored: Sequence[Published]) -> StoreWorkplace:
         """Return a copy whose checkpoint is the last one among these files."""
-        found = [file for file in stored if file.name == CHECKPOINT]
-        if not found:
+        saved = [file for file in stored if file.name == CHECKPOINT]
+        if not saved:
             return self
-        return replace(self, checkpoint=StoredFile(found[-1].location, found[-1].sha256, found[-1].size))
+        return replace(self, checkpoint=StoredFile(saved[-1].location, saved[-1].sha256, saved[-1].size))
 
     def tidy(self) -> None:
         """Remove folders of dead ranks on this machine."""
-        _remove_left(_ranks_folder(node_settings()))
+        _remove_leftovers(_ranks_folder(node_settings()))
 
 
 class RankFolder:
@@ -141,37 +141,37 @@ class RankFolder:
     def __init__(self, workplace: StoreWorkplace, rank: int, stored: Stored) -> None:
         settings = node_settings()
         keep_private(settings)
-        above = _ranks_folder(settings)
-        above.mkdir(parents=True, exist_ok=True)
-        _remove_left(above)
-        self._above = above / f"{workplace.job_id}-{workplace.epoch}-{rank}-{secrets.token_hex(4)}"
-        with _locked(above / "all"):  # an unlocked folder would be taken for a leftover
-            self._above.mkdir()
-            self._lock = (self._above / "lock").open("w")
+        parent = _ranks_folder(settings)
+        parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(parent)
+        self._root = parent / f"{workplace.job_id}-{workplace.epoch}-{rank}-{secrets.token_hex(4)}"
+        with _locked(parent / "all"):  # an unlocked folder would be taken for a leftover
+            self._root.mkdir()
+            self._lock = (self._root / "lock").open("w")
             fcntl.flock(self._lock, fcntl.LOCK_EX)
-        self._sweeper = sweeper.beside(self._above)
-        self.folder = self._above / "job"
-        self._shipper: _Shipper | None = None
+        self._sweeper = sweeper.beside(self._root)
+        self.folder = self._root / "job"
+        self._uploader: _Uploader | None = None
         try:
-            self._lay_out(workplace, settings, rank)
+            self._stage(workplace, settings, rank)
         except BaseException:
             self.close()
             raise
         if rank == 0:
             outbox = Outbox(workplace.job_id, workplace.epoch, self.folder / "out", Artifacts(workplace.url))
-            self._shipper = _Shipper(outbox, stored)
+            self._uploader = _Uploader(outbox, stored)
 
-    def _lay_out(self, workplace: StoreWorkplace, settings: ServiceSettings, rank: int) -> None:
+    def _stage(self, workplace: StoreWorkplace, settings: ServiceSettings, rank: int) -> None:
         cache, objects = open_cache(settings), ObjectStore(workplace.url)
-        kept, weights, out = self._above / "files", self._above / "weights", self.folder / "out"
-        for path in (kept, weights, out):
+        files, weights, out = self._root / "files", self._root / "weights", self.folder / "out"
+        for path in (files, weights, out):
             path.mkdir(parents=True)
 
         def link(file: StoredFile, target: Path) -> Path:
             cache.link(file.sha256, file.size, target, partial(objects.get, file.name))
             return target
 
-        blobs = {file.sha256: link(file, kept / file.sha256) for file in workplace.files}
+        blobs = {file.sha256: link(file, files / file.sha256) for file in workplace.files}
         stage(self.folder, workplace.inputs, blobs)
         try:
             for name, file in workplace.weights.items():
@@ -189,55 +189,55 @@ class RankFolder:
         Raises:
             StoreError: If the store was unreachable for too long.
         """
-        if self._shipper is not None:
-            self._shipper.finish(done=done)
+        if self._uploader is not None:
+            self._uploader.finish(done=done)
 
     def close(self) -> None:
         """Remove the folder."""
-        if self._shipper is not None:
-            self._shipper.stop()
-        shutil.rmtree(self._above, ignore_errors=True)
+        if self._uploader is not None:
+            self._uploader.stop()
+        shutil.rmtree(self._root, ignore_errors=True)
         self._lock.close()
         sweeper.dismiss(self._sweeper)
 
 
-class _Shipper:
+class _Uploader:
     """Uploader of a job's files in its own thread, so that steps do not wait for the store."""
 
     def __init__(self, outbox: Outbox, stored: Stored) -> None:
         self._outbox, self._stored = outbox, stored
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="shipper", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="uploader", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
-        while not self._stop.wait(_LOOK_SECONDS):
+        while not self._stop.wait(_SCAN_SECONDS):
             try:
-                refused = self._ship()
+                refused = self._upload()
             except Exception:  # the job continues whatever the error is
-                _log.exception("the files of the job could not be stored")
+                _log.exception("upload failed, retrying")
                 refused = None
             if refused is not None:
-                _log.warning("the files of the job could not be stored: %s", refused.__cause__ or refused)
-                self._stop.wait(_AGAIN_SECONDS)
+                _log.warning("upload failed, retrying: %s", refused.__cause__ or refused)
+                self._stop.wait(_RETRY_SECONDS)
 
-    def _ship(self) -> StoreError | None:
+    def _upload(self) -> StoreError | None:
         put, refused = self._outbox.put(self._outbox.unfinished())
-        self._tell(put)
+        self._report(put)
         return refused
 
-    def _tell(self, files: Sequence[Published]) -> None:
+    def _report(self, files: Sequence[Published]) -> None:
         for file in files:
             self._stored(file, file.step)
 
     def finish(self, *, done: bool) -> None:
         self.stop()
         if done:
-            self._tell(put_patiently(self._outbox, lambda: False))
-        refused = self._ship()
+            self._report(put_patiently(self._outbox, lambda: False))
+        refused = self._upload()
         if refused is not None and not done:
-            time.sleep(_AGAIN_SECONDS)
-            refused = self._ship()
+            time.sleep(_RETRY_SECONDS)
+            refused = self._upload()
             if refused is not None:
                 raise refused
 
@@ -253,15 +253,15 @@ def store_weights(objects: ObjectStore) -> dict[str, StoredFile]:
     Raises:
         StoreError: If the store cannot be reached.
     """
-    found = {}
+    weights = {}
     for path in sorted(cache_folder().glob("*.safetensors")):
         status = path.stat()
         sha256 = _digest(path, status.st_size, status.st_mtime_ns)
         file = StoredFile(f"{_WEIGHTS_FOLDER}/{sha256}", sha256, status.st_size)
         if not objects.exists(file.name):
             objects.put(path, file.name)
-        found[path.name] = file
-    return found
+        weights[path.name] = file
+    return weights
 
 
 @lru_cache
@@ -280,12 +280,12 @@ def _ranks_folder(settings: ServiceSettings) -> Path:
     return settings.folder / "ranks"
 
 
-def _remove_left(above: Path) -> None:
+def _remove_leftovers(parent: Path) -> None:
     """Remove folders whose lock is not held."""
-    if not above.is_dir():
+    if not parent.is_dir():
         return
-    with _locked(above / "all"):
-        for path in above.iterdir():
+    with _locked(parent / "all"):
+        for path in parent.iterdir():
             if not path.is_dir():
                 continue
             with contextlib.suppress(OSError), (path / "lock").open("a") as lock:
@@ -306,8 +306,8 @@ def _fetch_checkpoint(objects: ObjectStore, checkpoint: StoredFile, target: Path
         objects.get(checkpoint.name, target)
     except FileNotFoundError:
         target.unlink(missing_ok=True)
-        _log.warning("the checkpoint %s is gone: the job starts again", checkpoint.name)
+        _log.warning("checkpoint missing, job restarts: name=%s", checkpoint.name)
         return
     if file_digest(target) != checkpoint.sha256:
         target.unlink()
-        _log.error("the checkpoint %s is damaged: the job starts again", checkpoint.name)
+        _log.error("checkpoint damaged, job restarts: name=%s", checkpoint.name)

@@ -29,7 +29,7 @@ from service.store import Store
 from service.store.operations import Delivery
 
 #: Delays before further attempts in seconds: the schedule that Standard Webhooks suggests, up to a day.
-_WAITS = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0)
+_RETRY_SECONDS = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0)
 #: Time limit of one attempt in seconds: lookup, connection, TLS, request and the head of the response together.
 _DEADLINE = 15.0
 #: Time in seconds during which no other dispatcher takes a message that is being sent: several deadlines.
@@ -126,11 +126,11 @@ def _look_up(host: str, port: int) -> Future[list[str]]:
 
     def run() -> None:
         try:
-            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            entries = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError) as error:
             future.set_exception(OSError(f"{host} is not known ({error})"))
         else:
-            future.set_result([str(entry[4][0]) for entry in found])
+            future.set_result([str(entry[4][0]) for entry in entries])
 
     threading.Thread(target=run, name="webhook-lookup", daemon=True).start()
     return future
@@ -143,12 +143,12 @@ async def checked_address(host: str, port: int, *, private_allowed: bool) -> str
         PermissionError: If any address of the host is not public.
         OSError: If the name is unknown.
     """
-    found = [address.partition("%")[0] for address in await asyncio.wrap_future(_look_up(host, port))]
+    addresses = [address.partition("%")[0] for address in await asyncio.wrap_future(_look_up(host, port))]
     if not private_allowed:
-        for address in found:
+        for address in addresses:
             if not is_public(ipaddress.ip_address(address)):
                 raise PermissionError(f"{host} leads to {address}, which is not public")
-    return found[0]
+    return addresses[0]
 
 
 class Deliverer:
@@ -178,7 +178,7 @@ class Deliverer:
             try:
                 self.deliver_due()
             except Exception:  # the database may be down; the thread must continue
-                _log.exception("webhooks could not be delivered")
+                _log.exception("delivery of webhooks failed, retrying")
 
     def deliver_due(self) -> None:
         """Send due messages until none is due or being sent."""
@@ -207,18 +207,18 @@ class Deliverer:
                 error = await self._send(delivery)
         except TimeoutError:
             error = f"no answer within {_DEADLINE:g} s"
-        except Exception as broken:
-            error = f"{type(broken).__name__}: {broken}"[:_MAX_REASON]
-        wait = None if error is None or delivery.tries > len(_WAITS) else _WAITS[delivery.tries - 1]
+        except Exception as failure:
+            error = f"{type(failure).__name__}: {failure}"[:_MAX_REASON]
+        wait = None if error is None or delivery.tries > len(_RETRY_SECONDS) else _RETRY_SECONDS[delivery.tries - 1]
         if error is not None:
-            outcome = "given up" if wait is None else f"next attempt in {wait:g} s"
+            outcome = "given up" if wait is None else f"retrying in {wait:g} s"
             _log.warning(
-                "webhook failed (attempt %d, %s): %s", delivery.tries, outcome, error, extra={"job": delivery.job_id}
+                "webhook failed, %s: try=%d error=%s", outcome, delivery.tries, error, extra={"job": delivery.job_id}
             )
         try:
             await asyncio.to_thread(self._store.operations.settle_delivery, delivery.id, wait)
         except Exception:  # due again when the hold expires
-            _log.exception("the outcome of a webhook could not be stored", extra={"job": delivery.job_id})
+            _log.exception("webhook outcome not stored", extra={"job": delivery.job_id})
 
     async def _send(self, delivery: Delivery) -> str | None:
         """Send one message and return the error; None for success."""

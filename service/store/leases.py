@@ -27,7 +27,7 @@ from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, Rese
 from sgsst_core.errors import InfrastructureError
 
 #: Expiry of a lease whose dispatcher is known to be dead.
-RUN_OUT = 0.0
+EXPIRED = 0.0
 #: Number of progress events stored per job; a client that resumes from an older event misses only old progress.
 KEPT_PROGRESS = 200
 #: Maximum number of past attempts counted for the retry delay: by then the delay is at its maximum.
@@ -204,11 +204,11 @@ class Leases:
             query = select(JobRow.lease_owner).where(JobRow.status.in_(ACTIVE), JobRow.lease_owner.is_not(None))
             return sorted({str(owner) for owner in session.scalars(query)})
 
-    def run_out(self, dispatcher: str) -> None:
+    def expire(self, dispatcher: str) -> None:
         """Expire the leases and the reservation of a dispatcher that is known to be dead."""
         with self._database.writing() as session:
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
-            session.execute(update(JobRow).where(held).values(lease_expires_at=RUN_OUT))
+            session.execute(update(JobRow).where(held).values(lease_expires_at=EXPIRED))
             session.execute(delete(ReservationRow).where(mine(dispatcher)))
 
     def hold_gpus(self, lease: Lease, gpus: int) -> None:

@@ -334,16 +334,16 @@ def test_slots_are_fractions_of_cores_and_memory() -> None:
     capacity = Capacity(machine(0), 4)
     small = capacity.grant(job(GB), [], 9)
     assert small is not None
-    assert (small.places, small.threads) == (1, 4)
+    assert (small.slots, small.threads) == (1, 4)
     assert small.memory == 20 * GB - 4 * GB
     large = capacity.grant(job(8 * GB), [small], 9)
     assert large is not None
-    assert (large.places, large.threads) == (2, 8)
+    assert (large.slots, large.threads) == (2, 8)
     assert capacity.free([small, large]) == 1
     assert capacity.grant(job(8 * GB), [small, large], 9) is None, "two places, and one is free"
     asked = capacity.grant(job(GB, memory_limit=3 * GB), [small, large], 9)
     assert asked is not None
-    assert (asked.places, asked.memory) == (1, 3 * GB)
+    assert (asked.slots, asked.memory) == (1, 3 * GB)
     assert capacity.grant(job(1), [small, large, asked], 9) is None
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from service.scheduling import attempt_process
-from service.scheduling.attempt_process import tell_planning, tell_prepared, tell_progress
+from service.scheduling.attempt_process import report_planning, report_prepared, report_progress
 from service.scheduling.progress import progress_record, progress_seconds
 from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.stylizing.loop import Progress
@@ -30,8 +30,8 @@ def records(channel: io.StringIO) -> list[dict[str, Any]]:
 
 
 def test_planning_counts_views_as_steps(channel: io.StringIO) -> None:
-    tell_planning(PlanningProgress(0, 8))
-    tell_planning(PlanningProgress(2, 8, 31.5))
+    report_planning(PlanningProgress(0, 8))
+    report_planning(PlanningProgress(2, 8, 31.5))
     nothing = {"loss": None, "scales": None, "seconds": None, "attempt": 2}
     assert records(channel) == [
         {"stage": "planning", "step": 0, "total": 8, "fraction": 0.0, "eta_s": None, **nothing},
@@ -40,8 +40,8 @@ def test_planning_counts_views_as_steps(channel: io.StringIO) -> None:
 
 
 def test_progress_starts_at_the_resumed_step(channel: io.StringIO, capsys: pytest.CaptureFixture[str]) -> None:
-    tell_prepared(Prepared([("scene", "616 Gaussians")], 3, 12))
-    tell_progress(Progress("sos", 6, 12, 0.5, 20.0, 10.0, (None, 0.5)))
+    report_prepared(Prepared([("scene", "616 Gaussians")], 3, 12))
+    report_progress(Progress("sos", 6, 12, 0.5, 20.0, 10.0, (None, 0.5)))
     starting, step = records(channel)
     assert (starting["stage"], starting["step"], starting["fraction"]) == ("starting", 3, 0.25)
     assert (step["stage"], step["fraction"], step["loss"], step["scales"]) == ("sos", 0.5, 0.5, [None, 0.5])

@@ -46,9 +46,9 @@ def s3(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "node"))
     monkeypatch.setenv("SGSST_CACHE", os.environ.get("SGSST_CACHE", ""))
-    monkeypatch.setattr(store_workplace, "_LOOK_SECONDS", 0.05)
-    monkeypatch.setattr(store_workplace, "_AGAIN_SECONDS", 0.1)
-    monkeypatch.setattr(publishing, "_AGAIN_SECONDS", 0.1)
+    monkeypatch.setattr(store_workplace, "_SCAN_SECONDS", 0.05)
+    monkeypatch.setattr(store_workplace, "_RETRY_SECONDS", 0.1)
+    monkeypatch.setattr(publishing, "_RETRY_SECONDS", 0.1)
     yield faulty
     faulty.heal()
     faulty.close()

@@ -196,7 +196,7 @@ def test_lease_of_a_dead_local_dispatcher_is_lost_at_once(tmp_path: Path) -> Non
         store.inputs.add_blob(SHA, "aa/blob", 3)
         leased(store, "dead")
         assert store.leases.take("new", is_lost=watch.is_lost) is None
-        store.leases.run_out("dead")
+        store.leases.expire("dead")
         assert store.leases.take("new", is_lost=watch.is_lost) is not None
 
 
