@@ -12,6 +12,7 @@ from api.cli import client_commands, operator_commands
 from api.cli.bench_commands import bench_app
 from api.cli.console import BAD_INPUT, FAILURE, error_console, out_console
 from api.cli.scene_commands import check, convert, plan, render
+from api.cli.study_commands import study_app
 from api.cli.stylize_commands import demo, stylize
 from api.cli.weights_commands import weights_app
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError
@@ -28,6 +29,7 @@ for command in (stylize, plan, check, render, convert, demo, *client_commands.CO
     app.command()(command)
 app.add_typer(weights_app, name="weights")
 app.add_typer(bench_app, name="bench")
+app.add_typer(study_app, name="study")
 app.add_typer(operator_commands.keys_app, name="keys")
 
 

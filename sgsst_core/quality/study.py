@@ -1,0 +1,222 @@
+"""Blind comparison of stylized scenes: a web page that collects votes, and the counting of these votes.
+
+The page shows the style and, at one view after another, the renders of all variants in random order. It contains
+neither names nor files of the variants, only random tokens; a key file beside it maps tokens to variants.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import random
+import secrets
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
+
+from sgsst_core.errors import InvalidInputError, SettingsError
+from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.json_files import write_json
+from sgsst_core.scene.pyramid import resize_area
+
+#: Number of variants that a page can compare: one for each arrow key.
+VARIANTS = range(2, 5)
+#: Maximum longer side in pixels of the style image on the page.
+_STYLE_SIDE = 640
+_JPEG_QUALITY = 92
+#: Quantile of the normal distribution for intervals of 95 %.
+_NORMAL_95 = 1.959963984540054
+
+
+F = TypeVar("F", bound="_File")
+
+
+class StudyError(InvalidInputError):
+    """A key file or a file of votes that cannot be used."""
+
+
+class _File(BaseModel):
+    """Fields that all files of a study share."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    version: int = Field(1, ge=1, le=1)
+    study: str
+
+
+class Key(_File):
+    """Key of a study: what its tokens stand for.
+
+    Attributes:
+        study: Random name of the study.
+        variants: Names of the variants, in the order in which they were given.
+        views: Token of each variant's image, by view, in the order of `variants`.
+    """
+
+    variants: list[str]
+    views: list[list[str]]
+
+
+class Vote(BaseModel):
+    """One choice.
+
+    Attributes:
+        view: Index of the view.
+        chosen: Token of the chosen image.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    view: int = Field(ge=0)
+    chosen: str
+
+
+class Votes(_File):
+    """Votes of one person, as the page saves them.
+
+    Attributes:
+        study: Name of the study that the votes belong to.
+        voter: Random name of the session in which the votes were made.
+        votes: At most one vote per view.
+    """
+
+    voter: str
+    votes: list[Vote]
+
+
+@dataclass(frozen=True)
+class Share:
+    """Share of the votes that one variant received.
+
+    Attributes:
+        variant: Name of the variant.
+        votes: Number of its votes.
+        total: Number of all votes.
+        low: Lower end of the 95 % Wilson interval of the share.
+        high: Upper end of this interval.
+    """
+
+    variant: str
+    votes: int
+    total: int
+    low: float
+    high: float
+
+
+def write_study(
+    page: Path,
+    key: Path,
+    names: Sequence[str],
+    style: Tensor,
+    views: int,
+    render: Callable[[int], Sequence[Tensor]],
+) -> None:
+    """Write the page of a study and its key.
+
+    Args:
+        page: HTML file to write.
+        key: JSON file to write.
+        names: Names of the variants.
+        style: Style image [H, W, 3] in 0..1.
+        views: Number of views.
+        render: Function that returns the images [H, W, 3] of a variant at all views, by the variant's index.
+
+    Raises:
+        SettingsError: If the number of variants is not 2 to 4, or two have the same name.
+        OutputError: If a file cannot be written.
+    """
+    if len(names) not in VARIANTS:
+        raise SettingsError(f"{len(names)} variants: a study compares {VARIANTS[0]} to {VARIANTS[-1]}.")
+    if len(set(names)) < len(names):
+        raise SettingsError("Two variants have the same name. Name them as NAME=FILE.")
+    tokens = [[secrets.token_hex(8) for _ in names] for _ in range(views)]
+    images = {}
+    for index in range(len(names)):
+        for of_view, image in zip(tokens, render(index), strict=True):
+            images[of_view[index]] = _data_uri(image)
+    shuffled = [random.SystemRandom().sample(of_view, len(of_view)) for of_view in tokens]
+    study = secrets.token_hex(8)
+    data = {"study": study, "views": [[{"token": each, "image": images[each]} for each in view] for view in shuffled]}
+    environment = Environment(
+        loader=PackageLoader("sgsst_core.quality"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    scale = min(1.0, _STYLE_SIDE / max(style.shape[:2]))
+    small = resize_area(style, (max(1, round(style.shape[0] * scale)), max(1, round(style.shape[1] * scale))))
+    text = environment.get_template("study.html").render(style=_data_uri(small), data=data, count=len(names))
+    write_json(key, Key(study=study, variants=list(names), views=tokens).model_dump())
+    with atomic_path(page) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def count_votes(key: Path, files: Sequence[Path]) -> list[Share]:
+    """Return the share of each variant, the most chosen first.
+
+    A file that was saved twice counts once: the longer one of the same voter.
+
+    Raises:
+        StudyError: If a file cannot be read, belongs to another study, or there are no votes.
+    """
+    known = _read(Key, key)
+    variant_of = [dict(zip(tokens, known.variants, strict=True)) for tokens in known.views]
+    by_voter: dict[str, Votes] = {}
+    for path in files:
+        found = _read(Votes, path)
+        if found.study != known.study:
+            raise StudyError(f"{path}: holds votes of another study than {key}.")
+        views = [vote.view for vote in found.votes]
+        if len(set(views)) < len(views) or any(
+            vote.view >= len(variant_of) or vote.chosen not in variant_of[vote.view] for vote in found.votes
+        ):
+            raise StudyError(f"{path}: holds votes that the study's page does not make. Save them again.")
+        before = by_voter.get(found.voter)
+        if before is None or len(before.votes) < len(found.votes):
+            by_voter[found.voter] = found
+    chosen = [variant_of[vote.view][vote.chosen] for votes in by_voter.values() for vote in votes.votes]
+    if not chosen:
+        raise StudyError("There are no votes in these files.")
+    shares = [
+        Share(name, chosen.count(name), len(chosen), *wilson_interval(chosen.count(name), len(chosen)))
+        for name in known.variants
+    ]
+    return sorted(shares, key=lambda share: -share.votes)
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Return the 95 % score interval of a proportion (Wilson 1927), which holds for few trials and shares near 0 and 1.
+
+    Args:
+        successes: Number of successes, 0 to `trials`.
+        trials: Number of trials, at least 1.
+    """
+    share, square = successes / trials, _NORMAL_95**2
+    center = (share + square / (2 * trials)) / (1 + square / trials)
+    half = _NORMAL_95 / (1 + square / trials) * math.sqrt(share * (1 - share) / trials + square / (4 * trials**2))
+    return max(0.0, center - half), min(1.0, center + half)
+
+
+def _read(kind: type[F], path: Path) -> F:
+    try:
+        return kind.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise StudyError(f"{path}: cannot be read: {error.strerror}.") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        what = "the key of a study" if kind is Key else "a file of votes"
+        raise StudyError(f"{path}: not {what}: {where}: {first['msg']}.") from error
+
+
+def _data_uri(image: Tensor) -> str:
+    """Return an image [H, W, 3] in 0..1 as a data URI with a JPEG."""
+    levels = (image.clamp(0, 1) * 255).round().cpu().numpy().astype(np.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(levels).save(buffer, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
