@@ -43,8 +43,8 @@ _CUDNN: Any = torch.backends.cudnn
 _TF32_EPS = 2.0**-10
 #: Number of values from which cuDNN's fused convolution would overflow its 32-bit indices; it has no fallback.
 _FUSED_VALUES = 2**31
-#: Side of the image used to test fused convolutions, and their tolerance relative to the largest value. In TF32 and
-#: bfloat16, fused and separate operations round at different points of the computation.
+#: Side of the first image on which fused convolutions are tried, and their tolerance relative to the largest value. In
+#: TF32 and bfloat16, fused and separate operations round at different points of the computation.
 _TRIAL_SIDE, _TRIAL_TOLERANCE = 32, 2**-6
 
 
@@ -66,6 +66,7 @@ class _Convolution:
     bias: Tensor  # [out]
     backward_weight: Tensor  # [in, out, 3, 3], transposed and flipped
     fused: bool = False  # cuDNN runs convolution, bias and ReLU in one launch
+    tried: int = 0  # most pixels at which the fused convolution was compared with separate operations
 
 
 class _Pool:
@@ -258,7 +259,7 @@ class FeatureNetwork:
         with convolutions(self.device, tf32=self.tf32):
             for step in self._steps:
                 if isinstance(step, _Convolution):
-                    step.fused = _can_fuse(step)
+                    _try_fusing(step)
 
     @property
     def precision(self) -> str:
@@ -328,8 +329,15 @@ class FeatureNetwork:
 
     def _convolve(self, x: Tensor, step: _Convolution) -> Tensor:
         """Apply convolution, bias and ReLU to x [1, in, h, w]."""
-        if step.fused and x.shape[2] * x.shape[3] * max(step.weight.shape[:2]) < _FUSED_VALUES:
-            return _fused_convolution(x, step)
+        pixels = x.shape[2] * x.shape[3]
+        if step.fused and pixels * max(step.weight.shape[:2]) < _FUSED_VALUES:
+            if pixels <= step.tried:
+                return _fused_convolution(x, step)
+            step.tried = pixels  # cuDNN may choose another algorithm for a larger image
+            result = _tried_convolution(x, step)
+            if result is not None:
+                return result
+            step.fused = False
         return F.conv2d(x, step.weight, step.bias, padding=1).relu_()
 
     def _convolve_back(self, gradient: Tensor, step: _Convolution) -> Tensor:
@@ -411,15 +419,33 @@ def _fused_convolution(x: Tensor, step: _Convolution) -> Tensor:
     return result
 
 
-def _can_fuse(step: _Convolution) -> bool:
-    """Return whether cuDNN's fused convolution supports this step and agrees with the separate operations."""
+def _try_fusing(step: _Convolution) -> None:
+    """Fuse a convolution if that works on a small image."""
     generator = torch.Generator().manual_seed(0)
     x = torch.randn((1, int(step.weight.shape[1]), _TRIAL_SIDE, _TRIAL_SIDE), generator=generator)
     x = x.to(step.weight).contiguous(memory_format=torch.channels_last)
+    step.tried = _TRIAL_SIDE**2
+    step.fused = _tried_convolution(x, step) is not None
+
+
+def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
+    """Return the result of the fused convolution; None if cuDNN fails or disagrees with the separate operations.
+
+    PyTorch gives cuDNN the uninitialized output as a summand with factor 0. An algorithm that multiplies instead of
+    skipping it would return NaN whenever the memory happens to contain NaN, so the trial puts NaN there.
+    """
     expected = F.conv2d(x, step.weight, step.bias, padding=1).relu_()
+    largest = float(expected.amax())  # none is negative
+    _leave_nan(expected)
     try:
         found = _fused_convolution(x, step)
     except RuntimeError:  # cuDNN has no engine for it
-        return False
-    difference = float((found - expected).abs().max())
-    return found.stride() == expected.stride() and difference <= _TRIAL_TOLERANCE * float(expected.abs().max())
+        return None
+    same_layout = found.stride() == expected.stride()
+    difference = float(expected.sub_(found).abs_().amax())
+    return found if same_layout and difference <= _TRIAL_TOLERANCE * largest else None
+
+
+def _leave_nan(like: Tensor) -> None:
+    """Fill memory that the allocator reuses for the next tensor of this size with NaN."""
+    torch.full_like(like, torch.nan)
