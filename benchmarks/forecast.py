@@ -30,7 +30,6 @@ from sgsst_core.loss.content import ContentDifference
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.cost import content_bytes
-from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings
@@ -352,7 +351,7 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     of_a_view = {
         "content": (views / 2, content_bytes([size], loss.tiling, cell)),
         "lists": (
-            TritonRasterizer.options(memory_for("rasterizer", int(memory_limit())))["max_intersection_bytes"],
+            memory_for("rasterizer", int(memory_limit())),
             LIST_BYTES[0] * job.visible + LIST_BYTES[1] * job.pairs,
         ),
         "colors": (views / 4, 12.0 * job.gaussians),

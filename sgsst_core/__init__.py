@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 # pages, so a step on a CPU touches a few thousand pages instead of millions. Linux provides huge pages if it can; other
 # systems ignore the variable.
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+# PyTorch reads this one when it starts CUDA. Views of many sizes would otherwise leave gaps between blocks of memory
+# that no later block fits into.
+if os.environ.keys().isdisjoint({"PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF"}):
+    os.environ["PYTORCH_ALLOC_CONF"] = "expandable_segments:True"
 
 __all__ = ["Callbacks", "Camera", "Progress", "Scene", "Settings", "Stylizer", "make_settings", "run", "stylize"]
 

@@ -19,7 +19,7 @@ V = TypeVar("V")
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
 #: Maximum fraction of a GPU's total memory that a job plans with; a job does not share its GPU.
 GPU_SHARE = 0.7
-#: Fractions of the memory limit by use: see `memory_for`.
+#: Fractions of the memory limit by use, which add up to 1: see `memory_for`.
 _FRACTIONS = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
 
 
@@ -27,8 +27,8 @@ def memory_for(use: Literal["activations", "views", "rasterizer"], memory: int) 
     """Return the portion of a rank's memory limit, in bytes, that is reserved for one use.
 
     Args:
-        use: "activations" for those of one iteration; "views" for view targets and colors; "rasterizer" for tile
-            intersections and cached blend weights.
+        use: "activations" for those of one iteration; "views" for view targets and colors, and for the two caches below
+            that a job may need; "rasterizer" for tile intersections and cached blend weights.
         memory: Memory limit of the rank in bytes.
     """
     return int(memory * _FRACTIONS[use])
@@ -46,7 +46,7 @@ def least_intersection_memory(memory: int) -> int:
 def measuring_memory(memory: int) -> int:
     """Return the cache size in bytes for novel views, given a rank's memory limit.
 
-    The float32 reference has a cache of the same size.
+    The float32 reference has a cache of the same size. Both are taken from the budget for views.
     """
     return memory // 16
 

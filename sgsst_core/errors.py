@@ -92,6 +92,12 @@ class DivergedError(SgsstError):
     code = "diverged"
 
 
+class DeviceMemoryError(SgsstError):
+    """GPU without enough free memory for a step, even with half of the activations."""
+
+    code = "gpu-memory"
+
+
 class InfrastructureError(SgsstError):
     """Failure of a machine, a network or a file store, independent of the user's input."""
 

@@ -123,6 +123,12 @@ class LossGraphs:
         """Number of captured graphs."""
         return len(self._graphs)
 
+    def clear(self) -> None:
+        """Delete all graphs, for example because the partition is about to change."""
+        self._graphs.clear()
+        self._static.clear()
+        self._visited.clear()
+
     def evaluate(
         self,
         image: Tensor,

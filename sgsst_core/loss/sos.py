@@ -8,7 +8,7 @@ budget allows; only the remaining tiles are computed twice. With several ranks, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -127,6 +127,12 @@ class SosLoss:
             style_scale=style_scale,
         )
         self._compared = compared_layers(style_loss, network)
+
+    def halve_memory(self, pixels: int) -> None:
+        """Halve the memory budget for activations, after reducing it to what views of at most `pixels` pixels need."""
+        held = min(self.tiling.held, pixels * (1 + self.tiling.working)) / 2
+        self.memory = int(held * self.network.held_bytes_per_pixel())
+        self.tiling = self.divider.tiling = replace(self.tiling, held=held)
 
     def evaluate(
         self,

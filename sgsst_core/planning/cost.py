@@ -99,6 +99,11 @@ SEARCH_BYTES = 120
 #: Memory for the gradient of each tile intersection in a rasterizer's backward pass, as a fraction of a view's tile
 #: intersections.
 _SLOTS_FRACTION = 0.25
+#: Bytes per pair of Gaussian and raster tile on a GPU: while the pairs of a view are sorted (keys, values and the
+#: sort's own buffers), and for its slot in the color gradient.
+SORTING_BYTES, _SLOT_BYTES = 36, 12
+#: Estimated workspace of cuDNN, and buffers of NCCL, in bytes. No measurement exists yet.
+CUDNN_BYTES, NCCL_BYTES = 512 << 20, 512 << 20
 #: Bytes per pixel of a novel view: its coverage, and its two warps.
 _COVERAGE_BYTES, _WARP_BYTES = 4, 2 * 40
 
@@ -321,7 +326,7 @@ class ViewCosts:
             content: Size in bytes of the content features of all views.
         """
         raster, memory, views = probe.raster, probe.machine.memory, len(plan.covered)
-        view_budget, raster_budget = memory_for("views", memory), memory_for("rasterizer", memory)
+        view_budget, raster_budget = view_memory(plan, memory), memory_for("rasterizer", memory)
         surveyed = ViewData(0.0, len(probe.sizes) * raster.intersection_bytes, raster_budget)
         budget = raster_budget if plan.cached_weights == "none" else least_intersection_memory(memory)
         intersections = ViewData(raster.first_seconds, views * raster.intersection_bytes, budget)
@@ -572,11 +577,22 @@ class CostModel:
         self.work = Work.of(self._pieces(everything), self.tiling, working_fraction=fraction)
         self.coarse = Work.of(self._pieces(everything, coarsest=True), self.tiling)
         content = content_bytes(self.sizes, self.tiling, probe.network.content_bytes)
+        self._plan = plan = replace(plan, spare=self.spare())
         self.views = ViewCosts.of(plan, probe, settings, self.work, self.coarse, content)
 
     def _pieces(self, views: Iterable[int], *, coarsest: bool = False) -> list[tuple[Piece, ...]]:
         """Return the pieces of some views of the job, given by their positions in `sizes`."""
         return [pieces_of(self.sizes[at], self.tiling, self._regions[at], coarsest=coarsest) for at in views]
+
+    def spare(self) -> int:
+        """Return the bytes of the budget for activations that the steps of a single rank on a GPU do not need."""
+        plan, machine = self._plan, self._probe.machine
+        if machine.device == "cpu" or machine.ranks > 1:
+            return 0
+        budget, once = memory_for("activations", machine.memory), int(self.work.peak * self._probe.network.held_bytes)
+        needed = reference_activations(plan, once, budget)
+        # A CUDA graph does not share its memory: evaluating the loss without the graph needs the same amount again.
+        return max(budget - needed - (once if plan.graphs else 0), 0)
 
     def on_one_rank(self) -> tuple[Prediction, int]:
         """Return the prediction for the steps on one rank, and the bytes of its activations."""
@@ -728,9 +744,42 @@ def tiling_of(probe: Probe, settings: Settings) -> Tiling:
     )
 
 
+def view_memory(plan: Plan, memory: int) -> int:
+    """Return the budget in bytes for data of the views: what other caches leave of it, and `Plan.spare`.
+
+    Args:
+        plan: Plan of the job.
+        memory: Memory limit of a rank in bytes.
+    """
+    left = memory_for("views", memory) + plan.spare
+    if plan.cached_weights != "none":
+        left -= least_intersection_memory(memory)
+    if plan.measured:
+        left -= (2 if is_approximated(plan) else 1) * measuring_memory(memory)
+    return left
+
+
 def is_approximated(plan: Plan) -> bool:
     """Return whether the gradient of a job is compared with the float32 reference when it is measured."""
     return plan.precision != "float32" or plan.cached_weights == "half"
+
+
+def reference_activations(plan: Plan, activations: int, budget: int) -> int:
+    """Return the activations in bytes of a pass of the job, or of the float32 reference if it needs more.
+
+    Args:
+        plan: Plan of the job.
+        activations: Activations of the job in bytes.
+        budget: Budget for activations in bytes, which limits those of the reference.
+    """
+    if not plan.measured or not is_approximated(plan):
+        return activations
+    return max(min(int(activations * reference_size(plan)), budget), activations)
+
+
+def reference_size(plan: Plan) -> float:
+    """Return the size of a feature value in the float32 reference, relative to the job's network."""
+    return 2.0 if plan.precision == "bfloat16" else 1.0
 
 
 def neighbors_are_searched(plan: Plan, settings: Settings) -> bool:
@@ -763,28 +812,36 @@ class _PeakMemory:
     def bytes(self) -> tuple[int, int | None]:
         """Return the peak memory in bytes of a rank's process, and of its GPU (None on a CPU).
 
-        With a GPU, computed data are in GPU memory. Some data that grow with the number of Gaussians are counted only
-        on a CPU, because they are small compared to other tensors on a GPU.
+        With a GPU, computed data are in GPU memory. The copy of the scene is counted only on a CPU, because it is small
+        compared to other tensors on a GPU.
         """
-        probe, device, gaussians = self.probe, self.probe.machine.device, int(self.plan.seen.sum())
-        measuring = MEASURING_BYTES if self.plan.measured else 0
+        probe, plan, gaussians = self.probe, self.plan, int(self.plan.seen.sum())
+        measuring, everything = MEASURING_BYTES if plan.measured else 0, probe.scene.gaussians
+        held = self._intersections_and_weights() + self._content() + self._colors() + self._novel_views()
+        held += gaussians * OPTIMIZER_BYTES
+        building = everything * BUILDING_BYTES + probe.raster.most_pairs * SORTING_BYTES
+        if probe.machine.device != "cpu":
+            rastering = probe.raster.most_pairs * _SLOT_BYTES
+            # A CUDA graph does not share its memory.
+            graphs = self.activations if plan.graphs else 0
+            passing = graphs + max(self._passing() + CUDNN_BYTES, rastering, building)
+            messages = NCCL_BYTES if probe.machine.ranks > 1 else 0
+            return probe.process_bytes + measuring, probe.device_bytes + held + passing + messages
+        held += self._scene() + measuring
+        searching = everything * SEARCH_BYTES if neighbors_are_searched(plan, self.settings) else 0
+        rastering = gaussians * _STEP_BYTES + int(_SLOTS_FRACTION * probe.raster.intersection_bytes)
+        return probe.process_bytes + max(building, held + max(self._passing(), rastering, searching)), None
+
+    def _passing(self) -> int:
+        """Return the bytes that the loss of a view and its gradient take, without a graph."""
+        probe = self.probe
         # render, gradient, and their temporary float32 copies
         image = max(height * width for height, width in probe.sizes) * 3 * 4 * 6
-        matching = _matching_bytes(self.model.sizes, self.model.tiling, probe.network.vector_channels, device)
-        # A CUDA graph does not share its memory: evaluating the loss without the graph needs the same amount again.
-        passing = image + self.activations * (2 if self.plan.graphs else 1) + matching
-        optimizer = gaussians * OPTIMIZER_BYTES
-        if device != "cpu":
-            computing = passing + self._content() + self._weights()
-            return probe.process_bytes + measuring, probe.device_bytes + computing + optimizer
-        everything = probe.scene.gaussians
-        building = everything * BUILDING_BYTES
-        held = self._scene() + self._intersections_and_weights() + self._content() + self._colors()
-        held += self._novel_views() + optimizer + measuring
-        searching = everything * SEARCH_BYTES if neighbors_are_searched(self.plan, self.settings) else 0
-        rastering = gaussians * _STEP_BYTES + int(_SLOTS_FRACTION * probe.raster.intersection_bytes)
-        passing = max(passing + self._reference_activations() + gaussians * _COLOR_BYTES, rastering, searching)
-        return probe.process_bytes + max(building, held + passing), None
+        device, tiling = probe.machine.device, self.model.tiling
+        matching = _matching_bytes(self.model.sizes, tiling, probe.network.vector_channels, device)
+        budget = memory_for("activations", probe.machine.memory)
+        colors = int(self.plan.seen.sum()) * _COLOR_BYTES
+        return image + matching + colors + reference_activations(self.plan, self.activations, budget)
 
     def _visited(self, steps: int) -> float:
         """Return the fraction of views visited by this many steps and by the loss before and after."""
@@ -853,18 +910,6 @@ class _PeakMemory:
             held += min(views * pixels * _WARP_BYTES, memory // 2)
         if is_approximated(self.plan):
             evaluated, data = self.loss_views / len(self.plan.covered), self.model.views
-            held += int(min(evaluated * self._reference_size * data.content.bytes, memory // 2))
+            held += int(min(evaluated * reference_size(self.plan) * data.content.bytes, memory // 2))
             held += int(min(evaluated * data.colors.bytes, memory // 4))
         return held
-
-    def _reference_activations(self) -> int:
-        """Return by how many bytes the activations of the float32 reference exceed the job's."""
-        if not self.plan.measured or not is_approximated(self.plan):
-            return 0
-        budget = memory_for("activations", self.probe.machine.memory)
-        return max(min(int(self.activations * self._reference_size), budget) - self.activations, 0)
-
-    @property
-    def _reference_size(self) -> float:
-        """Size of a feature value in the float32 reference, relative to the job's network."""
-        return 2.0 if self.plan.precision == "bfloat16" else 1.0

@@ -66,7 +66,9 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
         choice, steps, activations = model.on_several_ranks()
         ranks, rank_lines = choice.ranks, [choices.about_ranks(choice, machine.ranks, probe.link)]
     prediction, level, loss_views = model.whole_job(steps, activations)
-    plan = replace(plan, ranks=ranks, measuring=level, loss_views=loss_views, prediction=prediction)
+    plan = replace(
+        plan, spare=model.spare(), ranks=ranks, measuring=level, loss_views=loss_views, prediction=prediction
+    )
     lines = (
         *choices.about_gaussians(probe, rendered, settings),
         *choices.about_views(probe),

@@ -66,6 +66,7 @@ class Plan:
         warm_start: Whether the job starts with the style's colors.
         steps_coarse: Steps of phase 1; 0 if it is skipped.
         memory_limit: Memory budget in bytes of all ranks on one machine together.
+        spare: Bytes of the budget for activations that no step needs, and that data of the views may use.
         device: Device of the feature network.
         rasterizer: Rasterizer of the job; "cached" stores blend weights in the format `cached_weights`.
         uncached: Rasterizer that computes blend weights, and recomputes those that are not cached.
@@ -93,6 +94,7 @@ class Plan:
     memory_limit: int
     training_background: PlannedBackground = "background"
     warm_start: bool = False
+    spare: int = 0
     device: Device = "cpu"
     rasterizer: str = "cpu"
     uncached: str = "cpu"

@@ -231,7 +231,10 @@ def _launch_cost(context: PlanningContext, views: Sequence[Camera]) -> LaunchCos
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
     if context.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
         return None
-    return launch_cost(_loss(context, settings.scales), (views[0].height, views[0].width))
+    try:
+        return launch_cost(_loss(context, settings.scales), (views[0].height, views[0].width))
+    except torch.OutOfMemoryError:
+        return LaunchCost(problem="the GPU's memory was not enough to evaluate the first view")
 
 
 def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
@@ -286,6 +289,7 @@ def _raster_cost(context: PlanningContext, cameras: Sequence[Camera]) -> RasterC
     known: dict[str, Any] = {
         "first_seconds": cost.preparation_seconds,
         "intersection_bytes": cost.preparation_bytes,
+        "most_pairs": cost.most_pairs,
         "colors_seconds": _colors_seconds(scene, sample[middle], rasterizer.device),
     }
     if not rasterizer.can_cache:

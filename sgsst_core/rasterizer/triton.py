@@ -10,7 +10,8 @@ of equal float32 depth keep the order of their float64 depths.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -27,7 +28,7 @@ from sgsst_core.constants import (
     TRANSMITTANCE_MIN,
 )
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, Rows, check_rows
+from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost, Rows, check_rows
 from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
 from sgsst_core.rasterizer.view_cache import ViewCache
 from sgsst_core.scene.camera import Camera
@@ -110,10 +111,9 @@ class TritonRasterizer(Rasterizer):
     def options(cls, memory: int) -> dict[str, Any]:
         """Return constructor options for a memory budget in bytes.
 
-        Tile intersections have their own budget, half that of cached weights. They are small compared to GPU memory,
-        and recomputing them costs a sort and a synchronization per view.
+        Tile intersections share the budget with cached weights.
         """
-        return {"max_intersection_bytes": memory // 2}
+        return {"max_intersection_bytes": memory}
 
     @classmethod
     def usable_device(cls, device: torch.device | str | None) -> torch.device:
@@ -157,6 +157,17 @@ class TritonRasterizer(Rasterizer):
             TooManyIntersectionsError: If there are more pairs of Gaussian and tile than 32-bit positions can address.
         """
         return self._intersections.of(camera)
+
+    def release_view(self, camera: Camera, budget: int) -> None:
+        """Drop the view's tile intersections, and set the budget for those of all other views to `budget` bytes."""
+        self._intersections.take(camera)
+        self._intersections.limit(budget)
+
+    def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
+        """Measure the cost of rendering some views with gradient, and the size of their tile intersections."""
+        cost, built = super().probe_cost(cameras), [self.intersections(camera) for camera in cameras]
+        pairs = max(len(isects.ranks) for isects in built)
+        return replace(cost, preparation_bytes=sum(isects.nbytes for isects in built) // len(built), most_pairs=pairs)
 
     def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
         """Count a band's weights without storing them; takes about as long as one render."""

@@ -20,9 +20,10 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import ends_with_transfer
 from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
+from sgsst_core.planning.cost import view_memory
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras, spread
@@ -285,14 +286,13 @@ def prepare_job(
     rendered = attenuated if plan.seen.all() else attenuated.subset(plan.seen)
     rendered = rendered if "sh" in settings.keep else rendered.without_zero_bands()
     rasterizer = _make_rasterizer(plan, settings, rendered, memory, planning_context)
-    view_memory = memory_for("views", memory) - _least_intersection_bytes(plan, memory)
     regions_seen = plan.survey.regions if plan.weighted else None
     views = Views(
         rendered,
         fit_cameras(cameras, settings),
         rasterizer,
         covered=list(plan.covered),
-        memory=view_memory,
+        memory=view_memory(plan, memory),
         clamp_aware_gradient=settings.clamp_aware_gradient,
         regions=regions_seen,
         collectives=team.group,
@@ -303,7 +303,7 @@ def prepare_job(
         loss,
         weighted=plan.weighted,
         photos=photos,
-        memory=view_memory,
+        memory=view_memory(plan, memory),
         cache_content="content" not in settings.keep,
         regions=regions_seen,
         background=settings.background,
@@ -348,14 +348,8 @@ def _make_rasterizer(
     return CachedRasterizer(
         rendered,
         max_bytes=budget,
-        least_intersection_bytes=_least_intersection_bytes(plan, memory),
+        least_intersection_bytes=least_intersection_memory(memory),
         precision="half" if plan.cached_weights == "half" else "float32",
         at_first_use=False,
         uncached=uncached,
     )
-
-
-def _least_intersection_bytes(plan: Plan, memory: int) -> int:
-    """Return the budget for tile intersections next to cached weights, which is taken from the memory for views."""
-    shared = plan.cached_weights != "none" and not RASTERIZERS[plan.uncached].on_gpu
-    return least_intersection_memory(memory) if shared else 0

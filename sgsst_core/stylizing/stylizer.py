@@ -37,6 +37,7 @@ from sgsst_core.stylizing.job import StylizationJob, plan_job
 from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
 from sgsst_core.stylizing.result_colors import result_colors, transferred_colors
 from sgsst_core.stylizing.schedule import Phase, ViewOrder, drawn_views, phase_at
+from sgsst_core.stylizing.second_attempt import with_second_attempt
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
 from sgsst_core.stylizing.training_background import Color, drawn_color
 
@@ -160,6 +161,7 @@ class Stylizer:
 
         Raises:
             DivergedError: If the gradient has left the range of float32; the colors are those before the step.
+            DeviceMemoryError: If a GPU's memory is not enough.
         """
         started = time.perf_counter()
         self._stylized = None
@@ -168,7 +170,7 @@ class Stylizer:
         sent = dict(self.job.collectives.sent)
         phase = self.phase
         self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
-        gradient, results, cost = self._mean_gradient(views, phase)
+        gradient, results, cost = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
         with self.job.timer("optimizer"):
             largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(self.fraction_done()))
         with self.job.timer("communication"):
@@ -303,7 +305,8 @@ class Stylizer:
         """
         self._cache_visited()
         values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
-        return evaluate(self.job.view_targets, self.job.style_targets, indices, values)
+        job = self.job
+        return with_second_attempt(job, lambda: evaluate(job.view_targets, job.style_targets, indices, values))
 
     def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
         """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its time in seconds.

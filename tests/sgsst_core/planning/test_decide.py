@@ -15,7 +15,14 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import MOST_VECTORS
 from sgsst_core.planning.choices import LEAST_PASSES
-from sgsst_core.planning.cost import MEASURING_BYTES, OPTIMIZER_BYTES, SHAPE_BYTES, gaussian_bytes
+from sgsst_core.planning.cost import (
+    CUDNN_BYTES,
+    MEASURING_BYTES,
+    NCCL_BYTES,
+    OPTIMIZER_BYTES,
+    SHAPE_BYTES,
+    gaussian_bytes,
+)
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import LaunchCost, Link, Machine, NetworkFacts, Probe, RasterCost, Rate, SceneFacts
 from sgsst_core.planning.plan import Plan
@@ -571,9 +578,11 @@ def test_computed_data_count_as_gpu_memory() -> None:
         assert on_gpu is not None
         assert on_cpu.device_bytes is None
         assert on_gpu.peak_bytes == GIGABYTE
-        beside = 5 * (12 + 12 * VIEWS + gaussian_bytes(3)) - 6 * SHAPE_BYTES
+        beside = 5 * gaussian_bytes(3) - 6 * SHAPE_BYTES - CUDNN_BYTES
         if ranks == 1:  # activations, less three quarters of what needs 500 bytes per pixel
             beside -= HEIGHT * WIDTH * 375
+        else:
+            beside -= NCCL_BYTES
         assert on_gpu.device_bytes == own + on_cpu.peak_bytes - GIGABYTE - beside
 
 

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+import pytest
+
+from sgsst_core.budget import least_intersection_memory, measuring_memory, memory_for
 from sgsst_core.planning.cost import (
     BUILDING_BYTES,
     MEASURING_BYTES,
@@ -11,6 +15,7 @@ from sgsst_core.planning.cost import (
     SEARCH_BYTES,
     SHAPE_BYTES,
     gaussian_bytes,
+    view_memory,
 )
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import RasterCost
@@ -75,6 +80,44 @@ def test_weights_replace_the_tile_intersections_of_the_survey() -> None:
     rises = [found.peak_bytes - base.peak_bytes for found in peaks if found is not None]
     isects = VIEWS * 10**8
     assert rises == [10**9 - isects, BUDGET - isects, BUDGET + 300_000_000 - isects]
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("weights", ["none", "half"])
+@pytest.mark.parametrize("measured", [False, True])
+def test_budgets_add_up_to_the_memory_limit(device: str, precision: str, weights: str, measured: bool) -> None:
+    raster = RasterCost(0.3, 0.1, GIGABYTE, GIGABYTE // 2)
+    found = probe(device=device, raster=raster, precision_ratio=2.0, rasterizer="cpu" if device == "cpu" else "triton")
+    settings = make_settings(precision=precision, cached_weights=weights, steps_sos=4000)
+    plan, memory = decide(found, settings, measured=measured), 10 * GIGABYTE
+    approximated = precision == "bfloat16" or weights == "half"
+    beside = (least_intersection_memory(memory) if weights == "half" else 0) + measured * (
+        (1 + approximated) * measuring_memory(memory)
+    )
+    activations = memory_for("activations", memory) - plan.spare
+    assert activations + memory_for("rasterizer", memory) + view_memory(plan, memory) + beside == memory
+    assert view_memory(plan, memory) > 0
+    # The steps, and on a GPU also the float32 reference, fit in what remains for activations.
+    assert (plan.spare == 0) is (device == "cpu")
+    assert activations > HEIGHT * WIDTH * 3000 * (2 if precision == "bfloat16" and measured else 1)
+
+
+def test_gpu_memory_includes_what_rasterizer_and_measurements_take() -> None:
+    def peak(measured: bool = False, **raster: Any) -> int:
+        found = probe(device="cuda", rasterizer="triton", raster=RasterCost(0.01, **raster))
+        prediction = decide(found, make_settings(steps_sos=4000), measured=measured).prediction
+        assert prediction is not None
+        assert prediction.device_bytes is not None
+        return prediction.device_bytes
+
+    plain = peak()
+    # The survey's tile intersections of all views are already in `device_bytes` of the probe.
+    assert peak(intersection_bytes=10**8) == plain
+    pairs = 10**9  # more than the activations take
+    assert peak(most_pairs=2 * pairs) - peak(most_pairs=pairs) == 36 * pairs
+    views = 4
+    assert peak(measured=True) - plain == 6 * (SHAPE_BYTES + 12 * 4 * views) + views * HEIGHT * WIDTH * 80
 
 
 def test_largest_temporary_allocation_counts() -> None:

@@ -22,6 +22,7 @@ import torch
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.rasterizer.trial import drawing_problem
@@ -176,6 +177,33 @@ def test_tile_intersections_beyond_the_budget_are_cached_for_the_last_view_only(
     assert rasterizer.intersections(views[0]) is first
     rasterizer.intersections(views[1])
     assert rasterizer.intersections(views[0]) is not first
+
+
+def test_weights_and_tile_intersections_share_a_budget() -> None:
+    scene = cloud(50)
+    views = [camera(33, 20, pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
+    separate = on_device(scene)
+    weights = [separate.count_weights(view).nbytes("float32") for view in views]
+    isects = [separate.intersections(view).nbytes for view in views]
+    budget = max(sum(weights[:2]) + isects[2], sum(isects))
+    rasterizer = on_device(scene, **TritonRasterizer.options(budget))
+    cached = CachedRasterizer(scene, max_bytes=budget, uncached=rasterizer)
+    for view in views:
+        rasterizer.intersections(view)
+    assert rasterizer._intersections.cached_bytes == sum(isects)
+    for done, view in enumerate(views, start=1):
+        cached.render(colors_of(scene), view)
+        assert cached.is_cached(view) is (sum(weights[:done]) <= budget)
+        assert cached.cached_bytes + rasterizer._intersections.cached_bytes <= budget
+    assert cached.cached_bytes > 0
+
+
+def test_cost_includes_the_size_of_tile_intersections() -> None:
+    rasterizer, views = on_device(cloud(50)), [camera(33, 20), camera(20, 33)]
+    cost = rasterizer.probe_cost(views)
+    isects = [rasterizer.intersections(view) for view in views]
+    assert cost.preparation_bytes == sum(each.nbytes for each in isects) // 2 > 0
+    assert cost.most_pairs == max(len(each.ranks) for each in isects) > 0
 
 
 def test_too_many_intersections_are_refused_before_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
