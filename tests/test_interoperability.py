@@ -25,7 +25,22 @@ from tests.sgsst_core.splat_scenes import cloud
 
 pytestmark = pytest.mark.slow
 
-PACKAGES = ("@playcanvas/splat-transform@3.7.0", "gltf-validator@2.0.0-dev.3.10")
+PACKAGES = (
+    "@playcanvas/splat-transform@3.7.0",
+    "gltf-validator@2.0.0-dev.3.10",
+    "@mkkellogg/gaussian-splats-3d@0.4.7",
+)
+#: Conversion of a PLY to .ksplat at a compression level and an SH degree.
+KSPLAT_SCRIPT = """
+globalThis.window = globalThis.document = {};
+const { PlyParser, SplatBufferGenerator } = await import("@mkkellogg/gaussian-splats-3d");
+const { readFileSync, writeFileSync } = await import("fs");
+const [ply, out, level, degree] = process.argv.slice(1);
+const data = new Uint8Array(readFileSync(ply)).buffer;
+const splats = PlyParser.parseToUncompressedSplatArray(data, Number(degree));
+const generator = SplatBufferGenerator.getStandardGenerator(1, Number(level), 0);
+writeFileSync(out, Buffer.from(generator.generateFromUncompressedSplatArray(splats).bufferData));
+"""
 #: Formats that splat-transform reads; its name ends with this suffix for each of ours.
 READ_BY_SPLAT_TRANSFORM = ("ply", "compressed.ply", "spz", "v4.spz", "sog")
 #: Largest differences of opacities after the sigmoid, and of other values, from what another program reads. Compressed
@@ -71,7 +86,7 @@ def matched(found: Scene, expected: Scene) -> Scene:
     return found.subset(torch.from_numpy(rows))
 
 
-def assert_same(found: Scene, expected: Scene, tolerance: float = 1e-4) -> None:
+def assert_same(found: Scene, expected: Scene, tolerance: float = 1e-4, opacities: float = OPACITIES) -> None:
     """Assert that every value of every Gaussian is the same, up to the sign of quaternions."""
     found = matched(found, expected)
     assert found.sh_degree == expected.sh_degree
@@ -83,7 +98,7 @@ def assert_same(found: Scene, expected: Scene, tolerance: float = 1e-4) -> None:
             one, other = (torch.nn.functional.normalize(each, dim=1) for each in (one, other))
             other = other * (one * other).sum(dim=1, keepdim=True).sign()
         error = float((one - other).abs().max()) if one.numel() else 0.0
-        assert error <= (OPACITIES if field.name == "opacities" else tolerance), field.name
+        assert error <= (opacities if field.name == "opacities" else tolerance), (field.name, error)
 
 
 @pytest.mark.parametrize("name", READ_BY_SPLAT_TRANSFORM)
@@ -141,6 +156,27 @@ def test_glb_is_valid(modules: Path, scene: Scene, tmp_path: Path) -> None:
     issues = json.loads(done.stdout)["issues"]
     known = {"MESH_PRIMITIVE_INVALID_ATTRIBUTE", "UNSUPPORTED_EXTENSION"}
     assert {message["code"] for message in issues["messages"]} <= known, issues
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_ksplat_of_its_own_program_is_read(modules: Path, scene: Scene, tmp_path: Path, level: int) -> None:
+    """The values are those that splat-transform reads and, within the format's rounding, those of the PLY."""
+    ply, theirs, back = (tmp_path / name for name in ("ours.ply", "theirs.ksplat", "back.ply"))
+    within = replace(scene, sh_dc=scene.sh_dc.clamp(-1.7, 1.7), opacities=scene.opacities.clamp(-5, 5))
+    write_scene(ply, within)
+    command = ["node", "--input-type=module", "-e", KSPLAT_SCRIPT, *map(str, (ply, theirs, level, 2))]
+    subprocess.run(command, cwd=modules, capture_output=True, text=True, check=True)
+    splat_transform(modules, theirs, back)
+    found = read_scene(theirs).scene
+    assert_same(found, read_scene(back).scene, 1e-6)
+    # colors and opacities are rounded down to 8 bits
+    found = matched(found, within)
+    assert float((found.sh_dc - within.sh_dc).abs().max()) <= 1.01 / 255 / 0.282
+    rounded = replace(found, sh_dc=within.sh_dc)
+    if level == 2:
+        assert float((held(found.sh_rest) - held(within.sh_rest)).abs().max()) <= 1.51 / 255 * 2
+        rounded = replace(rounded, sh_rest=within.sh_rest)
+    assert_same(rounded, within, 4e-3, opacities=1.01 / 255)
 
 
 def attributes_of(path: Path) -> dict[str, np.ndarray]:

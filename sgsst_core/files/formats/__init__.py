@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Literal
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.glb import GLB
+from sgsst_core.files.formats.ksplat import KSPLAT
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat, SceneHeader
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.splat import SPLAT
 from sgsst_core.files.formats.spz import SPZ, SPZ_4
-from sgsst_core.files.formats.unsupported import refuse_unsupported
+from sgsst_core.files.formats.unsupported import refuse_folder, refuse_unsupported
 
 #: All scene formats, in the order in which they are tried and listed. Formats without a magic number come last.
-FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_4, SOG, GLB, SPLAT)
+FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_4, SOG, GLB, KSPLAT, SPLAT)
 #: Formats of results: PLY, and those that can be written in addition to it.
 RESULT_FORMATS = tuple(each for each in FORMATS if each.write)
 EXTRA_FORMATS = tuple(each for each in RESULT_FORMATS if each is not PLY)
@@ -72,6 +73,8 @@ def read_scene_header(path: Path) -> SceneHeader:
     Raises:
         SceneError: If the file cannot be read, is truncated, has a wrong header, or has an unsupported format.
     """
+    if path.is_dir():
+        refuse_folder(path)
     try:
         with path.open("rb") as file:
             start = FileStart(path, file.read(HEAD_BYTES), path.stat().st_size)

@@ -36,7 +36,7 @@ from sgsst_core.files.formats.quantized import (
     without_largest,
 )
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
-from sgsst_core.files.formats.unsupported import advice
+from sgsst_core.files.formats.unsupported import advice, is_checkpoint
 
 _ZIP_MAGIC = b"PK\x03\x04"
 #: Record at the end of a ZIP archive, and its signature; archives above 4 GB have a locator of another record before.
@@ -172,7 +172,8 @@ def _check_end(path: Path) -> None:
 
 def _matches(start: FileStart) -> bool:
     head = start.head
-    return head.startswith(_ZIP_MAGIC) or (head.lstrip().startswith(b"{") and b'"means"' in head)
+    archive = head.startswith(_ZIP_MAGIC) and not is_checkpoint(head)
+    return archive or (head.lstrip().startswith(b"{") and b'"means"' in head)
 
 
 def _read_header(start: FileStart) -> SogHeader:

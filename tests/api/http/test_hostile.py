@@ -37,6 +37,7 @@ from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.options import declared
 from tests.api.service import Service, check_documented, wait_for
+from tests.sgsst_core.files.formats.samples import ksplat
 from tests.small_scenes import wall, write_files
 
 MB = 1_000_000
@@ -65,6 +66,7 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Files:
     for format in EXTRA_FORMATS:
         write_scene(folder / format.name, scene, format)
         found[format.name] = (folder / format.name).read_bytes()
+    found["ksplat"] = ksplat(scene, level=1)
     color = bytes([200, 100, 50, 255, 255, 128, 128, 128])
     rows = [struct.pack("<6f", *mean, 0.16, 0.16, 0.01) + color for mean in scene.means.tolist()]
     return {**found, "splat": b"".join(rows)}
@@ -285,6 +287,12 @@ SCENES: list[tuple[str, Make]] = [
     ),
     ("GLB with deep JSON", lambda f: glb(b"[" * 500_000)),
     ("GLB of a mesh", lambda f: glb(b'{"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}')),
+    ("ksplat, half of it", lambda f: f["ksplat"][: len(f["ksplat"]) // 2]),
+    ("ksplat of 4 billion Gaussians", lambda f: ksplat_with(f["ksplat"], 16, 2**32 - 1)),
+    ("ksplat, a section of 4 billion Gaussians", lambda f: ksplat_with(f["ksplat"], 4096, 2**32 - 1, 2**32 - 1)),
+    ("ksplat of 4 billion buckets", lambda f: ksplat_with(f["ksplat"], 4096 + 12, 2**32 - 1)),
+    ("ksplat, fewer Gaussians in buckets", lambda f: ksplat_with(f["ksplat"], 5120, 1)),
+    ("a checkpoint", lambda f: zipped("archive/data.pkl", b"cos\nsystem\n(S'true'\ntR.")),
     ("SOG without images", lambda f: zipped("meta.json", b'{"version": 2, "means": {"files": ["means_l.webp"]}}')),
 ]
 
@@ -312,6 +320,12 @@ def spz_4(size: int) -> bytes:
     sizes = [9, 1, 3, 3, 4]
     head = b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, 0, 5, 32) + bytes(12)
     return head + b"".join(struct.pack("<QQ", size, becomes) for becomes in sizes)
+
+
+def ksplat_with(scene: bytes, place: int, *values: int) -> bytes:
+    """Return a .ksplat file with other numbers from a byte offset on."""
+    new = struct.pack(f"<{len(values)}I", *values)
+    return scene[:place] + new + scene[place + len(new) :]
 
 
 def glb(document: bytes) -> bytes:

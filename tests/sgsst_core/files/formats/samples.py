@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from sgsst_core.constants import SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.scene_file import read_scene, write_scene
@@ -102,3 +103,36 @@ def check_damage(path: Path, good: bytes, wrap: Callable[[bytes], bytes] = bytes
         except SceneError:
             continue
         assert all(bool(torch.isfinite(held(getattr(scene, field.name))).all()) for field in fields(scene)), trial
+
+
+def ksplat(scene: Scene, level: int, bucket_size: int = 256) -> bytes:
+    """Return a scene as .ksplat of one section, in whose buckets Gaussians follow each other; the last may be partial.
+
+    Positions of level 1 and 2 are steps within the largest extent of a bucket.
+    """
+    count, coefficients = len(scene), held(scene.sh_rest).shape[1]
+    means = scene.means.double().numpy()
+    full, rest = divmod(count, bucket_size)
+    buckets = [means[start : start + bucket_size] for start in range(0, count, bucket_size)]
+    centers = np.array([(each.min(axis=0) + each.max(axis=0)) / 2 for each in buckets], "<f4")
+    block = float(np.ceil(2 * max(np.abs(each - center).max() for each, center in zip(buckets, centers, strict=True))))
+    kinds = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}[level]
+    names = ("position", "scale", "rotation", "color", "harmonics")
+    types = (kinds[0], kinds[1], kinds[1], "u1", kinds[2])
+    rows = np.zeros(count, [*zip(names, types, (3, 3, 4, 4, 3 * coefficients), strict=True)])
+    steps = np.rint((means - centers[np.arange(count) // bucket_size]) * (32767 / (block / 2))) + 32767
+    rows["position"] = steps if level else means
+    rows["scale"] = scene.scales.double().exp().numpy()
+    rows["rotation"] = scene.quats.numpy()
+    rows["color"][:, :3] = ((0.5 + SH_C0 * scene.sh_dc.double()).clamp(0, 1) * 255).round().numpy()
+    rows["color"][:, 3] = (scene.opacities.double().sigmoid() * 255).round().numpy()
+    harmonics = held(scene.sh_rest).double().numpy()
+    bands = [harmonics[:, first:last].transpose(0, 2, 1).reshape(count, -1) for first, last in ((0, 3), (3, 8))]
+    values = np.concatenate(bands, axis=1)
+    rows["harmonics"] = np.rint((values.clip(-1.5, 1.5) + 1.5) / 3 * 255) if level == 2 else values
+    degree = {0: 0, 3: 1, 8: 2}[coefficients]
+    head = struct.pack("<4BIIIIHxx5f", 0, 1, 0, 0, 1, 1, count, count, level, 0, 0, 0, 0, 0).ljust(4096, b"\0")
+    stored = (bucket_size, len(buckets), block, 12, 32767, 0, full, bool(rest)) if level else (0, 0, 0.0, 0, 0, 0, 0, 0)
+    section = struct.pack("<IIIIfHxxIIIIH", count, count, *stored, degree).ljust(1024, b"\0")
+    lengths = struct.pack("<I", rest) if rest else b""
+    return head + section + (lengths + centers.tobytes() if level else b"") + rows.tobytes()

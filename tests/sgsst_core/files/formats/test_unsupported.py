@@ -1,27 +1,73 @@
-"""Tests of formats that cannot be read."""
+"""Tests of files and folders that are no scenes: the message says what they are, and what to do."""
 
 from __future__ import annotations
 
-import struct
+import re
 from pathlib import Path
 
 import pytest
+import torch
 
-from tests.sgsst_core.files.formats.samples import (
-    refused,
-)
+from sgsst_core.errors import SceneError
+from sgsst_core.files.scene_file import read_scene
+from tests.sgsst_core.files.formats.samples import refused
 
-
-def ksplat() -> bytes:
-    head = struct.pack("<4BIIIIHHfff", 0, 1, 0, 0, 1, 1, 616, 616, 1, 0, 0, 0, 0)
-    return head + bytes(4096 + 1024 - len(head)) + bytes(616 * 24)
+OBJ = b"# Blender\nmtllib cube.mtl\no Cube\n" + b"".join(b"v %d 0 1.5\n" % i for i in range(500))
 
 
 @pytest.mark.parametrize(
     ("data", "name", "message"),
     [
-        (ksplat(), "scene.ksplat", "a .ksplat scene.*splat-transform scene.ksplat scene.ply"),
+        (OBJ, "cube", "is an OBJ mesh"),
+        (b"\r\n" + OBJ.replace(b"\n", b"\r\n"), "cube", "is an OBJ mesh"),
+        (b"g empty", "mesh.obj", "is an OBJ mesh"),
+        (b'\n{"scenes": [], "asset": {"version": "2.0"}}', "scene", "Save it as one GLB"),
+        (b'{"scenes": []}', "scene.gltf", "Save it as one GLB"),
+        (b"\x80\x02}q\x00.", "model.pth", "is a checkpoint.*ns-export"),
     ],
 )
-def test_message_names_the_converter(tmp_path: Path, data: bytes, name: str, message: str) -> None:
+def test_message_says_what_the_file_is(tmp_path: Path, data: bytes, name: str, message: str) -> None:
     refused(tmp_path, data, message, name)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_checkpoints_are_named(tmp_path: Path, legacy: bool) -> None:
+    path = tmp_path / "step-000029999.ckpt"
+    content = {"splats": {"means": torch.zeros(5, 3)}}
+    torch.save(content, path, _use_new_zipfile_serialization=not legacy)
+    with pytest.raises(SceneError, match="is a checkpoint, not a scene"):
+        read_scene(path)
+
+
+def test_text_is_no_obj_file(tmp_path: Path) -> None:
+    refused(tmp_path, b"so it is\nv 1 2 3\n" * 100, "is not a scene file")
+    refused(tmp_path, b"# only\n# comments\n" * 100, "is not a scene file")
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (
+            ["point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply", "input.ply"],
+            "Give the scene in it: {}/point_cloud/iteration_30000/point_cloud.ply",
+        ),
+        (
+            ["ply/point_cloud_6999.ply", "ply/point_cloud_29999.ply", "ckpts/ckpt_29999_rank0.pt"],
+            "Give the scene in it: {}/ply/point_cloud_29999.ply",
+        ),
+        (["splat.ply"], "Give the scene in it: {}/splat.ply"),
+        (["meta.json", "sh0.webp"], "Give the scene in it: {}/meta.json"),
+        (
+            ["config.yml", "nerfstudio_models/step-000029999.ckpt"],
+            "`ns-export gaussian-splat --load-config {}/config.yml --output-dir exports`",
+        ),
+        (["ckpts/ckpt_29999_rank0.pt"], "Run it again with --save-ply"),
+        ([], "is a folder. Give the file of a scene"),
+    ],
+)
+def test_folder_names_the_scene_in_it(tmp_path: Path, files: list[str], message: str) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(SceneError, match=re.escape(message.format(tmp_path))):
+        read_scene(tmp_path)
