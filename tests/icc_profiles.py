@@ -44,6 +44,21 @@ def cmyk_profile(grid: int = 9) -> bytes:
     return _profile(b"prtr", b"CMYK", b"Lab ", {"wtpt": _xyz_tag(D50), "A2B0": data})
 
 
+def with_float_steps(profile: bytes, steps: int) -> bytes:
+    """Add a floating-point conversion (D2B0) of `steps` steps to a profile; each swaps red and green of the result."""
+    matrix = struct.pack(">4s4xHH12f", b"matf", 3, 3, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0)
+    place = struct.pack(">II", 16 + 8 * steps, len(matrix))  # all steps share one matrix
+    data = struct.pack(">4s4xHHI", b"mpet", 3, 3, steps) + place * steps + matrix
+    count = int.from_bytes(profile[128:132], "big")
+    tags = [struct.unpack_from(">4sII", profile, 132 + 12 * index) for index in range(count)]
+    body = profile[132 + 12 * count :]
+    body += bytes(-len(body) % 4)
+    tags = [(name, start + 12, size) for name, start, size in tags]
+    tags.append((b"D2B0", 132 + 12 * len(tags) + 12 + len(body), len(data)))
+    found = profile[4:128] + struct.pack(">I", count + 1) + b"".join(struct.pack(">4sII", *tag) for tag in tags)
+    return struct.pack(">I", 4 + len(found) + len(body) + len(data)) + found + body + data
+
+
 def _lab_of_inks(cyan: float, magenta: float, yellow: float, black: float) -> np.ndarray:
     """Return the Lab value of a mixture of inks, encoded in 16 bits: each ink absorbs its complement and some more."""
     paper = D50 * 0.9

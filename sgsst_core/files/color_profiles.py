@@ -37,7 +37,7 @@ class ColorProfile:
         if len(data) > MAX_PROFILE_BYTES:
             raise ValueError(f"it has more than {MAX_PROFILE_BYTES >> 20} MiB")
         try:
-            profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
+            profile = ImageCms.ImageCmsProfile(io.BytesIO(_without_float_conversions(data)))
         except (ImageCms.PyCMSError, OSError) as error:
             raise ValueError("it is broken") from error
         space = profile.profile.xcolor_space.strip()
@@ -81,6 +81,20 @@ class ColorProfile:
             probe = Image.fromarray(np.stack(np.meshgrid(axis, axis, axis), axis=3).reshape(len(axis), -1, 3))
         change = np.asarray(self.to_srgb(probe), np.int16) - np.asarray(probe.convert("RGB"), np.int16)
         return int(np.abs(change).max()) > _ROUNDING
+
+
+def _without_float_conversions(data: bytes) -> bytes:
+    """Rename the tags of a profile's optional floating-point conversions, D2B0 to D2B3, so that they are not used.
+
+    They may have any number of steps: a profile of 1 MB would take hours. Every profile has another conversion, by
+    tables or a matrix, with a fixed number of steps (ICC.1:2010, section 8).
+    """
+    found = bytearray(data)
+    tags = int.from_bytes(found[128:132], "big")
+    for position in range(132, min(132 + 12 * tags, len(found)), 12):
+        if found[position : position + 3] == b"D2B":
+            found[position] = ord("x")
+    return bytes(found)
 
 
 @functools.cache

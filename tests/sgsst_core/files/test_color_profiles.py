@@ -20,7 +20,16 @@ from sgsst_core.files.color_profiles import MAX_PROFILE_BYTES, ColorProfile
 from sgsst_core.files.images import ImageWarning, load_image
 from sgsst_core.files.photos import check_photos, find_masks, load_photo
 from sgsst_core.scene.camera import Camera
-from tests.icc_profiles import ADOBE_RGB, DISPLAY_P3, PROPHOTO, SRGB, cmyk_profile, gray_profile, rgb_profile
+from tests.icc_profiles import (
+    ADOBE_RGB,
+    DISPLAY_P3,
+    PROPHOTO,
+    SRGB,
+    cmyk_profile,
+    gray_profile,
+    rgb_profile,
+    with_float_steps,
+)
 
 BUILT_IN_SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 
@@ -144,6 +153,16 @@ def test_unusable_profiles_are_ignored_with_a_warning(tmp_path: Path, name: str)
         warnings.simplefilter("error")
         load_image(path, warn=told.append)
     assert len(told) == 1
+
+
+def test_floating_point_conversions_are_not_used() -> None:
+    """The number of their steps is unlimited, so that a small profile could take hours."""
+    image = Image.fromarray(colors())
+    plain = ColorProfile(BUILT_IN_SRGB, "RGB")
+    for steps in (1, 2, 20_000):
+        profile = ColorProfile(with_float_steps(BUILT_IN_SRGB, steps), "RGB")
+        assert not profile.changes
+        assert profile.to_srgb(image).tobytes() == plain.to_srgb(image).tobytes()
 
 
 def test_profiles_with_random_damage_are_used_or_refused() -> None:
