@@ -202,36 +202,50 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
         raise SceneError(f"{path}: is SOG of version {version}, which cannot be read. {advice('scene.sog')}")
     names = {name: meta[name]["files"] for name in _IMAGES if name in meta or name != "shN"}
     for name, found in names.items():
-        if len(found) != _IMAGES[name] or not all(_NAME.fullmatch(each) for each in found):
+        if type(found) is not list or len(found) != _IMAGES[name] or not all(_NAME.fullmatch(each) for each in found):
             raise ValueError(f"files of {name}: {found}")
     count = meta["count"] if version == 2 else meta["means"]["shape"][0]
     if type(count) is not int or count < 1:
         raise ValueError(f"count: {count}")
-    bounds = np.array([meta["means"]["mins"], meta["means"]["maxs"]], np.float64).reshape(2, 3)
+    bounds = np.stack([_numbers(meta["means"][side], 3) for side in ("mins", "maxs")])
     table = _codebook if version == 2 else _steps
-    scales, colors = table(meta["scales"]), table(meta["sh0"])
+    scales, colors = table(meta["scales"], 3), table(meta["sh0"], 4)
     opacities = OPACITY_LOGITS if version == 2 else colors[3]
     coefficients, harmonics = 0, None
     if "shN" in names:
         width, _ = _dimensions(path, files, names["shN"][0], 1, _PALETTE_PIXELS)
         if width not in _COEFFICIENTS_BY_WIDTH:
             raise ValueError(f"width of {names['shN'][0]}: {width}")
-        coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"])[0]
+        coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"], 1)[0]
     return SogHeader(SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics)
 
 
-def _codebook(entry: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the values of each byte, the same for all channels, [3, 256]. Missing values are NaN."""
-    values = np.array(entry["codebook"], np.float64).reshape(-1)
-    if not 0 < len(values) <= VALUES:
-        raise ValueError(f"codebook of {len(values)} values")
-    return np.tile(np.pad(values, (0, VALUES - len(values)), constant_values=np.nan), (3, 1))
+def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
+    """Return the values of each byte, the same for all channels, [channels, 256]. Missing values are NaN."""
+    codebook = entry["codebook"]
+    if not 0 < len(codebook) <= VALUES:
+        raise ValueError(f"codebook of {len(codebook)} values")
+    values = np.pad(_numbers(codebook, len(codebook)), (0, VALUES - len(codebook)), constant_values=np.nan)
+    return np.tile(values, (channels, 1))
 
 
-def _steps(entry: dict[str, Any]) -> NDArray[np.float64]:
+def _steps(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
     """Return the values of each byte in version 1 by channel, [channels, 256]."""
-    low, high = (np.atleast_1d(np.array(entry[side], np.float64))[:, None] for side in ("mins", "maxs"))
-    return low + (high - low) * (np.arange(VALUES) / 255)
+    low, high = (_numbers(entry[side], channels)[:, None] for side in ("mins", "maxs"))
+    with np.errstate(over="ignore", invalid="ignore"):  # non-finite results are reported later
+        return low + (high - low) * (np.arange(VALUES) / 255)
+
+
+def _numbers(values: Any, count: int) -> NDArray[np.float64]:
+    """Return `count` numbers of meta.json; null becomes NaN. A single number needs no list.
+
+    Raises:
+        ValueError: If there are more or fewer, or any is a text, a truth value or a list.
+    """
+    found = values if isinstance(values, list) else [values]
+    if len(found) != count or not all(type(value) in (int, float, type(None)) for value in found):
+        raise ValueError(f"{len(found)} values in place of {count} numbers, or values that are not numbers")
+    return np.array(found, np.float64)
 
 
 def _dimensions(path: Path, files: _Files, name: str, least: int, most: int | None = None) -> tuple[int, int]:

@@ -52,6 +52,8 @@ _READ_BYTES = 1 << 18
 _EXTENSION_BYTES = 1 << 20
 #: Maximum window of zstd, the default limit of its command-line program.
 _WINDOW_BYTES = 1 << 27
+#: Maximum compression ratio of zstd: a block of at most 128 KiB takes at least four bytes (RFC 8878, section 3.1.1.2).
+_ZSTD_RATIO = (1 << 17) // 4
 
 #: Type of the extension record that states the axes, and its numbers for them; 0 stands for the library's default.
 _AXES_EXTENSION = 0xADBE0003
@@ -168,7 +170,7 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
         listed = list(struct.iter_unpack("<QQ", file.read(16 * number)))
     streams, position = [], table + 16 * number
     for (compressed, decompressed), wanted in zip(listed, expected, strict=True):
-        if decompressed != wanted or position + compressed > size:
+        if decompressed != wanted or position + compressed > size or wanted > _ZSTD_RATIO * compressed:
             raise SceneError(
                 f"{path}: the SPZ header declares a stream of {compressed} bytes that become {decompressed}; {wanted} "
                 f"belong to {count} Gaussians, and {size - position} bytes are left. The file is truncated or its "

@@ -22,8 +22,9 @@ from urllib.parse import quote, urlsplit
 import httpx
 import psutil
 import pytest
+import zstandard
 from annotated_types import Ge
-from PIL import Image, PngImagePlugin
+from PIL import Image, ImageCms, PngImagePlugin
 
 from api.cli.options import kind_of
 from api.http.connection import MAX_HEAD_BYTES, MAX_HEADERS
@@ -37,6 +38,7 @@ from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.options import declared
 from tests.api.service import Service, check_documented, wait_for
+from tests.icc_profiles import with_float_steps
 from tests.sgsst_core.files.formats.samples import ksplat
 from tests.small_scenes import wall, write_files
 
@@ -273,6 +275,9 @@ SCENES: list[tuple[str, Make]] = [
     ("SPZ of version 9", lambda f: spz(1, bytes(20), version=9)),
     ("SPZ of degree 200", lambda f: spz(1, bytes(20), degree=200)),
     ("SPZ 4, streams beyond the file", lambda f: spz_4(2**63)),
+    ("SPZ 4 of a billion Gaussians in 100 bytes", lambda f: spz_4(20, 10**9) + bytes(100)),
+    ("SPZ 4, half of it", lambda f: f["v4.spz"][: len(f["v4.spz"]) // 2]),
+    ("SPZ 4, a gigabyte in a stream", lambda f: spz_4_bomb()),
     ("splat, one byte more", lambda f: f["splat"] + b"x"),
     ("splat with infinite places", lambda f: f["splat"] + struct.pack("<6f8B", *[float("inf")] * 3, 1, 1, 1, *[9] * 8)),
     ("splat with sizes of 0", lambda f: f["splat"][:-32] + f["splat"][-32:-20] + bytes(12) + f["splat"][-8:]),
@@ -293,6 +298,9 @@ SCENES: list[tuple[str, Make]] = [
     ("ksplat of 4 billion buckets", lambda f: ksplat_with(f["ksplat"], 4096 + 12, 2**32 - 1)),
     ("ksplat, fewer Gaussians in buckets", lambda f: ksplat_with(f["ksplat"], 5120, 1)),
     ("a checkpoint", lambda f: zipped("archive/data.pkl", b"cos\nsystem\n(S'true'\ntR.")),
+    ("SOG, files by name", lambda f: sog(files={"means_l.webp": 0, "means_u.webp": 0})),
+    ("SOG, text for numbers", lambda f: sog(mins=["1_0", 0, 0])),
+    ("SOG, 100,000 channels", lambda f: sog_of_channels(100_000)),
     ("SOG without images", lambda f: zipped("meta.json", b'{"version": 2, "means": {"files": ["means_l.webp"]}}')),
 ]
 
@@ -316,10 +324,31 @@ def spz_bomb() -> bytes:
     return data + deflate.flush()
 
 
-def spz_4(size: int) -> bytes:
-    sizes = [9, 1, 3, 3, 4]
-    head = b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, 0, 5, 32) + bytes(12)
-    return head + b"".join(struct.pack("<QQ", size, becomes) for becomes in sizes)
+def spz_4(size: int, count: int = 1) -> bytes:
+    """Return the header of an SPZ 4 file and the table of its streams, which take `size` bytes each."""
+    head = b"NGSP" + struct.pack("<IIBBBBI", 4, count, 0, 12, 0, 5, 32) + bytes(12)
+    return head + b"".join(struct.pack("<QQ", size, count * each) for each in (9, 1, 3, 3, 4))
+
+
+def spz_4_bomb() -> bytes:
+    """Return an SPZ 4 file of one Gaussian, whose positions are a gigabyte of zeros."""
+    stream = zstandard.ZstdCompressor().compress(bytes(1 << 30))
+    return spz_4(len(stream)) + 5 * stream
+
+
+def sog(**means: Any) -> bytes:
+    """Return a SOG archive without images, with these values in the entry `means`."""
+    entry = {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": ["means_l.webp", "means_u.webp"], **means}
+    steps = {name: {"codebook": [0.0], "files": [f"{name}.webp"]} for name in ("scales", "quats", "sh0")}
+    return zipped("meta.json", json.dumps({"version": 2, "count": 16, "means": entry, **steps}).encode())
+
+
+def sog_of_channels(count: int) -> bytes:
+    """Return a SOG archive of version 1 whose scales have bounds for that many channels."""
+    means = {"shape": [16, 3], "mins": [0, 0, 0], "maxs": [1, 1, 1], "files": ["means_l.webp", "means_u.webp"]}
+    bounds = {"mins": [0] * count, "maxs": [1] * count}
+    steps = {name: {**bounds, "files": [f"{name}.webp"]} for name in ("scales", "quats", "sh0")}
+    return zipped("meta.json", json.dumps({"means": means, **steps}).encode())
 
 
 def ksplat_with(scene: bytes, place: int, *values: int) -> bytes:
@@ -469,6 +498,14 @@ def test_images_that_lie(client: httpx.Client, store: Store, files: Files, make:
     problem = refused(answer, 422, "invalid-image", "image-too-large", "inspection-limit")
     assert problem.get("input", "style") == "style"
     assert count_jobs(store) == before
+
+
+def test_a_profile_of_many_steps_costs_no_time(client: httpx.Client, files: Files) -> None:
+    file = io.BytesIO()
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.open(io.BytesIO(files["style"])).save(file, "PNG", icc_profile=with_float_steps(srgb, 50_000))
+    answer = client.post("/v1/jobs", files=form(files, style=file.getvalue()))
+    assert answer.status_code == 202, answer.text
 
 
 def changed_cameras(files: Files, **values: Any) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ import pytest
 import torch
 from PIL import Image
 
+from sgsst_core.errors import SceneError
+from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.stored_harmonics import held
@@ -152,9 +155,18 @@ def bomb() -> bytes:
     return zipped(by_hand(2) | {"low": by_hand(2)["low"] + bytes(1 << 28)}, zipfile.ZIP_DEFLATED)
 
 
+def many_channels() -> bytes:
+    """Return a scene of version 1 whose bounds have 100,000 channels, for each of which 256 steps were computed."""
+    files = by_hand(1)
+    meta = json.loads(files["meta.json"])
+    meta["scales"] |= {"mins": [0] * 100_000, "maxs": [1] * 100_000}
+    return zipped(files | {"meta.json": json.dumps(meta).encode()}, zipfile.ZIP_DEFLATED)
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
+        (many_channels(), "100000 values in place of 3 numbers"),
         (zipped({"a.txt": b"text"}), "a ZIP archive without meta.json, so no SOG scene"),
         (zipped({f"{i}": b"" for i in range(300)}), "a ZIP archive of 300 files"),
         (zipped(by_hand(2))[:-30], "truncated ZIP archive"),
@@ -168,11 +180,12 @@ def bomb() -> bytes:
         (changed(count=3), "2 x 1 pixels.*do not fit 3 Gaussians"),
         (changed(means__files=["../low", "high"]), "files of means"),
         (changed(means__files=["low"]), "files of means"),
-        (changed(means__mins=[0, 1]), "not that of a SOG scene"),
+        (changed(means__mins=[0, 1]), "2 values in place of 3 numbers"),
         (changed(means__maxs=[1, 3, 1e9]), "infinite"),
         (changed(scales__codebook=[0.0] * 257), "codebook of 257 values"),
         (changed(scales__codebook=[]), "codebook of 0 values"),
-        (changed(scales__codebook=["a"]), "not that of a SOG scene"),
+        (changed(scales__codebook=["1_0"]), "values that are not numbers"),
+        (changed(means__files={"low": 0, "high": 1}), "files of means"),
         (changed(sh0__codebook=[0.0, None, 1.0]), "f_dc_1 .2 NaN"),
         (changed(quats__files=["sh0"]), "sh0 has no valid rotations"),
         (changed(shN__files=["labels", "palette"]), "width of labels: 2"),
@@ -187,3 +200,55 @@ def bomb() -> bytes:
 )
 def test_false_file_is_refused(tmp_path: Path, data: bytes, message: str) -> None:
     refused(tmp_path, data, message)
+
+
+#: Values of every kind that JSON has, and of those that a reader may convert.
+WRONG: list[Any] = [
+    None,
+    True,
+    -1,
+    0,
+    1e999,
+    2**70,
+    "x",
+    "1_0",
+    [],
+    {},
+    [[]],
+    [{}],
+    [None] * 2,
+    ["a"] * 2,
+    {"a": 1, "b": 2},
+    [[1]],
+]
+
+
+def places(value: Any, found: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the keys that lead to every value within a JSON value."""
+    yield found
+    children = value if isinstance(value, dict) else range(min(len(value), 4)) if isinstance(value, list) else ()
+    for key in children:
+        yield from places(value[key], (*found, key))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_wrong_values_anywhere_in_meta_json_are_refused(tmp_path: Path, version: int) -> None:
+    """Nothing but a `SceneError` leaves the check of the header, which runs in the API process."""
+    files, path = by_hand(version), tmp_path / "scene"
+    meta = json.loads(files["meta.json"])
+    refusals = 0
+    for keys in places(meta):
+        for wrong in WRONG:
+            changed_meta = json.loads(files["meta.json"])
+            inner = changed_meta
+            for key in keys[:-1]:
+                inner = inner[key]
+            if keys:
+                inner[keys[-1]] = wrong
+            content = changed_meta if keys else wrong
+            path.write_bytes(zipped(files | {"meta.json": json.dumps(content).encode()}))
+            try:
+                read_scene_header(path)
+            except SceneError:
+                refusals += 1
+    assert refusals > 10 * len(list(places(meta)))

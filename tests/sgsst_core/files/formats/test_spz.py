@@ -210,6 +210,14 @@ ROW = 20 + 9
             b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, 0, 5, 32) + bytes(12) + struct.pack("<10Q", *[2**60, 9] * 5),
             "a stream of 1152921504606846976 bytes",
         ),
+        (
+            b"NGSP"
+            + struct.pack("<IIBBBBI", 4, 10**9, 0, 12, 0, 5, 32)
+            + bytes(12)
+            + struct.pack("<10Q", 20, 9 * 10**9, *(20, 10**9), *(20, 3 * 10**9) * 2, 20, 4 * 10**9)
+            + bytes(100),
+            "a stream of 20 bytes that become 9000000000; 9000000000 belong to 1000000000 Gaussians",
+        ),
     ],
 )
 def test_false_header_is_refused(tmp_path: Path, data: bytes, message: str) -> None:
