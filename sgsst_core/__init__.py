@@ -7,10 +7,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sgsst_core.files.images import load_image
+    from sgsst_core.files.library import load_cameras, load_scene, save
     from sgsst_core.scene.camera import Camera
     from sgsst_core.scene.gaussians import Scene
     from sgsst_core.settings import Settings, make_settings
-    from sgsst_core.stylizing.loop import Callbacks, Progress, run, stylize
+    from sgsst_core.style import Style
+    from sgsst_core.stylizing.loop import Callbacks, Progress, run
+    from sgsst_core.stylizing.stylize import stylize
     from sgsst_core.stylizing.stylizer import Stylizer
 
 # PyTorch reads this variable once, before it allocates its first tensor. Allocations of 2 MB and more then use huge
@@ -22,7 +26,22 @@ os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 if os.environ.keys().isdisjoint({"PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF"}):
     os.environ["PYTORCH_ALLOC_CONF"] = "expandable_segments:True"
 
-__all__ = ["Callbacks", "Camera", "Progress", "Scene", "Settings", "Stylizer", "make_settings", "run", "stylize"]
+__all__ = [
+    "Callbacks",
+    "Camera",
+    "Progress",
+    "Scene",
+    "Settings",
+    "Style",
+    "Stylizer",
+    "load_cameras",
+    "load_image",
+    "load_scene",
+    "make_settings",
+    "run",
+    "save",
+    "stylize",
+]
 
 _MODULES = {
     "Callbacks": "stylizing.loop",
@@ -30,10 +49,15 @@ _MODULES = {
     "Progress": "stylizing.loop",
     "Scene": "scene.gaussians",
     "Settings": "settings",
+    "Style": "style",
     "Stylizer": "stylizing.stylizer",
+    "load_cameras": "files.library",
+    "load_image": "files.images",
+    "load_scene": "files.library",
     "make_settings": "settings",
     "run": "stylizing.loop",
-    "stylize": "stylizing.loop",
+    "save": "files.library",
+    "stylize": "stylizing.stylize",
 }
 
 

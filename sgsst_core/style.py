@@ -83,38 +83,38 @@ class Style:
         return ", ".join(f"{name} {share:.0%}" for name, share in shares)
 
 
-def image_of(values: Tensor | NDArray[Any]) -> Tensor:
+def image_of(values: Tensor | NDArray[Any], name: str = "style image") -> Tensor:
     """Convert an array or tensor to an image as `load_image` returns it: [H, W, 3] float32 in 0..1, on the CPU.
 
     Args:
         values: Image [H, W], or with 1, 3 or 4 channels that come last or first; sRGB values, uint8 in 0..255 or
             floating point in 0..1. Transparent parts are composited over white.
+        name: Name of the image in messages.
 
     Raises:
         ImageError: If the type, dtype, shape or range differs, or values are NaN.
     """
     if not isinstance(values, Tensor | np.ndarray):
         raise ImageError(
-            f"The style image is a {type(values).__name__}, not a tensor or NumPy array. Read files with `load_image`."
+            f"The {name} is a {type(values).__name__}, not a tensor or NumPy array. Read files with `load_image`."
         )
     if isinstance(values, np.ndarray):
         if values.dtype.kind not in "uif":
-            raise ImageError(f"The style image has dtype {values.dtype}. Give uint8 in 0..255 or floats in 0..1.")
+            raise ImageError(f"The {name} has dtype {values.dtype}. Give uint8 in 0..255 or floats in 0..1.")
         values = torch.from_numpy(np.array(values, values.dtype.newbyteorder("="), order="C"))
     if values.dtype not in _DTYPES:
         raise ImageError(
-            f"The style image has dtype {str(values.dtype).removeprefix('torch.')}. Give uint8 in 0..255 or floats in "
-            "0..1."
+            f"The {name} has dtype {str(values.dtype).removeprefix('torch.')}. Give uint8 in 0..255 or floats in 0..1."
         )
     values = values.detach() if values.requires_grad else values
-    image = _channels_last(values).to("cpu", torch.float32)
+    image = _channels_last(values, name).to("cpu", torch.float32)
     image = image if values.dtype.is_floating_point else image / 255
     low, high = (float(value) for value in image.aminmax())
     if math.isnan(low):
-        raise ImageError("The style image holds NaN. Use another image.")
+        raise ImageError(f"The {name} holds NaN. Use another image.")
     if low < 0 or high > 1:
         raise ImageError(
-            f"The style image has values from {low:.4g} to {high:.4g}, but floats must be in 0..1. Divide values in "
+            f"The {name} has values from {low:.4g} to {high:.4g}, but floats must be in 0..1. Divide values in "
             "0..255 by 255, and clamp others."
         )
     if image.shape[2] == 4:
@@ -122,7 +122,7 @@ def image_of(values: Tensor | NDArray[Any]) -> Tensor:
     return (image.expand(-1, -1, 3) if image.shape[2] == 1 else image).contiguous()
 
 
-def _channels_last(values: Tensor) -> Tensor:
+def _channels_last(values: Tensor, name: str) -> Tensor:
     """Return an image of 1, 3 or 4 channels as [H, W, channels]."""
     shape = tuple(values.shape)
     if len(shape) == 2:
@@ -130,9 +130,7 @@ def _channels_last(values: Tensor) -> Tensor:
     elif len(shape) == 3 and shape[2] not in _CHANNELS and shape[0] in _CHANNELS:
         values = values.permute(1, 2, 0)
     if values.ndim != 3 or values.shape[2] not in _CHANNELS or not values.numel():
-        raise ImageError(
-            f"The style image has shape {list(shape)}. Give [H, W, 3] or [3, H, W], without a batch dimension."
-        )
+        raise ImageError(f"The {name} has shape {list(shape)}. Give [H, W, 3] or [3, H, W], without a batch dimension.")
     return values
 
 

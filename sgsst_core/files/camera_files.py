@@ -69,11 +69,6 @@ def read_cameras(path: Path, photos: Path | None = None) -> list[Camera]:
     Raises:
         CameraError: If the file is missing, its format is unknown, it holds no cameras, a camera cannot be a pinhole,
             or a value is invalid. The message names the file and the camera.
-
-    Example:
-        >>> cameras = read_cameras(Path("cameras.json"))
-        >>> cameras[0].width, cameras[0].height
-        (64, 48)
     """
     if path.is_dir():
         return _read_folder(path, photos)

@@ -67,6 +67,7 @@ class SceneFile:
         format: Name of the file's format.
         clamped: Number of infinite opacities that were replaced by finite ones. The stylized PLY keeps them.
         copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
+        sh_attenuation: SH attenuation that the scene has, but not the file.
     """
 
     path: Path
@@ -77,15 +78,18 @@ class SceneFile:
     format: str = PLY.name
     clamped: int = 0
     copies: NDArray[np.int64] | None = None
+    sh_attenuation: float = 0.0
 
     def refined(self, refinement: Refinement | None) -> SceneFile:
         """Return the file with its scene refined; the file itself if no Gaussian was split.
 
         Raises:
-            SceneError: If the file stores positions, opacities or scales as integers.
+            SceneError: If the file stores positions, opacities or scales as integers, or Gaussians are split already.
         """
         if refinement is None or not refinement.split:
             return self
+        if self.copies is not None:
+            raise SceneError(f"{self.path}: its Gaussians are split already. Save the result, and load it again.")
         if self.header is not None:
             kinds = {prop.name: prop.kind for prop in self.header.vertex.properties}
             integers = [name for name in _SHAPE if kinds[name][0] != "f"]
@@ -95,6 +99,17 @@ class SceneFile:
                     "double. Convert the scene first, or leave --refine out."
                 )
         return replace(self, scene=refinement.of(self.scene), copies=piece_counts(refinement.pieces).numpy())
+
+    def stylized(self, scene: Scene, refinement: Refinement | None, sh_attenuation: float) -> SceneFile:
+        """Return the file with a stylized scene in place of its own.
+
+        Args:
+            scene: Stylized scene.
+            refinement: Refinement of the stylized scene; None if there was none.
+            sh_attenuation: SH attenuation of the stylized scene, in addition to the file's own.
+        """
+        attenuation = 1 - (1 - self.sh_attenuation) * (1 - sh_attenuation)
+        return replace(self.refined(refinement), scene=scene, sh_attenuation=attenuation)
 
     @property
     def dropped(self) -> int:
@@ -121,11 +136,6 @@ def read_scene(
     Raises:
         SceneError: If the file cannot be read, is truncated, is not a 3DGS scene, has a wrong header, no Gaussians or
             invalid values, or has changed while it was read.
-
-    Example:
-        >>> source = read_scene(Path("scene.ply"))
-        >>> tuple(source.scene.means.shape)
-        (616, 3)
     """
     header = read_scene_header(path)
     if isinstance(header, SpzHeader):

@@ -50,9 +50,9 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
         ValueError: If sh_dc has the wrong shape or non-finite values.
 
     Example:
-        >>> source = read_scene(Path("scene.ply"))
+        >>> source = load_scene("scene.ply")
         >>> write_stylized(source, Path("gray.ply"), torch.zeros_like(source.scene.sh_dc))
-        >>> bool(read_scene(Path("gray.ply")).scene.sh_dc.any())
+        >>> bool(load_scene("gray.ply").scene.sh_dc.any())
         False
     """
     if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):

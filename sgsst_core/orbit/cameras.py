@@ -80,7 +80,7 @@ def orbit(
             range.
 
     Example:
-        >>> cameras = orbit(read_scene(Path("scene.ply")).scene, 8, width=320, height=240)
+        >>> cameras = orbit(load_scene("scene.ply").scene, 8, width=320, height=240)
         >>> len(cameras), cameras[0].width
         (8, 320)
     """

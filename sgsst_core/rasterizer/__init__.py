@@ -55,8 +55,8 @@ def make_rasterizer(
         SettingsError: If the name is unknown, the rasterizer cannot use the device, or `cuda` lacks gsplat or a GPU.
 
     Example:
-        >>> scene = read_scene(Path("scene.ply")).scene
-        >>> camera = read_cameras(Path("cameras.json"))[0]
+        >>> scene = load_scene("scene.ply").scene
+        >>> camera = load_cameras("cameras.json")[0]
         >>> make_rasterizer("cpu", scene).render(scene.sh_dc, camera).shape
         torch.Size([48, 64, 3])
     """

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from sgsst_core.errors import SceneError
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 
 #: Number of Gaussians that are processed at a time.
@@ -29,7 +33,7 @@ class Scene:
         sh_rest: [N, K, 3] with K = 0, 3, 8 or 15 for SH degree 0 to 3.
 
     Example:
-        >>> scene = read_scene(Path("scene.ply")).scene
+        >>> scene = load_scene("scene.ply").scene
         >>> len(scene), scene.sh_degree, tuple(scene.sh_dc.shape)
         (616, 0, (616, 3))
     """
@@ -87,6 +91,57 @@ class Scene:
         if isinstance(self.sh_rest, StoredHarmonics):
             return replace(self, sh_rest=self.sh_rest.first(coefficients))
         return replace(self, sh_rest=self.sh_rest[:, :coefficients].contiguous())
+
+
+def checked_scene(scene: Scene, names: Mapping[str, str] | None = None) -> Scene:
+    """Check a scene that a caller of the library passes, and convert its values to float32 tensors on the CPU.
+
+    NumPy arrays are accepted, and also opacities [N, 1] and sh_dc [N, 1, 3], as trainers keep them.
+
+    Args:
+        scene: Scene to check.
+        names: Names of its fields in messages; None for their own.
+
+    Raises:
+        SceneError: If a shape, type or value is wrong.
+    """
+    count = len(scene.means) if np.ndim(scene.means) else 0
+    shapes = {
+        "means": ((count, 3),),
+        "quats": ((count, 4),),
+        "scales": ((count, 3),),
+        "opacities": ((count,), (count, 1)),
+        "sh_dc": ((count, 3), (count, 1, 3)),
+        "sh_rest": tuple((count, coefficients, 3) for coefficients in (0, 3, 8, 15)),
+    }
+    values = {name: _checked((names or {}).get(name, name), getattr(scene, name), shapes[name]) for name in shapes}
+    if not count:
+        raise SceneError("The scene has no Gaussians. Give at least one.")
+    if all(values[name] is getattr(scene, name) for name in shapes):
+        return scene
+    return Scene(**values)
+
+
+def _checked(name: str, given: Any, shapes: tuple[tuple[int, ...], ...]) -> Any:
+    """Return a field of a scene as a tensor of the first of some shapes; SH coefficients may have any of them."""
+    if isinstance(given, StoredHarmonics):
+        return given
+    if not isinstance(given, Tensor | np.ndarray):
+        raise SceneError(f"The scene: `{name}` is a {type(given).__name__}. Give a tensor or NumPy array.")
+    if not (given.is_floating_point() if isinstance(given, Tensor) else given.dtype.kind == "f"):
+        raise SceneError(f"The scene: `{name}` has dtype {given.dtype}. Give floating point numbers.")
+    shape = tuple(given.shape)
+    if shape not in shapes:
+        wanted = " or ".join(str(list(each)) for each in shapes)
+        raise SceneError(f"The scene: `{name}` has shape {list(shape)}. Give {wanted}, with the same N everywhere.")
+    tensor = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, np.float32))
+    tensor = (tensor.detach() if tensor.requires_grad else tensor).to("cpu", torch.float32)
+    if len(shape) != len(shapes[0]):
+        tensor = tensor.reshape(shapes[0])
+    bad = int((~torch.isfinite(tensor)).sum())
+    if bad:
+        raise SceneError(f"The scene: `{name}` holds {bad} NaN or infinite values. Remove these Gaussians.")
+    return tensor
 
 
 def attenuation_factor(attenuation: float) -> float:

@@ -6,7 +6,9 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.budget import forget_device_peak, least_intersection_memory, memory_for
@@ -27,9 +29,9 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras, spread
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import Scene, checked_scene
 from sgsst_core.settings import Settings
-from sgsst_core.style import Style
+from sgsst_core.style import Style, image_of
 from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.refining import refine, refined
@@ -183,7 +185,7 @@ class StylizationJob:
 def plan_job(
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor | Style,
+    style: Tensor | NDArray[Any] | Style,
     settings: Settings,
     *,
     weights: BackboneWeights | None = None,
@@ -194,11 +196,12 @@ def plan_job(
 ) -> StylizationJob:
     """Plan and prepare a job; see `make_plan` for `weights`, `rasterizer` and exceptions.
 
-    Styles and cameras are checked, and converted if necessary. If the settings request refinement, the job contains the
-    refined scene.
+    Inputs are checked, and converted if necessary. If the settings request refinement, the job contains the refined
+    scene.
     """
     style, regions = Style.given(style), regions and regions.with_checked_styles()
-    cameras = checked_cameras(cameras)
+    scene, cameras = checked_scene(scene), checked_cameras(cameras)
+    photos = photos and _checked_photos(photos)
     weights = weights or load_network_weights("auto")
     refinement = refine(
         scene,
@@ -234,6 +237,11 @@ def plan_job(
         planning_context=planning_context,
         regions=regions,
     )
+
+
+def _checked_photos(photos: PhotoLoader) -> PhotoLoader:
+    """Return a loader that checks and converts the photos of a caller's loader."""
+    return lambda index: image_of(photos(index), f"photo of view {index}")
 
 
 def prepare_job(

@@ -7,20 +7,12 @@ loop, and the first rank decides when it stops.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from torch import Tensor
-
-from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import has_converged, has_reached
 from sgsst_core.planning.plan import Prediction
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import Settings
-from sgsst_core.style import Style
-from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -83,9 +75,9 @@ class Callbacks:
     Example:
         >>> steps = []
         >>> callbacks = Callbacks(progress=lambda progress: steps.append(progress.step))
-        >>> scene, cameras = read_scene(Path("scene.ply")).scene, read_cameras(Path("cameras.json"))
-        >>> settings = make_settings("preview", steps_sos=2)
-        >>> colors = stylize(scene, cameras, load_image(Path("style.png")), settings, callbacks=callbacks)
+        >>> scene, cameras = load_scene("scene.ply"), load_cameras("cameras.json")
+        >>> style = load_image("style.png")
+        >>> result = stylize(scene, cameras, style, preset="preview", steps_sos=2, callbacks=callbacks)
         >>> steps
         [1, 2]
     """
@@ -103,9 +95,9 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     """Iterate to the end of the schedule, unless a limit in the settings or `callbacks.stop` ends the run earlier.
 
     Example:
-        >>> scene, cameras = read_scene(Path("scene.ply")).scene, read_cameras(Path("cameras.json"))
+        >>> scene, cameras = load_scene("scene.ply").scene, load_cameras("cameras.json")
         >>> settings = make_settings("preview", steps_sos=2)
-        >>> stylizer = Stylizer.planned(scene, cameras, load_image(Path("style.png")), settings)
+        >>> stylizer = Stylizer.planned(scene, cameras, load_image("style.png"), settings)
         >>> run(stylizer)
         'finished'
     """
@@ -242,30 +234,3 @@ def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:
     save(stylizer)
     parts = stylizer.seconds_by_part
     parts["checkpoint"] = parts.get("checkpoint", 0.0) + time.perf_counter() - started
-
-
-def stylize(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    style: Tensor | Style,
-    settings: Settings,
-    *,
-    weights: BackboneWeights | None = None,
-    photos: PhotoLoader | None = None,
-    callbacks: Callbacks | None = None,
-) -> Tensor:
-    """Stylize a scene from start to finish. Arguments are those of `Stylizer.planned`.
-
-    Returns:
-        New sh_dc [N, 3], float32 on the CPU; everything else of the scene is unchanged. For a refined scene, N is the
-            number of its Gaussians; use `Stylizer.planned` to get that scene.
-
-    Example:
-        >>> scene, cameras = read_scene(Path("scene.ply")).scene, read_cameras(Path("cameras.json"))
-        >>> settings = make_settings("preview", steps_sos=2, seed=1)
-        >>> stylize(scene, cameras, load_image(Path("style.png")), settings).shape
-        torch.Size([616, 3])
-    """
-    stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, photos=photos)
-    run(stylizer, callbacks)
-    return stylizer.stylized()

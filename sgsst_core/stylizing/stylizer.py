@@ -13,6 +13,7 @@ from typing import Any, Self
 
 import psutil
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.budget import device_peak
@@ -96,7 +97,7 @@ class Stylizer:
         cls,
         scene: Scene,
         cameras: Sequence[Camera],
-        style: Tensor | Style,
+        style: Tensor | NDArray[Any] | Style,
         settings: Settings,
         *,
         weights: BackboneWeights | None = None,
@@ -110,9 +111,9 @@ class Stylizer:
         If the settings request refinement, the job contains the refined scene.
 
         Example:
-            >>> scene, cameras = read_scene(Path("scene.ply")).scene, read_cameras(Path("cameras.json"))
+            >>> scene, cameras = load_scene("scene.ply").scene, load_cameras("cameras.json")
             >>> settings = make_settings("preview", steps_sos=2)
-            >>> stylizer = Stylizer.planned(scene, cameras, load_image(Path("style.png")), settings)
+            >>> stylizer = Stylizer.planned(scene, cameras, load_image("style.png"), settings)
             >>> stylizer.job.total_steps
             2
         """

@@ -10,35 +10,26 @@ from typing import Any
 import pytest
 import torch
 
-from sgsst_core import Callbacks, Camera, Scene, Stylizer, make_settings, run, stylize
-from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.images import load_image
-from sgsst_core.files.scene_file import read_scene
+import sgsst_core
+from sgsst_core import Camera, Stylizer
+from sgsst_core.files.splats import scene_of_splats
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.rasterizer import make_rasterizer
 from tests.small_scenes import wall, write_files
 
-PUBLIC: list[Any] = [
-    Callbacks,
-    Camera,
-    Camera.from_matrix,
-    Scene,
-    Stylizer.planned,
-    load_image,
-    make_rasterizer,
-    make_settings,
-    orbit,
-]
-PUBLIC += [read_cameras, read_scene, run, stylize, write_stylized]
+EXPORTED = {name: getattr(sgsst_core, name) for name in sgsst_core.__all__}
+#: Exported names without an example: plain records, and classes whose factories have one.
+PLAIN = ("Progress", "Settings", "Style", "Stylizer")
+PUBLIC: list[Any] = [item for name, item in EXPORTED.items() if name not in PLAIN]
+PUBLIC += [Camera.from_matrix, Stylizer.planned, make_rasterizer, orbit, scene_of_splats, write_stylized]
 
 
 @pytest.mark.parametrize("item", PUBLIC, ids=lambda item: item.__qualname__)
 def test_example(item: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_files(tmp_path, wall())
     monkeypatch.chdir(tmp_path)
-    names = {each.__name__: each for each in PUBLIC if "." not in each.__qualname__}
-    names |= {"Stylizer": Stylizer, "Path": Path, "torch": torch}
+    names = {each.__name__: each for each in PUBLIC} | EXPORTED | {"Path": Path, "torch": torch}
     examples = doctest.DocTestFinder(recurse=False).find(item, item.__qualname__, globs=names)
     assert sum(len(each.examples) for each in examples) > 1
     for each in examples:

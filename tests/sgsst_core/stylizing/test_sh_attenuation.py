@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.loop import run, stylize
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylize import stylize
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, style, wall
 
@@ -60,11 +61,12 @@ def test_the_picture_of_the_result_is_what_was_optimized(
     source = read_scene(tmp_path / "scene.ply", held_bytes=held_bytes)
     assert isinstance(source.scene.sh_rest, StoredHarmonics) == (held_bytes == 0)
     settings = make_settings(steps_coarse=0, steps_sos=2, sh_attenuation=attenuation)
-    colors = stylize(source.scene, cameras(), style(), settings, weights=tiny_weights)
-    write_stylized(source, tmp_path / "out.ply", colors, sh_attenuation=attenuation)
+    values = settings.model_dump(exclude={"preset"})
+    stylized = stylize(source, cameras(), style(), weights=tiny_weights, **values)
+    save(tmp_path / "out.ply", stylized)
     result = read_scene(tmp_path / "out.ply").scene
     stylizer = Stylizer.planned(source.scene, cameras(), style(), settings, weights=tiny_weights)
-    stylizer.set_colors(colors)
+    stylizer.set_colors(stylized.scene.sh_dc)
     again = Stylizer.planned(result, cameras(), style(), make_settings(warm_start=False), weights=tiny_weights)
     for index in range(3):
         pictures = [

@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core import stylize
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
@@ -345,16 +344,6 @@ def test_larger_views_are_brought_down_to_the_limit() -> None:
     assert fitted[0] is views[0]
     assert (fitted[1].width, fitted[1].height) == (100, 75)
     assert fit_cameras(views, make_settings()) == views
-
-
-def test_stylize_leaves_the_scene_as_it_is(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    before = scene.sh_dc.clone()
-    settings = make_settings(steps_sos=2)
-    colors = stylize(scene, cameras(2), style(), settings, weights=tiny_weights)
-    assert torch.equal(scene.sh_dc, before)
-    assert colors.shape == before.shape
-    assert not torch.equal(colors, before)
-    assert not colors.requires_grad
 
 
 class ClockEvent:

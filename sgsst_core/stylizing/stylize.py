@@ -1,0 +1,70 @@
+"""Stylization of a scene in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.library import F, as_scene, stylized
+from sgsst_core.files.scene_file import SceneFile
+from sgsst_core.files.stylized_ply import check_sh_attenuation
+from sgsst_core.scene.camera import Camera
+from sgsst_core.settings import PresetName, make_settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.ahead import PhotoLoader
+from sgsst_core.stylizing.loop import Callbacks, run
+from sgsst_core.stylizing.stylizer import Stylizer
+
+
+def stylize(
+    scene: F,
+    cameras: Sequence[Camera],
+    style: Tensor | NDArray[Any] | Style,
+    *,
+    preset: PresetName = "standard",
+    photos: PhotoLoader | None = None,
+    callbacks: Callbacks | None = None,
+    weights: BackboneWeights | None = None,
+    **settings: Any,
+) -> F:
+    """Stylize a scene from start to finish. The given scene stays as it is.
+
+    Args:
+        scene: Result of `load_scene`, a `Scene`, or a dictionary of tensors of gsplat (`scene_of_splats`).
+        cameras: Cameras of the views.
+        style: Style image, such as from `load_image`; or a mixture of several.
+        preset: Preset of the settings: "preview", "standard" or "paper".
+        photos: Function that loads the content image of a view by its index, at the size of the view; None for
+            unstylized renders.
+        callbacks: Callbacks for progress, checkpoints and previews.
+        weights: Weights of the feature network; None for VGG19 if it is installed, else VGG16.
+        settings: Further settings by name (docs/options.md, with underscores), such as `steps_sos=100`.
+
+    Returns:
+        Stylized scene in the form in which it was given. `save` writes it to a file.
+
+    Raises:
+        InvalidInputError: If an input or a setting cannot be used.
+
+    Example:
+        >>> scene, cameras = load_scene("scene.ply"), load_cameras("cameras.json")
+        >>> result = stylize(scene, cameras, load_image("style.png"), preset="preview", steps_sos=2)
+        >>> save("stylized.ply", result)
+        >>> torch.equal(load_scene("stylized.ply").scene.sh_dc, result.scene.sh_dc)
+        True
+    """
+    chosen = make_settings(preset, **settings)
+    if isinstance(scene, SceneFile):
+        check_sh_attenuation(scene, chosen.sh_attenuation)
+    stylizer = Stylizer.planned(as_scene(scene), cameras, style, chosen, weights=weights, photos=photos)
+    job = stylizer.job
+    if isinstance(scene, SceneFile):
+        scene.refined(job.plan.refinement)  # raises before the steps if the file cannot hold the result
+    run(stylizer, callbacks)
+    result = replace(job.scene, sh_dc=stylizer.stylized())
+    return cast(F, stylized(scene, result, job.plan.refinement, chosen.sh_attenuation))

@@ -1,0 +1,174 @@
+"""Tests of checkpoints of gsplat and nerfstudio, hostile ones included, and of gsplat's dictionaries."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from sgsst_core import load_scene, save
+from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.files.formats.quantized import OPACITY_LOGITS
+from sgsst_core.files.scene_file import read_scene
+from sgsst_core.files.splats import scene_of_splats
+from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
+from sgsst_core.scene.gaussians import Scene
+from tests.sgsst_core.trainer_scenes import splats_of, write_gsplat, write_nerfstudio
+from tests.small_scenes import wall
+
+
+def same(first: Scene, second: Scene) -> bool:
+    return all(torch.equal(getattr(first, field.name), getattr(second, field.name)) for field in fields(Scene))
+
+
+def assert_equal(first: Any, second: Any) -> None:
+    """Compare everything in two checkpoints."""
+    assert type(first) is type(second)
+    if isinstance(first, dict):
+        assert list(first) == list(second)
+        for name in first:
+            assert_equal(first[name], second[name])
+    elif isinstance(first, torch.Tensor):
+        assert torch.equal(first, second)
+    else:
+        assert first == second
+
+
+def load_all(path: Path) -> Any:
+    return torch.load(path, weights_only=False)
+
+
+@pytest.mark.parametrize("write", [write_gsplat, write_nerfstudio])
+def test_only_colors_of_a_checkpoint_change(tmp_path: Path, write: Any) -> None:
+    path, scene = write(tmp_path / "given.ckpt", wall(sh_degree=3)), wall(sh_degree=3)
+    found = load_scene(path)
+    assert isinstance(found, TrainerCheckpoint)
+    assert same(found.scene, scene)
+    result = found.stylized(replace(scene, sh_dc=scene.sh_dc + 1), None, 0.0)
+    save(tmp_path / "out.pt", result)
+    before, after = load_all(path), load_all(tmp_path / "out.pt")
+    name = "splats" if write is write_gsplat else "pipeline"
+    colors = "sh0" if write is write_gsplat else "_model.gauss_params.features_dc"
+    assert torch.equal(after[name][colors], before[name][colors] + 1)
+    before[name][colors] = after[name][colors]
+    assert_equal(after, before)
+    assert same(load_scene(tmp_path / "out.pt").scene, result.scene)
+
+
+def test_a_checkpoint_is_saved_as_a_scene_file_too(tmp_path: Path) -> None:
+    found = load_scene(write_nerfstudio(tmp_path / "given.ckpt", wall(sh_degree=1)))
+    save(tmp_path / "out.ply", found)
+    assert same(read_scene(tmp_path / "out.ply").scene, wall(sh_degree=1))
+    for path, form in ((tmp_path / "out.json", found), (tmp_path / "out.pt", found.scene), (tmp_path / "out", found)):
+        with pytest.raises(OutputError, match="no suffix that a scene can be written with"):
+            save(path, form)
+    os.utime(found.path, ns=(0, 0))
+    with pytest.raises(SceneError, match="was changed after it was read"):
+        save(tmp_path / "other.pt", found)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["given.ckpt", "out.ply"]
+
+
+def repacked(path: Path, target: Path, compression: int = zipfile.ZIP_STORED, cut: int | None = None) -> Path:
+    """Write the entries of a checkpoint again, compressed or with the tensors' data cut."""
+    with zipfile.ZipFile(path) as given, zipfile.ZipFile(target, "w", compression) as written:
+        for entry in given.infolist():
+            data = given.read(entry)
+            written.writestr(entry.filename, data[:cut] if "/data/" in entry.filename else data)
+    return target
+
+
+class Command:
+    """Object whose pickle runs a command."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, ("touch executed",)
+
+
+def write_hostile(case: str, folder: Path) -> Path:
+    path, good = folder / f"{case}.pt", write_gsplat(folder / "good.pt", wall())
+    splats: dict[str, Any] = splats_of(wall())
+    if case == "command":
+        torch.save({"splats": {**splats, "means": Command()}}, path)
+    elif case == "expanded":  # a few bytes that would become terabytes
+        torch.save({"splats": {**splats, "means": torch.zeros(1, 1).expand(1 << 40, 3)}}, path)
+    elif case == "compressed":
+        repacked(good, path, zipfile.ZIP_DEFLATED)
+    elif case == "short":
+        repacked(good, path, cut=8)
+    elif case == "half":
+        path.write_bytes(good.read_bytes()[:5000])
+    elif case == "other":
+        torch.save({"model": splats}, path)
+    elif case == "list":
+        torch.save([splats], path)
+    elif case == "nerfacto":
+        torch.save({"pipeline": {"_model.field.weight": torch.ones(3)}}, path)
+    elif case == "degree 0":
+        write_nerfstudio(path, wall())
+    elif case == "nan":
+        torch.save({"splats": {**splats, "quats": splats["quats"] * torch.nan}}, path)
+    elif case == "text":
+        torch.save({"splats": {**splats, "opacities": "many"}}, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("case", "problem"),
+    [
+        ("command", "more than tensors and plain values. Such a file can run any program"),
+        ("expanded", "`means` is larger than its data"),
+        ("compressed", "compressed entries"),
+        ("short", "damaged checkpoint"),
+        ("half", "cannot be read: File is not a zip file"),
+        ("other", "neither a checkpoint of gsplat's trainer nor one of nerfstudio.*ns-export"),
+        ("list", "neither a checkpoint"),
+        ("nerfacto", "holds no Gaussians"),
+        ("degree 0", "SH degree 0"),
+        ("nan", "nan.pt: The scene: `quats` holds 2464 NaN"),
+        ("text", "`opacities` is a str"),
+    ],
+)
+def test_unusable_checkpoints_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str, problem: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneError, match=problem):
+        load_scene(write_hostile(case, tmp_path))
+    assert not Path("executed").exists()
+
+
+def test_activated_values_are_detected() -> None:
+    scene = wall(sh_degree=1)
+    assert same(scene_of_splats(splats_of(scene)), scene)
+    found = scene_of_splats(splats_of(scene, activated=True))
+    torch.testing.assert_close(found.scales, scene.scales)
+    torch.testing.assert_close(found.opacities, scene.opacities, rtol=1e-4, atol=0)
+    opaque = {**splats_of(scene, activated=True), "opacities": torch.ones(len(scene))}
+    flat = {**opaque, "scales": torch.tensor([0.1, 0.1, 0.0]).repeat(len(scene), 1)}
+    assert float(scene_of_splats(flat).opacities.max()) == pytest.approx(float(OPACITY_LOGITS[-1]))
+    assert bool(scene_of_splats(flat).scales.isfinite().all())
+    del opaque["shN"]
+    assert scene_of_splats(opaque).sh_degree == 0
+
+
+def test_values_of_which_only_some_are_activated_are_refused() -> None:
+    scene = wall()
+    for logits, scales in ((scene.opacities.sigmoid(), scene.scales), (scene.opacities, scene.scales.exp())):
+        with pytest.raises(SceneError, match="logarithms and logits as gsplat's trainers keep them"):
+            scene_of_splats({**splats_of(scene), "opacities": logits, "scales": scales})
+    assert bool(
+        scene_of_splats({**splats_of(scene), "opacities": scene.opacities * torch.inf}).opacities.isfinite().all()
+    )
+
+
+def test_dictionaries_without_colors_are_refused() -> None:
+    splats = splats_of(wall())
+    with pytest.raises(SceneError, match=r"lacks `quats`, `sh0`\. Give a dictionary with means, quats"):
+        scene_of_splats({key: value for key, value in splats.items() if key not in ("quats", "sh0")})
+    with pytest.raises(SceneError, match="`scales` is a list"):
+        scene_of_splats({**splats, "scales": [1.0]})

@@ -1,0 +1,177 @@
+"""Tests of stylizing in one call: the result has the form of the given scene, and the same colors in all forms."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sgsst_core import load_scene, save, stylize
+from sgsst_core.errors import CameraError, ImageError, SceneError, SettingsError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.library import as_scene
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.stored_harmonics import held
+from tests.sgsst_core.stylizing.test_refining import large_wall
+from tests.sgsst_core.trainer_scenes import splats_of, write_gsplat, write_nerfstudio
+from tests.small_scenes import cameras, style, wall, write_files
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+ROOT = Path(__file__).resolve().parents[3]
+FORMS = ("ply", "spz", "scene", "numpy", "splats", "parameters", "activated", "gsplat", "nerfstudio")
+
+
+def in_form(form: str, scene: Scene, folder: Path) -> Any:
+    """Return a scene in one of `FORMS`."""
+    if form in ("ply", "spz"):
+        save(folder / f"scene.{form}", scene)
+        return load_scene(str(folder / f"scene.{form}"))
+    if form in ("gsplat", "nerfstudio"):
+        write = write_gsplat if form == "gsplat" else write_nerfstudio
+        return load_scene(write(folder / "step-29999.ckpt", scene))
+    if form == "numpy":
+        return {key: value.numpy() for key, value in splats_of(scene).items()}
+    if form == "parameters":
+        return torch.nn.ParameterDict(splats_of(scene))
+    return scene if form == "scene" else splats_of(scene, activated=form == "activated")
+
+
+def run(scene: Any, weights: BackboneWeights, **settings: Any) -> Any:
+    return stylize(
+        scene, cameras(), style(), preset="preview", weights=weights, steps_coarse=0, steps_sos=2, measure=0, **settings
+    )
+
+
+def copied(scene: Scene) -> Scene:
+    return Scene(*(held(getattr(scene, field.name)).clone() for field in fields(Scene)))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_scene_comes_back_in_its_form_with_new_colors(
+    tiny_weights: BackboneWeights, tmp_path: Path, form: str
+) -> None:
+    given = in_form(form, wall(sh_degree=1), tmp_path)
+    before = as_scene(given)
+    kept = copied(before)
+    result = run(given, tiny_weights)
+    assert type(result) is type(given)
+    after, alone = as_scene(result), run(before, tiny_weights)
+    assert torch.equal(after.sh_dc, alone.sh_dc)
+    assert not torch.equal(after.sh_dc, before.sh_dc)
+    for field in fields(Scene):
+        assert torch.equal(getattr(before, field.name), getattr(kept, field.name)), "the given scene stays"
+        if field.name != "sh_dc":
+            assert torch.equal(getattr(after, field.name), getattr(before, field.name))
+    if form in ("splats", "activated", "numpy", "parameters"):
+        assert {key: (value.shape, value.dtype) for key, value in result.items()} == {
+            key: (value.shape, value.dtype) for key, value in given.items()
+        }
+        assert all(result[key] is given[key] for key in given if key != "sh0" and form != "parameters")
+
+
+@pytest.mark.parametrize("form", ["ply", "spz", "scene", "numpy", "activated", "nerfstudio"])
+def test_split_and_attenuated_scenes_come_back_in_their_form(
+    tiny_weights: BackboneWeights, tmp_path: Path, form: str
+) -> None:
+    scene = large_wall()
+    scene = replace(scene, sh_rest=0.1 * torch.ones(len(scene), 3, 3))
+    given = in_form(form, scene, tmp_path)
+    if isinstance(given, dict):
+        given["label"] = np.arange(len(scene))
+    before = as_scene(given)
+    result = run(given, tiny_weights, refine=2, sh_attenuation=0.25)
+    after = as_scene(result)
+    assert len(after) > len(before)
+    alone = run(before, tiny_weights, refine=2, sh_attenuation=0.25)
+    for field in fields(Scene):
+        found, wanted = (held(getattr(each, field.name)) for each in (after, alone))
+        tolerance = 1e-5 if form == "activated" else 0  # exp and log round
+        torch.testing.assert_close(found, wanted, rtol=tolerance, atol=tolerance)
+    if isinstance(given, dict):
+        assert len(result["label"]) == len(after)
+        assert set(result["label"]) == set(given["label"])
+    else:
+        suffix = "ckpt" if form == "nerfstudio" else "ply"
+        save(tmp_path / f"out.{suffix}", result)
+        saved = as_scene(load_scene(tmp_path / f"out.{suffix}"))
+        assert all(
+            torch.equal(held(getattr(saved, each.name)), held(getattr(after, each.name))) for each in fields(Scene)
+        )
+    if form == "ply":
+        with pytest.raises(SceneError, match="split already"):
+            run(result, tiny_weights, refine=2)
+
+
+def test_a_result_can_be_stylized_again(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+    source = in_form("ply", wall(sh_degree=1), tmp_path)
+    twice = run(run(source, tiny_weights, sh_attenuation=0.5), tiny_weights, sh_attenuation=0.5)
+    save(tmp_path / "out.ply", twice)
+    assert torch.equal(held(load_scene(tmp_path / "out.ply").scene.sh_rest), held(source.scene.sh_rest) * 0.25)
+    assert torch.equal(held(twice.scene.sh_rest), held(source.scene.sh_rest) * 0.25)
+
+
+def test_the_example_of_the_readme_runs(tiny_installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ply, _, image = write_files(tmp_path)
+    image.rename(tmp_path / "style.jpg")
+    monkeypatch.chdir(tmp_path)
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(example, names)
+    before, after = ply.read_bytes(), Path("stylized.ply").read_bytes()
+    changed = sum(a != b for a, b in zip(before, after, strict=True))
+    assert 0 < changed <= 12 * len(names["scene"].scene), "only colors"
+    assert torch.equal(load_scene("stylized.ply").scene.sh_dc, names["result"].scene.sh_dc)
+
+
+WRONG: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
+    "scene path": ({"scene": "scene.ply"}, SceneError, "is a str. Read files with `load_scene`"),
+    "cameras path": ({"cameras": "cameras.json"}, CameraError, "Read them with `load_cameras`"),
+    "style": ({"style": 255 * style()}, ImageError, "by 255"),
+    "photos": ({"photos": lambda index: 255 * torch.ones(48, 64, 3)}, ImageError, "photo of view 0 .*by 255"),
+    "setting": ({"steps": 5}, SettingsError, "steps"),
+    "preset": ({"preset": "fast"}, SettingsError, "There is no preset 'fast'"),
+    "shape": ({"scene": replace(wall(), scales=torch.zeros(5, 3))}, SceneError, r"`scales` has shape \[5, 3\]"),
+    "degree": ({"scene": replace(wall(), sh_rest=torch.zeros(616, 24, 3))}, SceneError, r"`sh_rest` has shape"),
+    "nan": ({"scene": replace(wall(), quats=torch.full((616, 4), torch.nan))}, SceneError, "`quats` holds 2464 NaN"),
+    "integers": ({"scene": replace(wall(), sh_dc=torch.zeros(616, 3).long())}, SceneError, "dtype torch.int64"),
+    "empty": ({"scene": wall().subset(torch.zeros(616).bool())}, SceneError, "no Gaussians"),
+    "list": ({"scene": replace(wall(), means=[[0.0] * 3])}, SceneError, "`means` is a list"),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_unusable_arguments_are_refused_in_a_sentence(tiny_weights: BackboneWeights, case: str) -> None:
+    given, error, problem = WRONG[case]
+    arguments: dict[str, Any] = {"scene": wall(), "cameras": cameras(1), "style": style(), "preset": "preview"} | given
+    with pytest.raises(error, match=problem):
+        stylize(**arguments, weights=tiny_weights)
+
+
+def test_arrays_of_numpy_make_a_scene(tiny_weights: BackboneWeights) -> None:
+    scene = wall(sh_degree=1)
+    arrays = Scene(*(getattr(scene, field.name).double().numpy() for field in fields(Scene)))
+    arrays = replace(arrays, opacities=arrays.opacities[:, None], sh_dc=arrays.sh_dc[:, None])
+    view = cameras(1)[0]
+    K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
+    camera = Camera.from_matrix(view.world_to_camera.numpy(), K, view.width, view.height)
+    image = (255 * style()).byte().permute(2, 0, 1).numpy()
+    results = [
+        stylize(each, [views], picture, preset="preview", steps_sos=1, weights=tiny_weights)
+        for each, views, picture in ((arrays, camera, image), (scene, view, (255 * style()).byte() / 255))
+    ]
+    assert torch.equal(results[0].sh_dc, results[1].sh_dc)
+
+
+def test_importing_the_package_imports_no_pytorch() -> None:
+    code = "import sys, sgsst_core; print(sorted({'torch', 'numba', 'numpy', 'pydantic'} & set(sys.modules)))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
