@@ -25,6 +25,7 @@ from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.formats.frame import Frame
 from sgsst_core.files.formats.quantized import SH_C0
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.files.json_files import json_numbers
 
 _MAGIC = b"glTF"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
@@ -121,7 +122,7 @@ def _read_header(start: FileStart) -> GlbHeader:
             )
         return _parsed(path, document, mesh, primitive, data_offset, data_bytes)
     except _WRONG_JSON as error:
-        raise SceneError(f"{path}: is not a valid GLB scene ({error!r}). Export it again.") from error
+        raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
 
 
 def _chunks(start: FileStart) -> tuple[bytes, int, int]:
@@ -167,6 +168,7 @@ def _splats(path: Path, document: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     return found[0]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # the transformation is checked
 def _parsed(
     path: Path, document: dict[str, Any], mesh: int, primitive: dict[str, Any], data_offset: int, data_bytes: int
 ) -> GlbHeader:
@@ -243,8 +245,8 @@ def _node_matrix(document: dict[str, Any], mesh: int) -> NDArray[np.float64]:
 def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     """Return a node's own transformation [4, 4]: a matrix in column order, or translation, rotation and scale."""
     if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    quat = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
+        return json_numbers(node["matrix"], 16).reshape(4, 4).T
+    quat = json_numbers(node.get("rotation", [0, 0, 0, 1]), 4)
     if not 0.5 < np.linalg.norm(quat) < 2:
         raise ValueError(f"rotation: {quat}")
     x, y, z, w = quat / np.linalg.norm(quat)
@@ -254,8 +256,8 @@ def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
-    matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64).reshape(3)
+    matrix[:3, :3] *= json_numbers(node.get("scale", [1, 1, 1]), 3)
+    matrix[:3, 3] = json_numbers(node.get("translation", [0, 0, 0]), 3)
     return matrix
 
 

@@ -37,6 +37,7 @@ from sgsst_core.files.formats.quantized import (
 )
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
 from sgsst_core.files.formats.unsupported import advice, is_checkpoint
+from sgsst_core.files.json_files import json_numbers
 
 _ZIP_MAGIC = b"PK\x03\x04"
 #: Record at the end of a ZIP archive, and its signature; archives above 4 GB have a locator of another record before.
@@ -183,7 +184,7 @@ def _read_header(start: FileStart) -> SogHeader:
         header = _parsed(start.path, files, json.loads(text))
     except _WRONG_META as error:
         raise SceneError(
-            f"{start.path}: meta.json is not that of a SOG scene ({error!r}). Export the scene again."
+            f"{start.path}: meta.json is not that of a SOG scene ({repr(error)[:200]}). Export the scene again."
         ) from error
     name = header.names["means"][0]
     _dimensions(start.path, files, name, header.count)
@@ -199,7 +200,7 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
     """Parse meta.json. Errors of `_WRONG_META` mean that a value is missing or wrong."""
     version = meta.get("version", 1)
     if version not in (1, 2):
-        raise SceneError(f"{path}: is SOG of version {version}, which cannot be read. {advice('scene.sog')}")
+        raise SceneError(f"{path}: is SOG of version {str(version)[:20]}, which cannot be read. {advice('scene.sog')}")
     names = {name: meta[name]["files"] for name in _IMAGES if name in meta or name != "shN"}
     for name, found in names.items():
         if type(found) is not list or len(found) != _IMAGES[name] or not all(_NAME.fullmatch(each) for each in found):
@@ -207,7 +208,7 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
     count = meta["count"] if version == 2 else meta["means"]["shape"][0]
     if type(count) is not int or count < 1:
         raise ValueError(f"count: {count}")
-    bounds = np.stack([_numbers(meta["means"][side], 3) for side in ("mins", "maxs")])
+    bounds = np.stack([json_numbers(meta["means"][side], 3) for side in ("mins", "maxs")])
     table = _codebook if version == 2 else _steps
     scales, colors = table(meta["scales"], 3), table(meta["sh0"], 4)
     opacities = OPACITY_LOGITS if version == 2 else colors[3]
@@ -225,27 +226,15 @@ def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
     codebook = entry["codebook"]
     if not 0 < len(codebook) <= VALUES:
         raise ValueError(f"codebook of {len(codebook)} values")
-    values = np.pad(_numbers(codebook, len(codebook)), (0, VALUES - len(codebook)), constant_values=np.nan)
+    values = np.pad(json_numbers(codebook, len(codebook)), (0, VALUES - len(codebook)), constant_values=np.nan)
     return np.tile(values, (channels, 1))
 
 
 def _steps(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
     """Return the values of each byte in version 1 by channel, [channels, 256]."""
-    low, high = (_numbers(entry[side], channels)[:, None] for side in ("mins", "maxs"))
+    low, high = (json_numbers(entry[side], channels)[:, None] for side in ("mins", "maxs"))
     with np.errstate(over="ignore", invalid="ignore"):  # non-finite results are reported later
         return low + (high - low) * (np.arange(VALUES) / 255)
-
-
-def _numbers(values: Any, count: int) -> NDArray[np.float64]:
-    """Return `count` numbers of meta.json; null becomes NaN. A single number needs no list.
-
-    Raises:
-        ValueError: If there are more or fewer, or any is a text, a truth value or a list.
-    """
-    found = values if isinstance(values, list) else [values]
-    if len(found) != count or not all(type(value) in (int, float, type(None)) for value in found):
-        raise ValueError(f"{len(found)} values in place of {count} numbers, or values that are not numbers")
-    return np.array(found, np.float64)
 
 
 def _dimensions(path: Path, files: _Files, name: str, least: int, most: int | None = None) -> tuple[int, int]:

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sgsst_core.errors import OutputError
-from sgsst_core.files.json_files import write_json
+from sgsst_core.files.json_files import json_numbers, write_json
 
 
 def test_a_name_that_is_not_unicode_is_json_all_the_same(tmp_path: Path) -> None:
@@ -18,3 +20,17 @@ def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         write_json(tmp_path / "missing" / "r.json", {})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_are_numbers() -> None:
+    assert json_numbers([1, 2.5, 10**30], 3).tolist() == [1, 2.5, 1e30]
+    assert json_numbers(7, 1).tolist() == [7]
+    assert math.isnan(json_numbers([None], 1)[0])
+
+
+@pytest.mark.parametrize(
+    "values", [[], [1], [1, 2, 3], ["1_0", 2], [True, 2], [[1], [2]], [{}, 2], "12", {"a": 1, "b": 2}]
+)
+def test_other_values_are_no_numbers(values: Any) -> None:
+    with pytest.raises(ValueError, match="in place of 2 numbers"):
+        json_numbers(values, 2)

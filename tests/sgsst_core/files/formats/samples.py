@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import struct
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import gsply
 import numpy as np
@@ -15,6 +17,7 @@ import torch
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import SceneError
+from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
@@ -136,3 +139,46 @@ def ksplat(scene: Scene, level: int, bucket_size: int = 256) -> bytes:
     section = struct.pack("<IIIIfHxxIIIIH", count, count, *stored, degree).ljust(1024, b"\0")
     lengths = struct.pack("<I", rest) if rest else b""
     return head + section + (lengths + centers.tobytes() if level else b"") + rows.tobytes()
+
+
+#: Values of all kinds of JSON, some of which NumPy would convert to numbers.
+_WRONG: list[Any] = [
+    *(None, True, -1, 0, 1e999, 2**70, "x", "1_0", "x" * 100_000, [], {}, {"a": 1, "b": 2}),
+    *([[]], [{}], [None] * 2, ["a"] * 2, [[1]], [1] * 3, ["1_0"] * 3),
+]
+
+
+def check_documents(path: Path, document: Any, make: Callable[[Any], bytes]) -> None:
+    """Assert that a header with a wrong value anywhere in its JSON gives a short `SceneError`, or is usable.
+
+    The API process reads these headers, and returns their errors to clients.
+
+    Args:
+        path: File to write.
+        document: JSON of a scene.
+        make: Conversion of changed JSON to the bytes of a file.
+    """
+    lengths = []
+    for keys in _keys(document):
+        for wrong in _WRONG:
+            changed = copy.deepcopy(document) if keys else wrong
+            inner = changed
+            for key in keys[:-1]:
+                inner = inner[key]
+            if keys:
+                inner[keys[-1]] = wrong
+            path.write_bytes(make(changed))
+            try:
+                read_scene_header(path)
+            except SceneError as error:
+                lengths.append(len(str(error)))
+    assert len(lengths) > len(document)
+    assert max(lengths) < len(str(path)) + 1000
+
+
+def _keys(value: Any, found: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the keys that lead to each value within a JSON value; of lists, the first values."""
+    yield found
+    children = value if isinstance(value, dict) else range(min(len(value), 4)) if isinstance(value, list) else ()
+    for key in children:
+        yield from _keys(value[key], (*found, key))

@@ -14,7 +14,7 @@ import torch
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.glb import GLB
 from sgsst_core.files.scene_file import read_scene, write_scene
-from tests.sgsst_core.files.formats.samples import assert_close, encoded, refused
+from tests.sgsst_core.files.formats.samples import assert_close, check_documents, encoded, refused
 from tests.sgsst_core.splat_scenes import cloud
 
 PREFIX = "KHR_gaussian_splatting:"
@@ -239,3 +239,15 @@ FIRST = "meshes__0__primitives__0__"
 )
 def test_false_file_is_refused(tmp_path: Path, data: bytes, message: str) -> None:
     refused(tmp_path, data, message, "scene.glb")
+
+
+def test_wrong_values_anywhere_in_the_document_are_refused(tmp_path: Path) -> None:
+    placed = {"mesh": 0, "translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
+    document, data = split(by_hand(nodes=[placed]))
+    check_documents(tmp_path / "scene", document, lambda changed: joined(changed, data))
+
+
+@pytest.mark.parametrize("key", ["matrix", "rotation", "scale", "translation"])
+def test_text_in_a_transformation_is_refused(tmp_path: Path, key: str) -> None:
+    numbers = {"matrix": 16, "rotation": 4}.get(key, 3)
+    refused(tmp_path, by_hand(nodes__0={"mesh": 0, key: ["1_0"] * numbers}), "values that are not numbers")
