@@ -170,7 +170,14 @@ TILE_SIZES = (64, 128, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 
 
 def choose_tile_size(
-    height: int, width: int, halo: int, *, held: float, working: float, region: Rectangle | None = None
+    height: int,
+    width: int,
+    halo: int,
+    *,
+    held: float,
+    working: float,
+    region: Rectangle | None = None,
+    largest: int | None = None,
 ) -> int | None:
     """Return the tile size with the least work for a view under a memory budget; None if it fits as one tile.
 
@@ -185,11 +192,13 @@ def choose_tile_size(
         held: Number of pixels whose activations fit in the memory budget.
         working: Additional memory of a tile during back-propagation, as a fraction of the memory of its activations.
         region: Result of `covered_region`; None for the whole view.
+        largest: Maximum pixels of a tile; None for no limit.
     """
 
     def work(size: int | None) -> float:
         areas = [tile.outer.pixels for tile in partition(height, width, size, halo, region)]
-        if max(areas, default=0) * (1 + working) > held and size != TILE_SIZES[0]:
+        area = max(areas, default=0)
+        if size != TILE_SIZES[0] and (area * (1 + working) > held or area > (largest or area)):
             return math.inf
         return 2 * sum(areas) + computed_twice(areas, cached_tiles(areas, held, working))
 

@@ -17,6 +17,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from sgsst_core.devices import on_device
 from sgsst_core.scene.spherical_harmonics import triton_runs_on
 
 #: Values per block. Centered values stay in the CPU cache until they have been multiplied.
@@ -314,20 +315,22 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1), dtype=torch.float32)
     sums = torch.empty((-(-positions // span), channels**2 + channels + 1), device=device)
     weights = features if position_weights is None else position_weights
-    kernels.shifted_moments[(len(sums), (-(-channels // tile)) ** 2)](
-        features, weights, shift, sums,
-        positions, width, *features.stride()[:2], *weights.stride()[:2],
-        CHANNELS=channels, TILE=tile, SPAN=span, FLUSH=FLUSH, P=block_of_positions(POSITIONS),
-        WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
-    )  # fmt: skip
+    with on_device(device):
+        kernels.shifted_moments[(len(sums), (-(-channels // tile)) ** 2)](
+            features, weights, shift, sums,
+            positions, width, *features.stride()[:2], *weights.stride()[:2],
+            CHANNELS=channels, TILE=tile, SPAN=span, FLUSH=FLUSH, P=block_of_positions(POSITIONS),
+            WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
+        )  # fmt: skip
     count = torch.empty((), dtype=torch.float64, device=device)
     mean = torch.empty(channels, dtype=torch.float64, device=device)
     centered = torch.empty((channels, channels), dtype=torch.float64, device=device)
     entries = block_of_entries(channels)
     total = sums.sum(dim=0, dtype=torch.float64) if len(sums) != 1 else sums
-    kernels.combine_moments[(-(-(channels**2) // entries),)](
-        total, shift, count, mean, centered, CHANNELS=channels, ENTRIES=entries
-    )
+    with on_device(device):
+        kernels.combine_moments[(-(-(channels**2) // entries),)](
+            total, shift, count, mean, centered, CHANNELS=channels, ENTRIES=entries
+        )
     return LayerStatistics(count, mean, centered)
 
 

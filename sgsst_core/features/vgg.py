@@ -41,8 +41,9 @@ ALIGNMENT = 16
 _CUDNN: Any = torch.backends.cudnn
 #: Relative rounding error of TF32 multiplication, the counterpart of `torch.finfo(...).eps`.
 _TF32_EPS = 2.0**-10
-#: Number of values from which cuDNN's fused convolution would overflow its 32-bit indices; it has no fallback.
-_FUSED_VALUES = 2**31
+#: Number of values from which a tensor overflows 32-bit indices. cuDNN's fused convolution has no fallback, and other
+#: operations split such tensors into parts, which takes time and memory.
+_INDEXED_VALUES = 2**31
 #: Side of the first image on which fused convolutions are tried, and their tolerance relative to the largest value. In
 #: TF32 and bfloat16, fused and separate operations round at different points of the computation.
 _TRIAL_SIDE, _TRIAL_TOLERANCE = 32, 2**-6
@@ -112,9 +113,19 @@ def use_whole_float32() -> None:
 
 def has_tf32(device: torch.device | str) -> bool:
     """Return whether a device supports TF32, as NVIDIA GPUs of compute capability 8.0 and above do."""
-    if torch.device(device).type != "cuda" or torch.version.hip is not None:
-        return False
-    return torch.cuda.get_device_capability(device) >= (8, 0)
+    return _is_nvidia(device) and torch.cuda.get_device_capability(device) >= (8, 0)
+
+
+def has_bfloat16(device: torch.device | str) -> bool:
+    """Return whether a device computes in bfloat16, as all do but NVIDIA GPUs below compute capability 8.0.
+
+    PyTorch emulates bfloat16 there, and Triton does not compile it.
+    """
+    return not _is_nvidia(device) or has_tf32(device)
+
+
+def _is_nvidia(device: torch.device | str) -> bool:
+    return torch.device(device).type == "cuda" and torch.version.hip is None
 
 
 @contextmanager
@@ -254,7 +265,7 @@ class FeatureNetwork:
     @torch.no_grad()
     def _fuse(self) -> None:
         """Use cuDNN's fused convolution with bias and ReLU wherever a test shows that it works."""
-        if self.device.type != "cuda" or torch.version.hip is not None or not torch.backends.cudnn.is_available():
+        if not _is_nvidia(self.device) or not torch.backends.cudnn.is_available():
             return
         with convolutions(self.device, tf32=self.tf32):
             for step in self._steps:
@@ -270,6 +281,12 @@ class FeatureNetwork:
     def rounding(self) -> float:
         """Relative rounding error of the features."""
         return _TF32_EPS if self.tf32 else torch.finfo(self.dtype).eps
+
+    @property
+    def largest_tile(self) -> int | None:
+        """Maximum pixels of a partition tile on a GPU, whose libraries index tensors with 32 bits; None on a CPU."""
+        most = max(max(step.weight.shape[:2]) for step in self._steps[:2] if isinstance(step, _Convolution))
+        return None if self.device.type == "cpu" else (_INDEXED_VALUES - 1) // most
 
     @property
     def halo(self) -> int:
@@ -330,7 +347,7 @@ class FeatureNetwork:
     def _convolve(self, x: Tensor, step: _Convolution) -> Tensor:
         """Apply convolution, bias and ReLU to x [1, in, h, w]."""
         pixels = x.shape[2] * x.shape[3]
-        if step.fused and pixels * max(step.weight.shape[:2]) < _FUSED_VALUES:
+        if step.fused and pixels * max(step.weight.shape[:2]) < _INDEXED_VALUES:
             if pixels <= step.tried:
                 return _fused_convolution(x, step)
             step.tried = pixels  # cuDNN may choose another algorithm for a larger image

@@ -115,7 +115,9 @@ class SosLoss:
         self.collectives = collectives
         held = network.held_bytes_per_pixel()
         working = network.working_bytes_per_pixel() / held
-        self.tiling = Tiling(network.halo, memory / held, working, coarsest, tile_size, cache_activations, scales)
+        self.tiling = Tiling(
+            network.halo, memory / held, working, coarsest, tile_size, cache_activations, scales, network.largest_tile
+        )
         self.divider = Divider(self.tiling, collectives, leave_out=leave_out)
         self.targets = TargetBuilder(
             network,

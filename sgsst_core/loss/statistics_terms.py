@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from sgsst_core.devices import on_device
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.statistics import (
@@ -294,11 +295,12 @@ def fused_style_loss(
     gram_weight, mean_weight, std_weight = weights
     columns = block_of_channels(channels)
     rows = block_of_entries(channels) // columns
-    kernels.compare[(-(-channels // rows),)](
-        statistics.count, statistics.mean, statistics.centered, *target, terms, matrix, mean, offset,
-        GRAM=gram_weight, MEAN=mean_weight, STD=std_weight, EPS=feature_eps, CHANNELS=channels, ROWS=rows,
-        COLUMNS=columns,
-    )  # fmt: skip
+    with on_device(device):
+        kernels.compare[(-(-channels // rows),)](
+            statistics.count, statistics.mean, statistics.centered, *target, terms, matrix, mean, offset,
+            GRAM=gram_weight, MEAN=mean_weight, STD=std_weight, EPS=feature_eps, CHANNELS=channels, ROWS=rows,
+            COLUMNS=columns,
+        )  # fmt: skip
     return terms.sum(dim=0), matrix, mean, offset
 
 
@@ -325,9 +327,10 @@ def fused_add_style_gradient(
     height, width, channels = features.shape
     positions, tile, block = height * width, block_of_channels(channels, TILE), block_of_positions(POSITIONS)
     weights = features if position_weights is None else position_weights
-    kernels.add_style_gradient[(-(-positions // block), -(-channels // tile))](
-        features, weights, gradient, matrix, mean, offset,
-        positions, width, *features.stride()[:2], *weights.stride()[:2], *gradient.stride()[:2],
-        CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEP), P=block,
-        WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
-    )  # fmt: skip
+    with on_device(features.device):
+        kernels.add_style_gradient[(-(-positions // block), -(-channels // tile))](
+            features, weights, gradient, matrix, mean, offset,
+            positions, width, *features.stride()[:2], *weights.stride()[:2], *gradient.stride()[:2],
+            CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEP), P=block,
+            WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
+        )  # fmt: skip

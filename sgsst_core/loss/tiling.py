@@ -35,6 +35,7 @@ class Tiling:
         cache_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
             twice.
         weights: Weights of the scales.
+        largest: Maximum pixels of a partition tile whose size is chosen; None for no limit.
     """
 
     halo: int
@@ -44,6 +45,7 @@ class Tiling:
     tile_size: int | None = None
     cache_activations: bool = True
     weights: ScaleWeights = EVEN
+    largest: int | None = None
 
     def scale_count(self, size: Size) -> int:
         """Return n_s for views of a size (height, width)."""
@@ -60,7 +62,9 @@ class Tiling:
         """
         tile_size = self.tile_size
         if tile_size is None:
-            tile_size = choose_tile_size(*size, self.halo, held=self.held, working=self.working, region=region)
+            tile_size = choose_tile_size(
+                *size, self.halo, held=self.held, working=self.working, region=region, largest=self.largest
+            )
         return partition(*size, tile_size, self.halo, region)
 
     def cached(self, areas: Sequence[int]) -> list[bool]:

@@ -33,11 +33,13 @@ class Collectives(Protocol):
         rank: Index of this rank in the group.
         size: Number of ranks.
         local_size: Number of ranks on this machine, including this one.
+        gpu_sharing: Largest number of ranks on one GPU; 1 without GPUs.
     """
 
     rank: int
     size: int
     local_size: int
+    gpu_sharing: int
 
     @property
     def sent(self) -> Mapping[Traffic, int]:
@@ -110,7 +112,7 @@ class RankLeftOut(Exception):  # noqa: N818 (not an error: the job continues wit
 class _Alone:
     """Collectives of a single rank."""
 
-    rank, size, local_size = 0, 1, 1
+    rank, size, local_size, gpu_sharing = 0, 1, 1, 1
     sent: Mapping[Traffic, int] = MappingProxyType(dict.fromkeys(TRAFFIC, 0))
 
     def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:

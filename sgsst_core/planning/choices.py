@@ -343,7 +343,8 @@ def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decisio
     if asked == "float32":
         return chosen, []
     if ratio is None:
-        reason = f"{asked} was requested, but needs an NVIDIA GPU of compute capability 8.0 or higher"
+        needed = "an NVIDIA GPU" if asked == "tf32" else "a CPU, an AMD GPU, or an NVIDIA GPU"
+        reason = f"{asked} was requested, but needs {needed} of compute capability 8.0 or higher"
         return chosen, [Decision("precision", "features in float32", reason)]
     if chosen == "float32":
         reason = f"{asked} was requested, but takes {1 / ratio:.1f} times as long as float32 on this processor"
@@ -470,6 +471,14 @@ def about_rasterizer(probe: Probe, *, cached: bool) -> list[Decision]:
     if used.on_gpu:
         reasons.append(f"{used.title} works here")
     return [Decision("rasterizer", how, "; ".join(reasons) or "requested")]
+
+
+def about_shared_gpus(probe: Probe) -> list[Decision]:
+    """Return the line about ranks that share a GPU, if there are any."""
+    if probe.machine.device == "cpu" or probe.machine.sharing == 1:
+        return []
+    reason = f"{probe.machine.sharing} of them share a GPU, which NCCL does not support; give each a GPU of its own"
+    return [Decision("communication", "ranks exchange data over the CPU (gloo)", reason)]
 
 
 def about_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:

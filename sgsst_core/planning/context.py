@@ -9,7 +9,7 @@ import torch
 
 from sgsst_core.budget import default_memory_limit, memory_for
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
+from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_bfloat16, has_tf32, use_whole_float32
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.choices import precision_of
@@ -120,8 +120,8 @@ def rasterizer_problem(collectives: Collectives, name: str) -> str | None:
 
 
 def sharing_memory(collectives: Collectives, device: Device) -> int:
-    """Return the maximum number of ranks that share the memory of a machine; GPUs do not share theirs."""
-    return max(collectives.all_gather(1 if device == "cuda" else collectives.local_size))
+    """Return the maximum number of ranks that share the memory of a machine, or of a GPU."""
+    return collectives.gpu_sharing if device == "cuda" else max(collectives.all_gather(collectives.local_size))
 
 
 def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
@@ -137,9 +137,12 @@ def precision_ratio(asked: Precision, device: Device, collectives: Collectives) 
     All ranks must call this.
 
     Returns:
-        Ratio measured on the first rank. None if float32 was requested, or TF32 is missing on some rank.
+        Ratio measured on the first rank. None if float32 was requested, or some rank lacks the requested precision.
     """
-    if asked == "float32" or (asked == "tf32" and not all(collectives.all_gather(has_tf32(device)))):
+    if asked == "float32":
+        return None
+    supported = has_tf32(device) if asked == "tf32" else has_bfloat16(device)
+    if not all(collectives.all_gather(supported)):
         return None
     return collectives.broadcast(lambda: convolution_ratio(asked, device))
 

@@ -407,6 +407,7 @@ class IterationWork:
         sharing: Number of ranks that divide the memory for activations.
         shown: Number of Gaussians that the view shows, whose gradients are sent; None for all.
         matching: Time in seconds of the nearest-neighbor search on one rank.
+        largest_tile: Maximum pixels of a partition tile; None for no limit.
     """
 
     pieces: tuple[Piece, ...]
@@ -421,6 +422,7 @@ class IterationWork:
     sharing: int = 1
     shown: float | None = None
     matching: float = 0.0
+    largest_tile: int | None = None
 
     def computing(self, ranks: int, groups: int = 1) -> float:
         """Return the computing time in seconds of the rank with most work.
@@ -445,7 +447,9 @@ class IterationWork:
         return seconds
 
     def _areas(self, piece: Piece, held: float) -> list[int]:
-        size = choose_tile_size(*piece.size, self.halo, held=held, working=self.working, region=piece.region)
+        size = choose_tile_size(
+            *piece.size, self.halo, held=held, working=self.working, region=piece.region, largest=self.largest_tile
+        )
         return [tile.outer.pixels for tile in partition(*piece.size, size, self.halo, piece.region)]
 
     def communication(self, ranks: int, link: Link) -> float:
@@ -661,6 +665,7 @@ class CostModel:
                 sharing=sharing,
                 shown=plan.survey.shown,
                 matching=network.rate.search * sum(map(pairs_of, pieces)),
+                largest_tile=network.largest_tile,
             )
             for pieces in self._pieces(sample, coarsest=coarsest)
         ]
@@ -741,6 +746,7 @@ def tiling_of(probe: Probe, settings: Settings) -> Tiling:
         settings.coarsest_side,
         cache_activations="activations" not in settings.keep,
         weights=ScaleWeights(settings.scales),
+        largest=network.largest_tile,
     )
 
 

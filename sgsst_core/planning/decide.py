@@ -85,6 +85,7 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
         *choices.about_scales([tiling.scale_count(size) for size in model.sizes], settings),
         *coarse_lines,
         *choices.about_early_stop(background, len(plan.covered), settings),
+        *choices.about_shared_gpus(probe),
         *rank_lines,
         *precision_lines,
         *([_about_measuring(plan, prediction, settings)] if measured else []),

@@ -70,6 +70,7 @@ class NetworkFacts:
         gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
         vector_channels: Length of a vector that is matched with the style's; 0 if nothing is matched.
         deepest: Name of the deepest layer in use.
+        largest_tile: Maximum pixels of a partition tile; None for no limit.
     """
 
     halo: int
@@ -82,6 +83,7 @@ class NetworkFacts:
     gradient_error: Difference | None = None
     vector_channels: int = 0
     deepest: str = "relu5_1"
+    largest_tile: int | None = None
 
 
 @dataclass(frozen=True)
@@ -153,8 +155,8 @@ class Machine:
 
     Attributes:
         device: Device of the feature network.
-        memory_limit: Memory budget in bytes of all ranks on one machine together.
-        sharing: Maximum number of ranks that share one machine's memory; 1 if they run on GPUs.
+        memory_limit: Memory budget in bytes of all ranks on one machine together, or on one GPU.
+        sharing: Maximum number of ranks that share one machine's memory, or that of a GPU.
         ranks: Number of available ranks.
         problems: Reason by name for each GPU rasterizer that does not work; empty on the CPU.
     """

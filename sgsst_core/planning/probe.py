@@ -129,6 +129,7 @@ def _network_facts(context: PlanningContext, first: Camera, maps: int) -> Networ
         gradient_error(context, first, side),
         sum(network.channels(layer) for layer in nearest_layers(settings.style_loss, network.name)),
         max(network.layers),
+        network.largest_tile,
     )
 
 

@@ -27,6 +27,7 @@ from sgsst_core.constants import (
     TO_POWER_OF_TWO,
     TRANSMITTANCE_MIN,
 )
+from sgsst_core.devices import on_device
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost, Rows, check_rows
 from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
@@ -191,11 +192,12 @@ class TritonRasterizer(Rasterizer):
             return gradient
         slots = torch.zeros((len(isects.ranks), 3), device=self.device)
         across, tiles = tiles_of(camera, band)
-        kernels.slot_gradients[(tiles,)](
-            isects.ranks, isects.slots, isects.starts, isects.values, image_gradient, slots,
-            camera.width, *band, across,
-            **self.cuts(),
-        )  # fmt: skip
+        with on_device(self.device):
+            kernels.slot_gradients[(tiles,)](
+                isects.ranks, isects.slots, isects.starts, isects.values, image_gradient, slots,
+                camera.width, *band, across,
+                **self.cuts(),
+            )  # fmt: skip
         add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
         return gradient
 
@@ -211,16 +213,19 @@ class TritonRasterizer(Rasterizer):
         slots = torch.zeros(len(isects.ranks), device=self.device)
         transmittance = torch.empty((camera.height, camera.width), device=self.device)
         across, tiles = tiles_of(camera, (0, camera.height))
-        kernels.survey[(tiles,)](
-            isects.ranks, isects.slots, isects.starts, isects.values, slots, transmittance,
-            camera.width, camera.height, across,
-            **self.cuts(),
-        )  # fmt: skip
+        with on_device(self.device):
+            kernels.survey[(tiles,)](
+                isects.ranks, isects.slots, isects.starts, isects.values, slots, transmittance,
+                camera.width, camera.height, across,
+                **self.cuts(),
+            )  # fmt: skip
         visible, block = len(isects.gaussians), kernels.ADDED.value
         if visible:
-            kernels.add_slot_weights[(-(-visible // block),)](
-                slots, isects.first_slots, isects.gaussians, weights, visible, BLOCK=block, SLOTS=kernels.SLOTS.value
-            )
+            with on_device(self.device):
+                kernels.add_slot_weights[(-(-visible // block),)](
+                    slots, isects.first_slots, isects.gaussians, weights, visible,
+                    BLOCK=block, SLOTS=kernels.SLOTS.value,
+                )  # fmt: skip
         return 1 - transmittance, weights
 
     def _blend(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
@@ -232,11 +237,12 @@ class TritonRasterizer(Rasterizer):
         image = torch.empty((height, camera.width, 3), device=self.device)
         transmittance = torch.empty((height, camera.width), device=self.device)
         across, tiles = tiles_of(camera, band)
-        kernels.render[(tiles,)](
-            isects.ranks, isects.starts, isects.gaussians, isects.values, colors, self.background, image, transmittance,
-            camera.width, *band, across,
-            **self.cuts(),
-        )  # fmt: skip
+        with on_device(self.device):
+            kernels.render[(tiles,)](
+                isects.ranks, isects.starts, isects.gaussians, isects.values, colors, self.background,
+                image, transmittance, camera.width, *band, across,
+                **self.cuts(),
+            )  # fmt: skip
         return image, transmittance
 
     def cuts(self) -> dict[str, float | int]:
@@ -261,10 +267,11 @@ class TritonRasterizer(Rasterizer):
         depths = torch.empty(count, dtype=torch.float64, device=self.device)
         counts = torch.empty(count, dtype=torch.int32, device=self.device)
         if count:
-            kernels.project[(-(-count // block),)](
-                *self._geometry, view, values, depths, counts, count,
-                EPS2D=EPS2D, MARGIN=FRUSTUM_MARGIN, SUPPORT=-LOG2_ALPHA_MIN, POWER=TO_POWER_OF_TWO, BLOCK=block,
-            )  # fmt: skip
+            with on_device(self.device):
+                kernels.project[(-(-count // block),)](
+                    *self._geometry, view, values, depths, counts, count,
+                    EPS2D=EPS2D, MARGIN=FRUSTUM_MARGIN, SUPPORT=-LOG2_ALPHA_MIN, POWER=TO_POWER_OF_TWO, BLOCK=block,
+                )  # fmt: skip
         ordered, order = torch.sort(depths, stable=True)
         first_slots = torch.zeros(count + 1, dtype=torch.int64, device=self.device)
         torch.cumsum(counts[order], 0, out=first_slots[1:])
@@ -274,9 +281,10 @@ class TritonRasterizer(Rasterizer):
         tiles = torch.empty(total, dtype=torch.int32, device=self.device)
         ranks = torch.empty(total, dtype=torch.int32, device=self.device)
         if visible:
-            kernels.list_tiles[(-(-visible // block),)](
-                order, values, first_slots, view, tiles, ranks, visible, SUPPORT=-LOG2_ALPHA_MIN, BLOCK=block
-            )
+            with on_device(self.device):
+                kernels.list_tiles[(-(-visible // block),)](
+                    order, values, first_slots, view, tiles, ranks, visible, SUPPORT=-LOG2_ALPHA_MIN, BLOCK=block
+                )
         tiles, slots = torch.sort(tiles, stable=True)
         across, down = tile_grid(camera)
         edges = torch.arange(across * down + 1, dtype=torch.int32, device=self.device)
@@ -296,9 +304,10 @@ def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: 
     from sgsst_core.rasterizer import triton_kernels as kernels
 
     block = kernels.ADDED.value
-    kernels.add_slots[(-(-len(gaussians) // block),)](
-        slots, first_slots, gaussians, gradient, len(gaussians), BLOCK=block, SLOTS=kernels.SLOTS.value
-    )
+    with on_device(slots.device):
+        kernels.add_slots[(-(-len(gaussians) // block),)](
+            slots, first_slots, gaussians, gradient, len(gaussians), BLOCK=block, SLOTS=kernels.SLOTS.value
+        )
 
 
 def _numbers(camera: Camera, near: float) -> list[float]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from sgsst_core.devices import on_device
 from sgsst_core.rasterizer.base import Precision, Rows
 from sgsst_core.rasterizer.triton import TritonRasterizer, add_slots_, tiles_of
 from sgsst_core.scene.camera import Camera
@@ -41,11 +42,12 @@ class CountedPieces:
         self.slot_pieces = torch.zeros_like(self.masks)
         self.block_pieces = torch.empty(self.tiles * kernels.BLOCKS.value, dtype=torch.int32, device=device)
         self.ends = torch.empty(self.tiles, dtype=torch.int64, device=device)
-        kernels.count_pieces[(self.tiles,)](
-            isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces, self.block_pieces,
-            self.ends, camera.width, *band, self.across,
-            **rasterizer.cuts(),
-        )  # fmt: skip
+        with on_device(device):
+            kernels.count_pieces[(self.tiles,)](
+                isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces,
+                self.block_pieces, self.ends, camera.width, *band, self.across,
+                **rasterizer.cuts(),
+            )  # fmt: skip
         self.pieces = int(self.block_pieces.sum())
 
     @property
@@ -99,12 +101,13 @@ class WeightPieces:
         self.piece_slots = empty(counted.pieces, dtype=index_type)
         self.weights = empty(counted.pieces * kernels.PIECE.value, dtype=_DTYPES[precision])
         self.transmittance = empty(self.band[1] - self.band[0], self.camera.width, dtype=torch.float32)
-        kernels.store_pieces[(counted.tiles,)](
-            isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
-            slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights, self.transmittance,
-            self.camera.width, *self.band, counted.across,
-            **rasterizer.cuts(), SCALE=self.scale,
-        )  # fmt: skip
+        with on_device(rasterizer.device):
+            kernels.store_pieces[(counted.tiles,)](
+                isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
+                slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights,
+                self.transmittance, self.camera.width, *self.band, counted.across,
+                **rasterizer.cuts(), SCALE=self.scale,
+            )  # fmt: skip
 
     @property
     def nbytes(self) -> int:
@@ -120,11 +123,12 @@ class WeightPieces:
         from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
         image = torch.empty((*self.transmittance.shape, 3), device=colors.device)
-        kernels.apply_pieces[self._grid()](
-            self.block_starts, self.piece_gaussians, self.weights, colors, self._rasterizer.background,
-            self.transmittance, image, *self._band_arguments(),
-            SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
-        )  # fmt: skip
+        with on_device(colors.device):
+            kernels.apply_pieces[self._grid()](
+                self.block_starts, self.piece_gaussians, self.weights, colors, self._rasterizer.background,
+                self.transmittance, image, *self._band_arguments(),
+                SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
+            )  # fmt: skip
         return image
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
@@ -135,10 +139,11 @@ class WeightPieces:
         if not len(self.piece_slots):
             return gradient
         slots = torch.empty((len(self.piece_slots), 3), device=image_gradient.device)
-        kernels.piece_gradients[self._grid()](
-            self.block_starts, self.piece_slots, self.weights, image_gradient, slots, *self._band_arguments(),
-            SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
-        )  # fmt: skip
+        with on_device(image_gradient.device):
+            kernels.piece_gradients[self._grid()](
+                self.block_starts, self.piece_slots, self.weights, image_gradient, slots, *self._band_arguments(),
+                SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
+            )  # fmt: skip
         add_slots_(gradient, slots, self.first_slots, self.gaussians)
         return gradient
 

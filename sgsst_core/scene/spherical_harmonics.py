@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
+from sgsst_core.devices import on_device
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
@@ -174,10 +175,11 @@ def kernel_rest_colors(
     colors = torch.empty((count, 3), device=sh_rest.device)
     if count:
         center = camera.center.to(device=sh_rest.device, dtype=torch.float64, non_blocking=True)
-        kernels.rest_colors[(-(-count // block),)](
-            sh_rest.contiguous(), means.to(sh_rest.device).contiguous(), center, colors, count,
-            DEGREE=degree, COEFFICIENTS=sh_rest.shape[1], BLOCK=block,
-        )  # fmt: skip
+        with on_device(sh_rest.device):
+            kernels.rest_colors[(-(-count // block),)](
+                sh_rest.contiguous(), means.to(sh_rest.device).contiguous(), center, colors, count,
+                DEGREE=degree, COEFFICIENTS=sh_rest.shape[1], BLOCK=block,
+            )  # fmt: skip
     return colors
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -81,16 +82,31 @@ class Event:
         return 1e3 * (end._moment - self._moment)
 
 
-class _Selected(nullcontext[None]):
-    """Replacement of `torch.cuda.device`, which does nothing because there is only one device."""
+class _Current(threading.local):
+    """Index of each thread's current device; all tensors of the simulated device are on device 0."""
+
+    index = 0
+
+
+current = _Current()
+
+
+class _Selected:
+    """Replacement of `torch.cuda.device`."""
 
     def __init__(self, to: Any) -> None:
-        super().__init__()
+        self._to, self._before = torch.cuda._utils._get_device_index(to, optional=True), 0
+
+    def __enter__(self) -> None:
+        self._before, current.index = current.index, self._to
+
+    def __exit__(self, *_: object) -> None:
+        current.index = self._before
 
 
 def _set_device(to: Any) -> None:
     """Replacement of `torch.cuda.set_device`. Like CUDA's, it requires an index, or a device with an index."""
-    torch.cuda._utils._get_device_index(to)
+    current.index = torch.cuda._utils._get_device_index(to)
 
 
 def _count_launch(original: Any) -> Any:
@@ -99,6 +115,8 @@ def _count_launch(original: Any) -> Any:
         if any(isinstance(tensor, device.PretendTensor) for tensor in tensors):
             if not all(isinstance(tensor, device.PretendTensor) for tensor in tensors):
                 raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
+            if current.index != 0:
+                raise RuntimeError("Triton Error [CUDA]: an illegal memory access was encountered")
             device.launch()
         values, named = [device.inner(arg) for arg in args], {name: device.inner(arg) for name, arg in kwargs.items()}
         # While a graph is captured, the values of its inputs are meaningless.
@@ -123,7 +141,7 @@ def pretend_cuda() -> Iterator[Counts]:
         "is_available": lambda: True,
         "is_initialized": lambda: True,
         "device_count": lambda: 1,
-        "current_device": lambda: 0,
+        "current_device": lambda: current.index,
         "set_device": _set_device,
         "synchronize": lambda *_: device.wait(),
         "get_device_name": lambda *_: "pretend",
@@ -148,6 +166,7 @@ def pretend_cuda() -> Iterator[Counts]:
     }
     device.counts.clear()
     device.capture.stuck = False
+    current.index = 0
     with (
         mock.patch.multiple(torch.cuda, **instead),
         mock.patch.object(GridExecutor, "__call__", _count_launch(GridExecutor.__call__)),

@@ -1,4 +1,4 @@
-"""Collectives over torch.distributed: NCCL between GPUs, gloo between CPUs.
+"""Collectives over torch.distributed: NCCL between GPUs, gloo between CPUs and between ranks that share a GPU.
 
 torch.distributed does not authenticate its peers. Ranks therefore listen on one interface only, which is loopback if
 all ranks run on one machine, and never unpickle what they receive (see `messages`).
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import socket
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -65,17 +66,18 @@ def process_group(
         return
     patience = max(timeout, PREPARING)
     _stay_on_interface(address)
-    device, store = _meet(rank, size, address, with_index(device), patience, listener)
+    device, sharing, store = _meet(rank, size, address, with_index(device), patience, listener)
     if device.type == "cuda":
         torch.cuda.set_device(device)
+    backend = _backend(device, sharing)
     dist.init_process_group(
-        _backend(device), store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device)
+        backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device, backend)
     )
     # With a bound device, subgroups would be split off this group's connections. That needs all ranks, including those
     # that the job has left out by then.
     world: Any = dist.group.WORLD
     world.bound_device_id = None
-    collectives = ProcessGroupCollectives(world, device, timeout)
+    collectives = ProcessGroupCollectives(world, device, timeout, sharing)
     try:
         yield collectives
     finally:
@@ -102,8 +104,8 @@ def _meet(
     device: torch.device,
     timeout: timedelta,
     listener: socket.socket | None = None,
-) -> tuple[torch.device, Any]:
-    """Return the device of this rank's tensors, and the key-value store of the ranks.
+) -> tuple[torch.device, int, Any]:
+    """Return the device of this rank's tensors, the largest number of ranks on one GPU, and the key-value store.
 
     The device is a GPU if every rank has one, else the CPU. Ranks agree on this before they form a group, because all
     of them must form it with the same back ends.
@@ -114,25 +116,35 @@ def _meet(
     store: Any = dist.TCPStore(  # type: ignore[attr-defined]  # public, but not listed
         host, port, size, rank == 0, timeout, master_listen_fd=descriptor
     )
-    store.set(f"device/{rank}", device.type)
-    types = {store.get(f"device/{other}") for other in range(size)}
-    return (device if len(types) == 1 else torch.device("cpu")), store
+    store.set(f"device/{rank}", _processor(device))
+    processors = [store.get(f"device/{other}").decode() for other in range(size)]
+    if "cpu" in processors:
+        return torch.device("cpu"), 1, store
+    return device, max(Counter(processors).values()), store
 
 
-def _backend(device: torch.device) -> str:
+def _processor(device: torch.device) -> str:
+    """Return an identifier of a GPU, the same for all of its MIG slices; "cpu" for a CPU."""
+    if device.type == "cpu":
+        return "cpu"
+    found: Any = torch.cuda.get_device_properties(device)  # the type stubs lack its place on the bus
+    return f"{socket.gethostname()} {found.pci_domain_id}:{found.pci_bus_id}:{found.pci_device_id}"
+
+
+def _backend(device: torch.device, sharing: int) -> str:
     """Return the back ends of torch.distributed. Values that are not tensors are always exchanged between CPUs.
 
-    Without NCCL, gloo copies tensors of GPUs to the host and back.
+    Without NCCL, or if ranks share a GPU, which NCCL refuses, gloo copies tensors of GPUs to the host and back.
     """
-    return "cpu:gloo,cuda:nccl" if device.type == "cuda" and dist.is_nccl_available() else "gloo"
+    return "cpu:gloo,cuda:nccl" if device.type == "cuda" and sharing == 1 and dist.is_nccl_available() else "gloo"
 
 
-def _named(device: torch.device) -> torch.device | None:
+def _named(device: torch.device, backend: str) -> torch.device | None:
     """Return the device to bind a group to; None for gloo, which does not accept a device.
 
     With a bound device, NCCL connects at once rather than in the first exchange.
     """
-    return device if "nccl" in _backend(device) else None
+    return device if "nccl" in backend else None
 
 
 def with_index(device: torch.device | str) -> torch.device:
@@ -150,17 +162,24 @@ class ProcessGroupCollectives:
         group: Group of torch.distributed.
         device: Device of the tensors.
         timeout: Timeout of each exchange; see `process_group`.
+        gpu_sharing: Largest number of ranks of the job on one GPU; 1 without GPUs.
         sent: Counters of sent bytes to continue; None for new ones.
     """
 
     def __init__(
-        self, group: Any, device: torch.device, timeout: timedelta, sent: dict[Traffic, int] | None = None
+        self,
+        group: Any,
+        device: torch.device,
+        timeout: timedelta,
+        gpu_sharing: int = 1,
+        sent: dict[Traffic, int] | None = None,
     ) -> None:
         self.rank = dist.get_rank(group)
         self.size = dist.get_world_size(group)
         self._group = group
         self._device = device
-        self._named = _named(device)
+        self.gpu_sharing = gpu_sharing
+        self._named = _named(device, _backend(device, gpu_sharing))
         self._timeout = timeout
         self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
         self._subgroups: list[ProcessGroupCollectives] = []
@@ -335,7 +354,7 @@ class ProcessGroupCollectives:
         return own
 
     def _of_group(self, group: Any) -> ProcessGroupCollectives:
-        own = ProcessGroupCollectives(group, self._device, self._timeout, self.sent)
+        own = ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing, self.sent)
         self._subgroups.append(own)
         return own
 

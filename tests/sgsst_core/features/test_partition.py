@@ -52,6 +52,14 @@ def test_whole_view_where_it_fits_and_a_tile_that_fits_where_not():
     assert choose_tile_size(3361, 5187, 64, held=1, working=0.5) == 64
 
 
+def test_tiles_have_no_more_pixels_than_allowed_even_if_more_fit_in_memory():
+    assert choose_tile_size(3361, 5187, 64, held=1e9, working=0.5, largest=3361 * 5187) is None
+    for largest in (3361 * 5187 - 1, 10**6, 10**5):
+        size = choose_tile_size(3361, 5187, 64, held=1e9, working=0.5, largest=largest)
+        assert size is not None
+        assert max(tile.outer.pixels for tile in partition(3361, 5187, size, 64)) <= largest
+
+
 def test_region_holds_what_is_covered_and_no_more_than_it_must():
     coverage = torch.zeros((100, 210))
     assert covered_region(coverage).pixels == 0

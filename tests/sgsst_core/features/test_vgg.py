@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sgsst_core.features import pooling, vgg
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
+from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_bfloat16, has_tf32, use_whole_float32
 
 CUDA = torch.device("cuda")  # only a name: no test needs a GPU
 CUDNN: Any = torch.backends.cudnn
@@ -137,21 +137,26 @@ def test_float32_is_whole_where_tf32_is_allowed_in_general(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize(
-    ("device", "hip", "capability", "expected"),
+    ("device", "hip", "capability", "tf32", "bfloat16"),
     [
-        ("cuda", None, (9, 0), True),
-        ("cuda", None, (8, 0), True),
-        ("cuda", None, (7, 5), False),
-        ("cuda", "6.4", (9, 4), False),
-        ("cpu", None, (9, 0), False),
+        ("cuda", None, (9, 0), True, True),
+        ("cuda", None, (8, 0), True, True),
+        ("cuda", None, (7, 5), False, False),
+        ("cuda", "6.4", (9, 4), False, True),
+        ("cpu", None, (9, 0), False, True),
     ],
 )
-def test_which_devices_have_tf32(
-    device: str, hip: str | None, capability: tuple[int, int], expected: bool, monkeypatch: pytest.MonkeyPatch
+def test_which_devices_have_tf32_and_bfloat16(
+    device: str,
+    hip: str | None,
+    capability: tuple[int, int],
+    tf32: bool,
+    bfloat16: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(torch.version, "hip", hip)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
-    assert has_tf32(device) is expected
+    assert (has_tf32(device), has_bfloat16(device)) == (tf32, bfloat16)
 
 
 def test_tf32_is_of_float32(tiny_weights: BackboneWeights) -> None:
@@ -279,7 +284,7 @@ def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, mon
     with operator_on_cpu(fused) as calls:
         fuse(network)
         calls.clear()
-        monkeypatch.setattr(vgg, "_FUSED_VALUES", SIZE[0] * SIZE[1] * 16)
+        monkeypatch.setattr(vgg, "_INDEXED_VALUES", SIZE[0] * SIZE[1] * 16)
         network.forward(picture())
         first_block = 2
         assert len(calls) == sum(isinstance(step, vgg._Convolution) for step in network._steps) - first_block

@@ -218,6 +218,14 @@ def test_a_view_without_its_content_is_not_captured(tiny_weights: BackboneWeight
     assert (graphs.captured, graphs.problem) == (0, None)
 
 
+def test_no_tensor_of_a_tile_needs_64_bit_indices(counts: Counts, tiny_weights: BackboneWeights) -> None:
+    network = FeatureNetwork(tiny_weights, device="cuda")
+    side, channels = 40_000, max(network.channels("relu1_1"), network.channels("relu1_2"))
+    tiles = SosLoss(network, memory=1 << 60).tiling.tiles((side, side))
+    assert side**2 * channels > 2**31 > max(tile.outer.pixels for tile in tiles) * channels
+    assert len(SosLoss(FeatureNetwork(tiny_weights), memory=1 << 60).tiling.tiles((side, side))) == 1
+
+
 def test_where_graphs_are_thought_of(tiny_weights: BackboneWeights) -> None:
     assert graphs_problem("cpu") == "only NVIDIA GPUs are known to replay them"
     tiling = Tiling(halo=64, held=1000.0, working=0.25, coarsest=16)
@@ -226,7 +234,7 @@ def test_where_graphs_are_thought_of(tiny_weights: BackboneWeights) -> None:
     network = FeatureNetwork(tiny_weights, STYLE_LAYERS, device="cpu")
 
     class Two:
-        rank, size, local_size = 0, 2, 2
+        rank, size, local_size, gpu_sharing = 0, 2, 2, 1
 
     loss = SosLoss(network, collectives=Two())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="communication between ranks"):

@@ -260,6 +260,13 @@ def test_content_is_left_out_without_weight() -> None:
             "float32",
             "features in float32: tf32 was requested, but needs an NVIDIA GPU of compute capability 8.0 or higher",
         ),
+        (
+            "bfloat16",
+            None,
+            "float32",
+            "features in float32: bfloat16 was requested, but needs a CPU, an AMD GPU, or an NVIDIA GPU of compute "
+            "capability 8.0 or higher",
+        ),
     ],
 )
 def test_lower_precision_is_used_if_requested_and_faster(
@@ -288,6 +295,16 @@ def test_cudnn_benchmarks_algorithms_if_sizes_recur_often(device: str, weights: 
     assert (decision is not None) is (device == "cuda")
     if decision:
         assert ("does not benchmark" in decision.decision) is not search
+
+
+def test_ranks_that_share_a_gpu_are_reported() -> None:
+    values: dict[str, Any] = {"device": "cuda", "ranks": 2, "link": Link(1e9, 1e-6)}
+    assert line(plan_of(probe(**values)), "communication") is None
+    assert line(plan_of(probe(**{**values, "device": "cpu", "sharing": 2})), "communication") is None
+    assert text_of(plan_of(probe(sharing=2, **values)), "communication") == (
+        "ranks exchange data over the CPU (gloo): 2 of them share a GPU, which NCCL does not support; give each a GPU "
+        "of its own"
+    )
 
 
 #: A graph saves 4 of 10 ms and takes 40 ms to capture, so it pays off from the twelfth visit on.

@@ -91,6 +91,24 @@ def test_a_failed_capture_does_not_break_the_process(
     torch.cuda.synchronize()
 
 
+@pytest.mark.parametrize(("capability", "chosen"), [((7, 5), "float32"), ((8, 0), "bfloat16")])
+def test_bfloat16_is_not_used_where_it_is_emulated(
+    counts: Counts,
+    tiny_weights: BackboneWeights,
+    monkeypatch: pytest.MonkeyPatch,
+    capability: tuple[int, int],
+    chosen: str,
+) -> None:
+    """The emulation may even be faster in the timed convolution, but Triton does not compile it."""
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda *_: capability)
+    monkeypatch.setattr("sgsst_core.planning.context.convolution_ratio", lambda *_: 1.5)
+    settings = make_settings(steps_coarse=0, steps_sos=2, coarsest_side=16, precision="bfloat16")
+    stylizer = Stylizer.planned(
+        wall(10, 8), cameras(1, 48, 32), style(), settings, weights=tiny_weights, rasterizer="cpu"
+    )
+    assert stylizer.job.plan.precision == chosen
+
+
 def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_weights: BackboneWeights) -> None:
     for steps, keep in ((LEAST_GRAPH_VISITS, ()), (LEAST_GRAPH_VISITS, ("launches",)), (LEAST_GRAPH_VISITS - 1, ())):
         settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16, keep=keep)

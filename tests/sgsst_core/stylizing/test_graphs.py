@@ -39,6 +39,15 @@ def counts() -> Iterator[Counts]:
         yield found
 
 
+def test_kernels_run_on_the_device_of_their_data(counts: Counts, tiny_weights: BackboneWeights) -> None:
+    """The caller's current device may be another one, as in a new thread."""
+    stylizer = make(tiny_weights, graphs=False, scan=True, steps_coarse=0, steps_sos=2)
+    torch.cuda.set_device(1)
+    stylizer.run_step()
+    assert torch.cuda.current_device() == 1
+    assert stylizer.step == 1
+
+
 def make(
     weights: BackboneWeights,
     *,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -27,20 +28,33 @@ from worker.ranks.process_group import _backend, _meet
 HEIGHT = 70
 
 
-@pytest.mark.parametrize(("types", "expected"), [(("cuda", "cuda"), "cuda"), (("cuda", "cpu"), "cpu")])
-def test_ranks_meet_on_gpus_where_every_one_has_one(types: tuple[str, str], expected: str) -> None:
+@pytest.mark.parametrize(
+    ("gpus", "expected", "sharing"),
+    [((0, 1), "cuda", 1), ((3, 3), "cuda", 2), ((0, None), "cpu", 1), ((None, None), "cpu", 1)],
+)
+def test_ranks_meet_on_gpus_if_each_has_one(
+    gpus: tuple[int | None, int | None], expected: str, sharing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ranks on one GPU, or on MIG slices of it, find each other by its place on the bus."""
+
+    def properties(device: torch.device) -> SimpleNamespace:
+        return SimpleNamespace(pci_domain_id=0, pci_bus_id=16 + (device.index or 0), pci_device_id=0)
+
+    monkeypatch.setattr(torch.cuda, "get_device_properties", properties)
     address, patience = f"127.0.0.1:{free_port()}", timedelta(seconds=60)
     with ThreadPoolExecutor(2) as ranks:
-        devices = [torch.device(name, 0) if name == "cuda" else torch.device(name) for name in types]
+        devices = [torch.device("cpu") if gpu is None else torch.device("cuda", gpu) for gpu in gpus]
         meeting = [ranks.submit(_meet, rank, 2, address, device, patience) for rank, device in enumerate(devices)]
-        assert [met.result(60)[0].type for met in meeting] == [expected] * 2
+        found = [met.result(60) for met in meeting]
+    assert [(device.type, shared) for device, shared, _ in found] == [(expected, sharing)] * 2
 
 
-def test_nccl_is_taken_between_gpus_where_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nccl_is_used_between_gpus_of_one_rank_each(monkeypatch: pytest.MonkeyPatch) -> None:
     for there, expected in ((True, "cpu:gloo,cuda:nccl"), (False, "gloo")):
         monkeypatch.setattr(dist, "is_nccl_available", lambda there=there: there)
-        assert _backend(torch.device("cuda", 0)) == expected
-        assert _backend(torch.device("cpu")) == "gloo"
+        assert _backend(torch.device("cuda", 0), 1) == expected
+        assert _backend(torch.device("cuda", 0), 2) == "gloo"
+        assert _backend(torch.device("cpu"), 1) == "gloo"
 
 
 def image(rank: int, rows: int = HEIGHT) -> Tensor:
