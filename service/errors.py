@@ -1,9 +1,12 @@
-"""Exceptions of the service; each has a machine-readable `code` and a message for people."""
+"""Exceptions of the service. Each class defines its whole response, from which the API's documentation derives."""
 
 from __future__ import annotations
 
-from typing import Self
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Self
 
+from service.examples import JOB_ID, SHA256, UPLOAD_ID
 from sgsst_core.errors import InfrastructureError, SgsstError
 
 _AGAIN = "If you uploaded it, upload it again; if it is a result, run the job again."
@@ -14,15 +17,30 @@ class ServiceError(SgsstError):
 
     Attributes:
         status: HTTP status of the response.
+        message: Default message.
+        retry_after: Seconds after which the request may succeed (`Retry-After`); None if waiting does not help.
+        headers: Further headers of the response.
         extra: Additional members of the problem document.
+        example: Positional arguments of the constructor for the example in the API's documentation.
     """
 
     code = "service-error"
     status = 500
+    message = ""
+    retry_after: int | None = None
+    headers: Mapping[str, str] = MappingProxyType({})
+    example: tuple[Any, ...] = ()
 
-    def __init__(self, message: str, **extra: object) -> None:
-        super().__init__(message)
+    def __init__(self, message: str = "", *, retry_after: int | None = None, **extra: object) -> None:
+        super().__init__(message or self.message)
         self.extra = extra
+        if retry_after is not None:
+            self.retry_after = retry_after
+
+    @classmethod
+    def of_example(cls) -> Self:
+        """Return the example in the API's documentation."""
+        return cls(*cls.example)
 
 
 class NotFoundError(ServiceError):
@@ -31,14 +49,162 @@ class NotFoundError(ServiceError):
     code, status = "not-found", 404
 
 
+class NoJobError(NotFoundError):
+    """Job that does not exist or belongs to another owner."""
+
+    example = (JOB_ID,)
+
+    def __init__(self, job_id: str) -> None:
+        super().__init__(f"There is no job {job_id}.")
+
+
+class NoArtifactError(NotFoundError):
+    """File that a job has not made, or has not made yet."""
+
+    example = (JOB_ID, "stylized.ply")
+
+    def __init__(self, job_id: str, name: str) -> None:
+        super().__init__(f"Job {job_id} has no file {name!r} (yet). Its artifacts list has all there are.")
+
+
+class NoUploadError(NotFoundError):
+    """Upload that does not exist, belongs to another owner, or has expired."""
+
+    example = (UPLOAD_ID,)
+
+    def __init__(self, upload_id: str) -> None:
+        super().__init__(f"There is no upload {upload_id}, or it has expired.")
+
+
+class LostUploadError(NotFoundError):
+    """Upload whose bytes are missing from the disk."""
+
+    example = (UPLOAD_ID,)
+
+    def __init__(self, upload_id: str) -> None:
+        super().__init__(f"The bytes of upload {upload_id} are gone. Begin a new one.")
+
+
 class RefusedInputError(ServiceError):
     """Unusable input; `code` is that of the core's error, and `extra["input"]` names the part of the request."""
 
     code, status = "invalid-input", 422
+    example: tuple[Any, ...] = ("The files cannot be read.", "invalid-input", "scene")
 
-    def __init__(self, message: str, code: str = "invalid-input", **extra: object) -> None:
+    def __init__(self, message: str, code: str | None = None, input: str | None = None, **extra: Any) -> None:
         super().__init__(message, **extra)
-        self.code = code
+        self.code = code or self.code
+        if input is not None:
+            self.extra = {"input": input, **extra}
+
+
+class TooManyGaussiansError(RefusedInputError):
+    """Scene with more Gaussians than the settings allow.
+
+    Args:
+        note: End of the first sentence, about a setting that multiplies the Gaussians.
+    """
+
+    code = "too-many-gaussians"
+    example = (30_000_000, 20_000_000)
+
+    def __init__(self, count: int, limit: int, note: str = "") -> None:
+        message = f"The scene has {count:,} Gaussians{note}. At most {limit:,} are allowed."
+        super().__init__(message, input="scene", limit=limit)
+
+
+class TooManyViewsError(RefusedInputError):
+    """Job with more views than the settings allow."""
+
+    code = "too-many-views"
+    example = (3000, 2000)
+
+    def __init__(self, count: int, limit: int) -> None:
+        super().__init__(f"There are {count:,} views. At most {limit:,} are allowed.", input="cameras")
+
+
+class TooManyPixelsError(RefusedInputError):
+    """Job whose views have more pixels than the settings allow."""
+
+    code = "too-many-pixels"
+    example = (30_000_000_000, 20_000_000_000)
+
+    def __init__(self, count: int, limit: int) -> None:
+        super().__init__(f"All views have {count:,} pixels. At most {limit:,} are allowed.", input="cameras")
+
+
+class ImageTooLargeError(RefusedInputError):
+    """Image with more pixels than the settings allow."""
+
+    code = "image-too-large"
+    example = ("style.jpg", 20_000, 20_000, 100_000_000, "style")
+
+    def __init__(self, name: str, width: int, height: int, limit: int, role: str | None = None) -> None:
+        super().__init__(f"{name}: has {width} x {height} pixels. At most {limit:,} are allowed.", input=role)
+
+
+class TooManyFilesError(RefusedInputError):
+    """Request with more files or fields than a job can have."""
+
+    code = "too-many-files"
+    example = (2041, "files")
+
+    def __init__(self, limit: int, what: str) -> None:
+        super().__init__(f"There are more than {limit} {what}.")
+
+
+class InspectionLimitError(RefusedInputError):
+    """Input whose inspection exceeds the limits of time and memory, or crashes."""
+
+    code = "inspection-limit"
+    example = ("Reading the files takes more time or memory than allowed, or breaks their reader.",)
+
+
+class UnknownUploadError(RefusedInputError):
+    """Field of a job that is neither a file nor the id of an upload."""
+
+    code = "unknown-upload"
+    example = (UPLOAD_ID, "scene")
+
+    def __init__(self, upload_id: str, role: str) -> None:
+        super().__init__(
+            f"{upload_id[:60]!r} is not the ID of a usable upload, and {role!r} has no file name. Send an upload's "
+            "ID, or a file with its name.",
+            input=role,
+        )
+
+
+class UnfinishedUploadError(RefusedInputError):
+    """Upload that is not complete yet."""
+
+    code = "unfinished-upload"
+    example = (UPLOAD_ID, 16_384, 42_301, "scene")
+
+    def __init__(self, upload_id: str, offset: int, length: int, role: str) -> None:
+        super().__init__(f"Upload {upload_id} has {offset:,} of {length:,} bytes. Finish it first.", input=role)
+
+
+class WebhooksOffError(RefusedInputError):
+    """Webhook of a job on a service that sends none."""
+
+    code = "webhooks-off"
+    example = ()
+
+    def __init__(self) -> None:
+        super().__init__("Webhooks are switched off on this service.", input="webhook")
+
+
+class InvalidWebhookError(RefusedInputError):
+    """URL that cannot be called."""
+
+    code = "invalid-webhook"
+    example = ("ftp://example.com", "its scheme is neither http nor https")
+
+    def __init__(self, url: str, reason: object) -> None:
+        super().__init__(
+            f"{url[:100]!r} cannot be called: {reason}. Give a URL such as 'https://example.com/hook'.",
+            input="webhook",
+        )
 
 
 class ConflictError(ServiceError):
@@ -47,113 +213,217 @@ class ConflictError(ServiceError):
     code, status = "conflict", 409
 
 
+class CancelError(ConflictError):
+    """Job that has already ended in another way."""
+
+    example = ("succeeded",)
+
+    def __init__(self, status: str) -> None:
+        super().__init__(f"The job has {status} and cannot be canceled.", job_status=status)
+
+
+class RetryError(ConflictError):
+    """Job that has not failed and was not canceled."""
+
+    example = ("running",)
+
+    def __init__(self, status: str) -> None:
+        super().__init__(
+            f"The job has status {status}; only failed or canceled jobs can be retried.", job_status=status
+        )
+
+
+class DeleteError(ConflictError):
+    """Job that has not ended."""
+
+    example = ("running",)
+
+    def __init__(self, status: str) -> None:
+        advice = "It ends in some seconds" if status == "canceling" else "Cancel it first"
+        super().__init__(f"The job has status {status}. {advice}; delete it once it has ended.", job_status=status)
+
+
+class OffsetError(ConflictError):
+    """Part of an upload that does not start at the next missing byte."""
+
+    example = (0, 16_384)
+
+    def __init__(self, offset: int, expected: int) -> None:
+        super().__init__(f"Upload-Offset is {offset}, but the next byte is {expected}.", offset=expected)
+
+
+class TooManyUploadsError(ConflictError):
+    """Upload that would exceed the key's limit of unfinished uploads."""
+
+    example = (1000,)
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"There are {limit} unfinished uploads of this key. Finish or delete some.")
+
+
 class IdempotencyError(ServiceError):
     """Idempotency-Key that was already used for a different request."""
 
     code, status = "idempotency-key-reused", 422
+    message = "This Idempotency-Key was used for another request. Give each request its own key."
 
 
 class TooLargeError(ServiceError):
-    """Request with more bytes, Gaussians or pixels than the settings allow."""
+    """Request with more bytes than the settings allow."""
 
     code, status = "too-large", 413
+    example: tuple[Any, ...] = (
+        "The request has 5,000,000,000 bytes. At most 4,000,000,000 are allowed. Use uploads.",
+        4_000_000_000,
+    )
+
+    def __init__(self, message: str, limit: int) -> None:
+        super().__init__(message, limit=limit)
+
+
+class FileTooLargeError(TooLargeError):
+    """Upload with more bytes than the settings allow."""
+
+    example = (20_000_000_000, 16_000_000_000)
+
+    def __init__(self, size: int, limit: int) -> None:
+        super().__init__(f"The file has {size:,} bytes. At most {limit:,} are allowed.", limit)
 
 
 class QueueFullError(ServiceError):
     """Job that would exceed the key's limit of unfinished jobs."""
 
     code, status = "queue-full", 429
+    retry_after = 30
+    example = (100,)
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(
+            f"There are already {limit} unfinished jobs of this key. Wait for one to finish, or cancel one.",
+            limit=limit,
+        )
 
 
 class QuotaError(ServiceError):
-    """Exhausted quota of a key; `extra["quota"]` names it.
-
-    The quota recovers after `extra["retry_after"]` seconds.
-    """
+    """Exhausted quota of a key, which recovers after `retry_after` seconds; `extra["quota"]` names it."""
 
     code, status = "quota-exceeded", 429
+    example: tuple[Any, ...] = (
+        "This key may submit 1,000 jobs a day, and has done so. Try again tomorrow (UTC).",
+        "jobs-a-day",
+        1000,
+        30_000,
+    )
+
+    def __init__(self, message: str, quota: str, limit: float, retry_after: int) -> None:
+        super().__init__(message, quota=quota, limit=limit, retry_after=retry_after)
+
+
+class BytesQuotaError(QuotaError):
+    """Exhausted quota of stored bytes."""
+
+    example = (120_000_000_000, 100_000_000_000)
+
+    def __init__(self, used: int, limit: int) -> None:
+        super().__init__(
+            f"With this, {used:,} bytes would be kept for this key. At most {limit:,} are allowed. "
+            "Delete jobs or uploads first.",
+            "stored-bytes",
+            limit,
+            retry_after=3600,
+        )
 
 
 class RateLimitError(ServiceError):
-    """Request that exceeds the key's rate limit."""
+    """Request that exceeds the key's rate limit, in requests per second."""
 
     code, status = "rate-limited", 429
+    example = (20, 1)
+
+    def __init__(self, limit: float, retry_after: int) -> None:
+        super().__init__(
+            f"This key may send {limit:g} requests a second on average. Wait, and ask less often: jobs tell of "
+            "themselves by events.",
+            limit=limit,
+            retry_after=retry_after,
+        )
 
 
 class NoSpaceError(ServiceError, InfrastructureError):
     """Request that is rejected because the service's disk is too full."""
 
     code, status = "insufficient-storage", 507
+    message = "The service's disk is too full to take this in. Try again later."
+    retry_after = 30
 
 
 class BusyError(ServiceError):
     """Request that needs a resource that is in use; retrying it later will succeed."""
 
     code, status = "busy", 503
+    retry_after = 10
+    message = "Too many files are being checked. Try again later."
 
 
 class StoreError(ServiceError, InfrastructureError):
     """File store that cannot be reached; the exception's cause has the details."""
 
     code, status = "store-unavailable", 503
+    message = "The service's store of files does not answer. Try again later."
+    retry_after = 10
 
 
 class DamagedWeightsError(ServiceError, InfrastructureError):
     """Damaged feature network weights on this machine: no job is accepted until they are reinstalled."""
 
     code, status = "weights-damaged", 503
-
-    def __init__(self) -> None:
-        super().__init__(
-            "The service's feature networks are damaged. Retry after its operator has reinstalled them; the log and "
-            "`sgsst weights list` name them.",
-            retry_after=60,
-        )
+    message = (
+        "The service's feature networks are damaged. Retry after its operator has reinstalled them; the log and "
+        "`sgsst weights list` name them."
+    )
+    retry_after = 60
 
 
 class LostFileError(ServiceError):
     """File that a database row refers to but that is missing from the file store, although the store is reachable."""
 
     code, status = "file-lost", 500
+    example = (SHA256,)
 
-    @classmethod
-    def of(cls, sha256: str) -> Self:
-        """Return the error for the file with this SHA-256."""
-        return cls(f"The service has lost the file with SHA-256 {sha256}. {_AGAIN}")
+    def __init__(self, sha256: str) -> None:
+        super().__init__(f"The service has lost the file with SHA-256 {sha256}. {_AGAIN}")
 
 
 class DamagedFileError(ServiceError):
     """Stored file whose SHA-256 differs from the recorded one; it is neither sent nor used."""
 
     code, status = "file-damaged", 500
+    example = (SHA256,)
 
-    @classmethod
-    def of(cls, sha256: str) -> Self:
-        """Return the error for the file that should have this SHA-256."""
-        return cls(f"The service's copy of the file with SHA-256 {sha256} is damaged. {_AGAIN}")
+    def __init__(self, sha256: str) -> None:
+        super().__init__(f"The service's copy of the file with SHA-256 {sha256} is damaged. {_AGAIN}")
 
 
 class LockedError(ServiceError):
     """Upload that another request is writing to."""
 
     code, status = "upload-locked", 423
-
-    def __init__(
-        self, message: str = "Another request is writing to this upload. Get its offset and resume from there."
-    ) -> None:
-        super().__init__(message)
+    message = "Another request is writing to this upload. Get its offset and resume from there."
 
 
 class DatabaseUnavailableError(ServiceError, InfrastructureError):
     """Database that does not respond."""
 
     code, status = "database-unavailable", 503
+    message = "The service's database does not answer. Try again later."
+    retry_after = 5
 
 
 class DatabaseBusyError(DatabaseUnavailableError):
     """Database that stays locked for too long, or whose connections are all in use."""
 
     code, status = "database-busy", 503
+    message = "The service's database is busy. Try again later."
 
 
 class LeaseLostError(ServiceError):

@@ -61,7 +61,7 @@ class Connection(HttpToolsProtocol):
         memory.connections += 1
         if len(self.connections) > self.most:
             error = f"There are {self.most:,} connections already. Try again later."
-            self._refuse(TooManyConnectionsError(error, retry_after=5))
+            self._refuse(TooManyConnectionsError(error))
             return
         self._start_timer()
 

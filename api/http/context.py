@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import re
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -50,18 +51,28 @@ class NoKeyError(ServiceError):
     """A missing, unknown or revoked API key."""
 
     code, status = "unauthorized", 401
+    message = "An API key is needed: send it as 'Authorization: Bearer KEY'."
+    headers = MappingProxyType({"WWW-Authenticate": "Bearer"})
+
+
+class UnknownKeyError(NoKeyError):
+    """An API key that does not exist or was revoked."""
+
+    message = "The API key is unknown or was revoked. `sgsst keys create NAME` makes one."
 
 
 class ForeignSiteError(ServiceError):
     """A request from another site's web page to a service that requires no key."""
 
     code, status = "foreign-site", 403
+    example = ("Pages of 'https://example.com' may not use this service without an API key.",)
 
 
 class CrossOriginError(ServiceError):
     """A request with a session cookie that would change something, but does not come from a page of this service."""
 
     code, status = "cross-origin", 403
+    example = ("Pages of 'https://example.com' may not use the sessions of this service.",)
 
 
 @dataclass(frozen=True)
@@ -128,7 +139,7 @@ async def get_caller(
     if given is not None:
         key = await asyncio.to_thread(context.store.keys.find, given.credentials)
         if key is None:
-            raise NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one.")
+            raise UnknownKeyError
         return _caller(context, key)
     if request.headers.get("authorization") is not None:
         raise NoKeyError("The Authorization header must have the form 'Bearer KEY'.")
@@ -140,7 +151,7 @@ async def get_caller(
     if context.settings.keys_required:
         if cookie:
             raise NoKeyError("The session has ended. Sign in again with an API key.")
-        raise NoKeyError("An API key is needed: send it as 'Authorization: Bearer KEY'.")
+        raise NoKeyError
     _check_site(request, context.settings)
     return Caller(LOCAL_OWNER, 0)
 

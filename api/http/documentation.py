@@ -20,8 +20,8 @@ from api.http.problems import (
     TooManyConnectionsError,
     from_service,
 )
-from api.http.schemas import JOB_ID, SHA256
 from service.errors import DatabaseBusyError, DatabaseUnavailableError, RateLimitError, RefusedInputError, ServiceError
+from service.examples import JOB_ID, SHA256
 
 Responses = dict[int | str, dict[str, Any]]
 
@@ -63,58 +63,50 @@ _HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
 
 def headers(*names: str, maybe: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the documentation of the headers that a response always has (`names`) or may have (`maybe`)."""
-    found = {}
+    documented = {}
     for name in (*names, *maybe):
         description, schema, example = _HEADERS[name]
-        found[name] = {
+        documented[name] = {
             "description": description,
             "required": name in names,
             "schema": {"type": "string", **schema},
             "example": example,
         }
-    return found
+    return documented
 
 
 #: Errors of every operation, and errors of operations that may require a key.
-_ANYWHERE: tuple[ServiceError, ...] = (
-    MalformedRequestError("The request is not HTTP as it should be: its first line, a header or a chunk is wrong."),
-    HeadTooLargeError("The request's line and headers have more than 131,072 bytes."),
-    InternalError(),
-    TooManyConnectionsError("There are 10,000 connections already. Try again later.", retry_after=5),
-    DatabaseUnavailableError("The service's database does not answer. Try again later.", retry_after=5),
-    DatabaseBusyError("The service's database is busy. Try again later.", retry_after=5),
+_ANYWHERE = (
+    MalformedRequestError,
+    HeadTooLargeError,
+    InternalError,
+    TooManyConnectionsError,
+    DatabaseUnavailableError,
+    DatabaseBusyError,
 )
-_WITH_KEY: tuple[ServiceError, ...] = (
-    RateLimitError(
-        "This key may send 20 requests a second on average. Wait, and ask less often: jobs tell of themselves by "
-        "events.",
-        limit=20,
-        retry_after=1,
-    ),
-    NoKeyError("An API key is needed: send it as 'Authorization: Bearer KEY'."),
-    ForeignSiteError("Pages of 'https://example.com' may not use this service without an API key."),
-    CrossOriginError("Pages of 'https://example.com' may not use the sessions of this service."),
-)
+_WITH_KEY = (RateLimitError, NoKeyError, ForeignSiteError, CrossOriginError)
 
 
-def problems(*errors: ServiceError, key: bool = True) -> Responses:
+def problems(*errors: type[ServiceError] | ServiceError, key: bool = True) -> Responses:
     """Return the documentation of an operation's errors by status, with an example response for each.
 
     Args:
-        errors: One error for each `code` that is specific to this operation. Errors of all operations are added.
+        errors: Errors that are specific to this operation, one for each `code`; an instance is its own example. Errors
+            of all operations are added.
         key: Whether the operation may require a key.
     """
-    found: Responses = {}
+    responses: Responses = {}
     for error in (*_ANYWHERE, *(_WITH_KEY if key else ()), *errors):
-        answer = from_service(error)
-        example = json.loads(bytes(answer.body))
-        shown = found.setdefault(error.status, _no_problem_yet(error.status, example["title"]))
-        content = shown["content"][MEDIA_TYPE]
-        content["schema"]["allOf"][1]["properties"]["code"]["enum"].append(error.code)
-        content["examples"][error.code] = {"value": example}
+        example = error if isinstance(error, ServiceError) else error.of_example()
+        answer = from_service(example)
+        body = json.loads(bytes(answer.body))
+        response = responses.setdefault(example.status, _no_problem_yet(example.status, body["title"]))
+        content = response["content"][MEDIA_TYPE]
+        content["schema"]["allOf"][1]["properties"]["code"]["enum"].append(example.code)
+        content["examples"][example.code] = {"value": body}
         sent = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
-        shown.setdefault("headers", {}).update(headers(*sent))
-    return found
+        response.setdefault("headers", {}).update(headers(*sent))
+    return responses
 
 
 def _no_problem_yet(status: int, title: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from fastapi import Request
@@ -20,7 +21,13 @@ from starlette.requests import ClientDisconnect
 from api.http.memory import memory
 from api.http.receipts import Receipt
 from api.http.threads import OwnerThreads
-from service.errors import RefusedInputError, ServiceError, TooLargeError
+from service.errors import (
+    RefusedInputError,
+    ServiceError,
+    TooLargeError,
+    TooManyFilesError,
+    TooManyGaussiansError,
+)
 from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_name
 from service.settings import ServiceSettings
@@ -29,6 +36,8 @@ from sgsst_core.files.formats import read_scene_header
 
 #: Maximum bytes of a text field: JSON parameters or an id.
 _MAX_TEXT = 1 << 16
+#: Media types of the body of a new job.
+MEDIA_TYPES = "multipart/form-data or application/json"
 _TEXT_FIELDS = ("parameters", "webhook")
 #: Maximum number of headers of a part, and bytes of each. They hold the file's role and name.
 _MAX_HEADERS, _MAX_HEADER = 8, 4224
@@ -43,18 +52,43 @@ class BadRequestError(ServiceError):
     """A body that contradicts its headers."""
 
     code, status = "malformed-body", 400
+    message = "The request was cut off."
+
+
+class NotUtf8Error(BadRequestError):
+    """A JSON body in another encoding than UTF-8."""
+
+    message = "The body is not UTF-8."
 
 
 class MediaTypeError(ServiceError):
-    """A media type or content encoding that is not supported."""
+    """A body in a format that is not supported."""
 
     code, status = "unsupported-media-type", 415
+
+
+class BodyTypeError(MediaTypeError):
+    """A body of a media type that the operation does not support."""
+
+    def __init__(self, supported: str) -> None:
+        super().__init__(f"The body must be {supported}.")
+
+
+class EncodedBodyError(MediaTypeError):
+    """A compressed body."""
+
+    message = "Encoded bodies are not accepted. Send the body without Content-Encoding."
 
 
 class TooSlowError(ServiceError):
     """A body that has stopped arriving."""
 
     code, status = "too-slow", 408
+    headers = MappingProxyType({"Connection": "close"})  # the rest of the body may never arrive
+    example = (60.0,)
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__(f"Nothing has come for {seconds:g} s, or less than {_LEAST_RATE} bytes per second.")
 
 
 @dataclass
@@ -81,7 +115,7 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
         advice: End of the error message for a body that is too long.
 
     Raises:
-        MediaTypeError: If the body is compressed.
+        EncodedBodyError: If the body is compressed.
         TooLargeError: If the body is too long. A declared length is checked before the body is read.
         TooSlowError: If the body stalls or arrives too slowly.
         BadRequestError: If the body is cut off.
@@ -98,15 +132,12 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
         except StopAsyncIteration:
             return
         except TimeoutError as error:
-            raise TooSlowError(
-                f"Nothing has come for {settings.receive_seconds:g} s, or less than {_LEAST_RATE} bytes per second.",
-                headers={"Connection": "close"},  # the rest of the body may never arrive
-            ) from error
+            raise TooSlowError(settings.receive_seconds) from error
         except ClientDisconnect as error:
-            raise BadRequestError("The request was cut off.") from error
+            raise BadRequestError from error
         total += len(part)
         if total > limit:
-            raise TooLargeError(f"The request has more than {limit:,} bytes. {advice}", limit=limit)
+            raise TooLargeError(f"The request has more than {limit:,} bytes. {advice}", limit)
         yield part
 
 
@@ -132,18 +163,29 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
         yield bytes(block)
 
 
+def check_media_type(request: Request, supported: str) -> None:
+    """Raise BodyTypeError if the body has another media type; parameters such as `charset` are ignored."""
+    if media_type(request) != supported:
+        raise BodyTypeError(supported)
+
+
+def media_type(request: Request) -> str:
+    """Return the media type of the body, without parameters."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
 def declared_bytes(request: Request, limit: int, advice: str = "Use uploads.") -> int:
     """Return the length of a body from its headers, or 0 if they do not declare it.
 
     Raises:
-        MediaTypeError: If the body is compressed.
+        EncodedBodyError: If the body is compressed.
         TooLargeError: If the body is too long.
     """
     if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
-        raise MediaTypeError("Encoded bodies are not accepted. Send the body without Content-Encoding.")
+        raise EncodedBodyError
     total = int(request.headers.get("content-length", "0"))  # only digits: the HTTP parser refuses anything else
     if total > limit:
-        raise TooLargeError(f"The request has {total:,} bytes. At most {limit:,} are allowed. {advice}", limit=limit)
+        raise TooLargeError(f"The request has {total:,} bytes. At most {limit:,} are allowed. {advice}", limit)
     return total
 
 
@@ -160,7 +202,7 @@ async def receive(
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data":
-        raise MediaTypeError("The body must be multipart/form-data or application/json.")
+        raise BodyTypeError(MEDIA_TYPES)
     if not boundary:
         raise BadRequestError("The Content-Type multipart/form-data must name a boundary.")
     await asyncio.to_thread(receipt.charge, declared_bytes(request, settings.max_request_bytes))
@@ -255,7 +297,7 @@ class _Form:
     def _begin(self) -> None:
         self._parts += 1
         if self._parts > self._most_files + len(_TEXT_FIELDS):
-            raise RefusedInputError(f"There are more than {self._parts - 1} fields.", "too-many-files")
+            raise TooManyFilesError(self._parts - 1, "fields")
         self._headers = {}
         self._clear_header()
 
@@ -279,7 +321,7 @@ class _Form:
             return
         count = len(self.received.files)
         if count >= self._most_files:
-            raise RefusedInputError(f"There are more than {count} files.", "too-many-files")
+            raise TooManyFilesError(count, "files")
         self._name = clean_name(self._role, filename.decode("utf-8", "replace"), count)
         self._file = self._blobs.receive(self._settings.max_upload_bytes)
 
@@ -332,12 +374,7 @@ def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSet
     except SceneError as error:
         raise RefusedInputError(str(error).replace(os.fspath(path), name), error.code, input=role) from error
     if count > settings.max_gaussians:
-        raise RefusedInputError(
-            f"The scene has {count:,} Gaussians. At most {settings.max_gaussians:,} are allowed.",
-            "too-many-gaussians",
-            input=role,
-            limit=settings.max_gaussians,
-        )
+        raise TooManyGaussiansError(count, settings.max_gaussians)
 
 
 def _kind(role: str) -> str:
@@ -363,7 +400,7 @@ async def read_json(request: Request, settings: ServiceSettings, most: int) -> A
             body += part
         return parse_json(body.decode(), "body")
     except UnicodeDecodeError as error:
-        raise BadRequestError("The body is not UTF-8.") from error
+        raise NotUtf8Error from error
     finally:
         memory.give_back(len(body))
 

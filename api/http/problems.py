@@ -57,27 +57,29 @@ class MalformedRequestError(ServiceError):
     """Bytes that are not an HTTP request. Raised by `api.http.connection`, below the app."""
 
     code, status = "malformed-request", 400
+    example = ("The request is not HTTP as it should be: its first line, a header or a chunk is wrong.",)
 
 
 class HeadTooLargeError(ServiceError):
     """A request line and headers that are too long. Raised by `api.http.connection`, below the app."""
 
     code, status = "head-too-large", 431
+    example = ("The request's line and headers have more than 131,072 bytes.",)
 
 
 class TooManyConnectionsError(ServiceError):
     """More connections than this process accepts. Raised by `api.http.connection`, below the app."""
 
     code, status = "too-many-connections", 503
+    retry_after = 5
+    example = ("There are 10,000 connections already. Try again later.",)
 
 
 class InternalError(ServiceError):
     """A fault of the service itself."""
 
     code, status = "internal", 500
-
-    def __init__(self) -> None:
-        super().__init__("Something went wrong on the service's side; its log says what.")
+    message = "Something went wrong on the service's side; its log says what."
 
 
 def problem(
@@ -102,13 +104,10 @@ def add_handlers(app: FastAPI) -> None:
 
 def from_service(error: ServiceError) -> JSONResponse:
     """Return the problem document of a service error."""
-    extra = dict(error.extra)
-    headers: dict[str, str] = dict(extra.pop("headers", {}))  # type: ignore[call-overload]
-    if "retry_after" in extra or error.status in (429, 503, 507):
-        headers["Retry-After"] = str(extra.pop("retry_after", 30))
-    if error.status == 401:
-        headers["WWW-Authenticate"] = "Bearer"
-    return problem(error.status, error.code, str(error), headers, **extra)
+    headers = dict(error.headers)
+    if error.retry_after is not None:
+        headers["Retry-After"] = str(error.retry_after)
+    return problem(error.status, error.code, str(error), headers, **error.extra)
 
 
 async def _service_error(request: Request, error: Exception) -> JSONResponse:
@@ -155,7 +154,7 @@ async def _system_error(request: Request, error: Exception) -> JSONResponse:
     if error.errno not in (errno.EMFILE, errno.ENFILE):
         raise error
     detail = "The service has as many files open as its system allows. Try again later."
-    return from_service(TooManyConnectionsError(detail, retry_after=5))
+    return from_service(TooManyConnectionsError(detail))
 
 
 async def _unexpected(request: Request, error: Exception) -> JSONResponse:

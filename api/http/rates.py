@@ -42,9 +42,4 @@ class Rates:
         if len(self._left) > _REMEMBERED:
             del self._left[next(iter(self._left))]  # the owner with the oldest last request
         if not allowed:
-            raise RateLimitError(
-                f"This key may send {a_second:g} requests a second on average. Wait, and ask less often: jobs tell of "
-                "themselves by events.",
-                limit=a_second,
-                retry_after=math.ceil((1 - left) / a_second),
-            )
+            raise RateLimitError(a_second, math.ceil((1 - left) / a_second))

@@ -23,6 +23,16 @@ class ChecksumError(ServiceError):
     """Received bytes that differ from the bytes that were sent."""
 
     code, status = "checksum-mismatch", 460
+    message = "The part's digest is not that of Upload-Checksum; it was thrown away. Send it again."
+
+
+class LongerThanDeclaredError(TooLargeError):
+    """Upload of more bytes than its `Upload-Length`."""
+
+    example = (42_301,)
+
+    def __init__(self, length: int) -> None:
+        super().__init__(f"More bytes come than the {length:,} of Upload-Length.", length)
 
 
 async def append_body(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
@@ -53,9 +63,7 @@ class _Writer:
 
     def write(self, block: bytes) -> None:
         if self._offset + len(block) > self._row.length:
-            raise TooLargeError(
-                f"More bytes come than the {self._row.length:,} of Upload-Length.", limit=self._row.length
-            )
+            raise LongerThanDeclaredError(self._row.length)
         self._context.blobs.ensure_room(len(block))
         self._part.write(block)
         self._offset += len(block)
@@ -73,7 +81,7 @@ class _Writer:
         """Verify and save the bytes of the request. Store the file as a blob if the upload is complete."""
         if self._digest is not None and self._wanted is not None and self._digest.digest() != self._wanted[1]:
             self._part.discard()
-            raise ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again.")
+            raise ChecksumError
         expires = self.save()
         self.close()
         if self._offset == self._row.length:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from service.examples import JOB_ID, SHA256, UPLOAD_ID
 from service.files.artifacts import media_type
 from service.parameters import JobName, JobParameters
 from service.store.history import Point
@@ -24,10 +25,7 @@ else:  # inlined in the OpenAPI document; enumerations would get schemas of thei
 
 #: Maximum number of points of a loss history.
 MOST_POINTS = 512
-#: Values of the examples, which all describe one job.
-JOB_ID = "job_1a1fe701a104f943e9d4d8cce5b818c"
-UPLOAD_ID = "upl_1a1fe701a104f943e9d4d8cce5b818c"
-SHA256 = "3158b524aebf9351a4de9039a6b9b799cfc0452d9cec424a9f867085d0a9a7b5"
+#: Times in the examples.
 _CREATED, _STARTED, _NOW = "2026-11-21T14:06:02.057842Z", "2026-11-21T14:06:05.536727Z", "2026-11-21T14:09:30.532514Z"
 
 

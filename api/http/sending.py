@@ -16,8 +16,8 @@ from fastapi import Header, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.documentation import Responses, headers
-from api.http.schemas import SHA256
 from service.errors import NotFoundError, ServiceError
+from service.examples import SHA256
 
 #: Size in bytes above which a file counts as large, and limiter of concurrent checks of large files. It keeps checks of
 #: small files and other requests from waiting for them.
@@ -42,12 +42,21 @@ class RangeError(ServiceError):
     """A requested range that starts after the end of the file."""
 
     code, status = "range-not-satisfiable", 416
+    example = (42_301,)
+
+    def __init__(self, size: int) -> None:
+        super().__init__(f"The file has {size} bytes.")
+        self.headers = {"Content-Range": f"bytes */{size}"}
 
 
-#: Headers of every response with a file, and examples of errors.
+class JustRemovedError(NotFoundError):
+    """A file that was deleted after the request had found it."""
+
+    message = "The file has just been removed."
+
+
+#: Headers of every response with a file.
 _SENT = ("ETag", "Accept-Ranges", "Cache-Control", "Content-Disposition", "X-Content-Type-Options")
-JUST_REMOVED = NotFoundError("The file has just been removed.")
-NO_SUCH_RANGE = RangeError("The file has 42301 bytes.", headers={"Content-Range": "bytes */42301"})
 
 
 @dataclass(frozen=True)
@@ -141,7 +150,7 @@ def _first(body: Iterator[bytes]) -> list[bytes]:
     try:
         return [piece for piece in (next(body, None),) if piece is not None]
     except FileNotFoundError as error:
-        raise JUST_REMOVED from error
+        raise JustRemovedError from error
 
 
 def _headers(file: SentFile, tag: str) -> dict[str, str]:
@@ -189,5 +198,5 @@ def _parse_range(text: str, size: int) -> tuple[int, int] | None:
         if last and int(last) < start:
             return None
     if start >= stop:
-        raise RangeError(f"The file has {size} bytes.", headers={"Content-Range": f"bytes */{size}"})
+        raise RangeError(size)
     return start, stop

@@ -18,6 +18,8 @@ class TooManyTriesError(ServiceError):
     """Too many sign-ins with invalid keys."""
 
     code, status = "too-many-tries", 429
+    message = "Too many invalid keys came from this address. Try again later."
+    retry_after = 30
 
 
 class SignIns:
@@ -37,8 +39,7 @@ class SignIns:
         if found is not None and len(found) == MOST_FAILURES:
             left = found[0] + WITHIN_SECONDS - self._clock()
             if left > 0:
-                message = "Too many invalid keys came from this address. Try again later."
-                raise TooManyTriesError(message, retry_after=int(left) + 1)
+                raise TooManyTriesError(retry_after=int(left) + 1)
 
     def failed(self, address: str) -> None:
         """Record a failed attempt."""

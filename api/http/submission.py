@@ -7,26 +7,45 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from api.http.documentation import invalid
-from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError
-from api.http.schemas import SHA256
+from api.http.multipart import MEDIA_TYPES, BadRequestError, BodyTypeError, TooSlowError
 from service.errors import (
     BusyError,
     DamagedFileError,
     DamagedWeightsError,
     IdempotencyError,
+    ImageTooLargeError,
+    InspectionLimitError,
+    InvalidWebhookError,
     LockedError,
     LostFileError,
+    LostUploadError,
     NoSpaceError,
-    NotFoundError,
     QueueFullError,
     QuotaError,
     RefusedInputError,
     ServiceError,
     StoreError,
     TooLargeError,
+    TooManyFilesError,
+    TooManyGaussiansError,
+    TooManyPixelsError,
+    TooManyViewsError,
+    UnfinishedUploadError,
+    UnknownUploadError,
+    WebhooksOffError,
 )
+from service.examples import UPLOAD_ID
 from service.files.staging import MOST_STYLES
 from service.parameters import JobParameters
+from sgsst_core.errors import (
+    CameraError,
+    ImageError,
+    SceneError,
+    SettingsError,
+    SgsstError,
+    TooManyIntersectionsError,
+    WeightsError,
+)
 from sgsst_core.files.formats import TITLES
 
 
@@ -38,7 +57,7 @@ class JobFromUploads(BaseModel):
         json_schema_extra={
             "examples": [
                 {
-                    "scene": "upl_1a1fe701a104f943e9d4d8cce5b818c",
+                    "scene": UPLOAD_ID,
                     "style": "upl_1a1fe701b52a0c11d0ab9f6ad0c2a54",
                     "cameras": ["upl_1a1fe701b9e8e2a45b1c1d8c6bd8a90"],
                     "parameters": {"preset": "preview"},
@@ -100,80 +119,47 @@ BODY = {
     }
 }
 
-REFUSALS: tuple[ServiceError, ...] = (
-    BadRequestError("The multipart body ends before its last boundary: it was cut off."),
-    NotFoundError("The bytes of upload upl_1a1fe701a104f943e9d4d8cce5b818c are gone. Begin a new one."),
-    TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
-    TooLargeError(
-        "The request has 5,000,000,000 bytes. At most 4,000,000,000 are allowed. Use uploads.", limit=4_000_000_000
-    ),
-    MediaTypeError("The body must be multipart/form-data or application/json."),
-    invalid("resolution", "Input should be greater than or equal to 1"),
-    RefusedInputError(
-        "scene.ply: holds no Gaussians (element vertex 0). Export the scene again.",
-        "invalid-scene",
-        input="scene",
-    ),
-    RefusedInputError(
-        "style.jpg: is not an image that can be read. Give a PNG or JPEG.", "invalid-image", input="style"
-    ),
-    RefusedInputError("cameras.json: holds no cameras. Export them again.", "invalid-cameras", input="cameras"),
-    RefusedInputError("The files cannot be read.", "invalid-input", input="scene"),
-    RefusedInputError("Both numbers of steps are 0, so that nothing would change. Give some.", "invalid-settings"),
-    RefusedInputError("The service has no weights of vgg19: its operator has to fetch them.", "invalid-weights"),
-    RefusedInputError(
-        "The scene has 30,000,000 Gaussians. At most 20,000,000 are allowed.",
-        "too-many-gaussians",
-        input="scene",
-        limit=20_000_000,
-    ),
-    RefusedInputError("There are 3,000 views. At most 2,000 are allowed.", "too-many-views", input="cameras"),
-    RefusedInputError(
-        "All views have 30,000,000,000 pixels. At most 20,000,000,000 are allowed.", "too-many-pixels", input="cameras"
-    ),
-    RefusedInputError(
-        "style.jpg: has 20000 x 20000 pixels. At most 100,000,000 are allowed.", "image-too-large", input="style"
-    ),
-    RefusedInputError("There are more than 2041 files.", "too-many-files"),
-    RefusedInputError(
+#: Errors of the core that the inspection of the files reports: part of the request and example.
+_CORE_ERRORS: dict[type[SgsstError], tuple[str | None, str]] = {
+    SceneError: ("scene", "scene.ply: holds no Gaussians (element vertex 0). Export the scene again."),
+    ImageError: ("style", "style.jpg: is not an image that can be read. Give a PNG or JPEG."),
+    CameraError: ("cameras", "cameras.json: holds no cameras. Export them again."),
+    SettingsError: (None, "Both numbers of steps are 0, so that nothing would change. Give some."),
+    WeightsError: (None, "The service has no weights of vgg19: its operator has to fetch them."),
+    TooManyIntersectionsError: (
+        None,
         "view 'view_0' (5187x3361): its 9,000,000 visible Gaussians touch raster tiles 3,000,000,000 times, more than "
         "can be addressed. Render at a lower resolution.",
-        "too-many-intersections",
     ),
-    RefusedInputError(
-        "Reading the files takes more time or memory than allowed, or breaks their reader.", "inspection-limit"
-    ),
-    RefusedInputError(
-        "'upl_1a1fe701a104f943e9d4d8cce5b818c' is not the ID of a usable upload, and 'scene' has no file name. Send an "
-        "upload's ID, or a file with its name.",
-        "unknown-upload",
-        input="scene",
-    ),
-    RefusedInputError(
-        "Upload upl_1a1fe701a104f943e9d4d8cce5b818c has 16,384 of 42,301 bytes. Finish it first.",
-        "unfinished-upload",
-        input="scene",
-    ),
-    RefusedInputError("Webhooks are switched off on this service.", "webhooks-off", input="webhook"),
-    RefusedInputError(
-        "'ftp://example.com' cannot be called: its scheme is neither http nor https. Give a URL such as "
-        "'https://example.com/hook'.",
-        "invalid-webhook",
-        input="webhook",
-    ),
-    IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key."),
-    QueueFullError("There are 100 unfinished jobs of this key already. Wait for one to end, or cancel one.", limit=100),
-    QuotaError(
-        "This key may submit 1,000 jobs a day, and has. Come back tomorrow (UTC).",
-        quota="jobs-a-day",
-        limit=1000,
-        retry_after=30_000,
-    ),
-    BusyError("Too many files are being checked. Try again later.", retry_after=10),
-    NoSpaceError("The service's disk is too full to take this in. Try again later."),
-    StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
-    DamagedWeightsError(),
-    LockedError(),
-    LostFileError.of(SHA256),
-    DamagedFileError.of(SHA256),
+}
+#: Errors of `POST /v1/jobs`.
+REFUSALS: tuple[type[ServiceError] | ServiceError, ...] = (
+    BadRequestError,
+    LostUploadError,
+    TooSlowError,
+    TooLargeError,
+    BodyTypeError(MEDIA_TYPES),
+    invalid("resolution", "Input should be greater than or equal to 1"),
+    *(RefusedInputError(message, error.code, role) for error, (role, message) in _CORE_ERRORS.items()),
+    RefusedInputError,
+    TooManyGaussiansError,
+    TooManyViewsError,
+    TooManyPixelsError,
+    ImageTooLargeError,
+    TooManyFilesError,
+    InspectionLimitError,
+    UnknownUploadError,
+    UnfinishedUploadError,
+    WebhooksOffError,
+    InvalidWebhookError,
+    IdempotencyError,
+    QueueFullError,
+    QuotaError,
+    BusyError,
+    NoSpaceError,
+    StoreError,
+    DamagedWeightsError,
+    LockedError,
+    LostFileError,
+    DamagedFileError,
 )

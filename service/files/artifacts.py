@@ -91,9 +91,9 @@ class Artifacts:
                 found = file_digest(temporary)
                 if found != sha256:
                     _log.error("%s is damaged: its SHA-256 is %s, and should be %s", location, found, sha256)
-                    raise DamagedFileError.of(sha256)
+                    raise DamagedFileError(sha256)
         except FileNotFoundError as error:
-            raise LostFileError.of(sha256) from error
+            raise LostFileError(sha256) from error
 
     def remove(self, location: str) -> None:
         """Remove a file if it exists."""

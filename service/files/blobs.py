@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Protocol
 
-from service.errors import LockedError, NoSpaceError, NotFoundError, StoreError, TooLargeError
+from service.errors import LockedError, LostUploadError, NoSpaceError, NotFoundError, StoreError, TooLargeError
 from service.files.cache import file_digest
 from service.files.objects import ObjectStore
 from service.store.inputs import Inputs, check_offset
@@ -53,7 +53,7 @@ class Receiver:
         """
         self.size += len(data)
         if self.size > self._limit:
-            raise TooLargeError(f"A file has more than {self._limit:,} bytes.", limit=self._limit)
+            raise TooLargeError(f"A file has more than {self._limit:,} bytes.", self._limit)
         self._room(len(data))
         write_all(self._file, data)
 
@@ -106,7 +106,7 @@ class Blobs(ABC):
     def ensure_room(self, size: int) -> None:
         """Raise NoSpaceError if `size` more bytes would leave too little free disk space."""
         if shutil.disk_usage(self.incoming).free - size < self._min_free:
-            raise NoSpaceError("The service's disk is too full to take this in. Try again later.")
+            raise NoSpaceError
         inodes = os.statvfs(self.incoming)
         if inodes.f_files and inodes.f_favail < _MIN_FREE_INODES:  # file systems without an inode table report 0
             raise NoSpaceError("The service's disk cannot hold more files. Try again later.")
@@ -292,7 +292,7 @@ class BlobFolder(Blobs):
                 if known is not None:
                     return known
                 if path.stat().st_size != upload.length:
-                    raise gone(upload)
+                    raise LostUploadError(upload.id)
                 sha256 = self.keep(path, upload.id, leave=True)
                 self._inputs.finish_upload(upload.id, sha256, seconds)
                 path.unlink(missing_ok=True)
@@ -300,7 +300,7 @@ class BlobFolder(Blobs):
         except FileNotFoundError:  # missing also if another request has just finished the upload
             known = self._inputs.upload(upload.id, upload.owner).sha256
             if known is None:
-                raise gone(upload) from None
+                raise LostUploadError(upload.id) from None
             return known
 
     def forget_upload(self, upload_id: str) -> None:
@@ -336,14 +336,14 @@ class _FileWriter:
         try:
             self._file = path.open("r+b", buffering=0)
         except FileNotFoundError:
-            raise gone(upload) from None
+            raise LostUploadError(upload.id) from None
         try:
             _lock(self._file)
             # read the row again: no other writer changes it while the lock is held
             check_offset(inputs.upload(upload.id, upload.owner), upload.offset)
             # writing beyond the end of the file would fill the gap with zeros
             if os.fstat(self._file.fileno()).st_size < upload.offset:
-                raise gone(upload)
+                raise LostUploadError(upload.id)
             self._file.truncate(upload.offset)  # a crash may have left unrecorded bytes
             self._file.seek(upload.offset)
         except BaseException:
@@ -380,11 +380,6 @@ def _lock(file: IO[bytes]) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise LockedError from None
-
-
-def gone(upload: UploadRow) -> NotFoundError:
-    """Return the error for an upload whose bytes are gone."""
-    return NotFoundError(f"The bytes of upload {upload.id} are gone. Begin a new one.")
 
 
 def write_all(file: object, data: bytes) -> None:

@@ -123,11 +123,11 @@ class FileCache:
                     self._keep(half, sha256)
                     return
         except FileNotFoundError as error:
-            raise LostFileError.of(sha256) from error
+            raise LostFileError(sha256) from error
         finally:
             half.unlink(missing_ok=True)
         _log.error("the file with SHA-256 %s is damaged in the store: the received file has %s", sha256, found)
-        raise DamagedFileError.of(sha256)
+        raise DamagedFileError(sha256)
 
     def _fetch(self, half: Path, fetch: Fetch) -> None:
         """Fetch a file; if the disk is full, evict all unused files and retry."""

@@ -157,7 +157,7 @@ class ObjectStore:
         fault = self.fault(name, sha256)
         if fault is not None:
             _log.error("%s in %s, which should have the SHA-256 %s, is %s", name, self.url, sha256, fault)
-            raise LostFileError.of(sha256) if fault == "missing" else DamagedFileError.of(sha256)
+            raise LostFileError(sha256) if fault == "missing" else DamagedFileError(sha256)
 
     def fault(self, name: str, sha256: str) -> Literal["missing", "damaged"] | None:
         """Return the fault of an object that should have this SHA-256; None if it is intact."""
@@ -289,9 +289,7 @@ class ObjectStore:
         except Exception as error:
             if self.local:
                 raise
-            raise StoreError("The service's store of files does not answer. Try again later.", retry_after=10) from (
-                _cause(name, error)
-            )
+            raise StoreError from _cause(name, error)
 
 
 def _cause(name: str, error: Exception) -> Exception:

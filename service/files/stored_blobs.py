@@ -14,12 +14,13 @@ from service.errors import (
     ConflictError,
     DamagedFileError,
     LostFileError,
+    LostUploadError,
     NoSpaceError,
     NotFoundError,
     StoreError,
 )
 from service.files.artifacts import Artifacts
-from service.files.blobs import BLOBS, UPLOADS, BlobFolder, Blobs, PartWriter, gone, write_all
+from service.files.blobs import BLOBS, UPLOADS, BlobFolder, Blobs, PartWriter, write_all
 from service.files.cache import FileCache, file_digest
 from service.files.objects import ObjectStore
 from service.settings import ServiceSettings
@@ -134,7 +135,7 @@ class StoredBlobs(Blobs):
             except (FileNotFoundError, NotFoundError):  # missing also if another request has just finished the upload
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is None:
-                    raise gone(upload) from None
+                    raise LostUploadError(upload.id) from None
                 return known
             self._inputs.finish_upload(upload.id, sha256, seconds)
         finally:

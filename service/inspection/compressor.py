@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from service.errors import NotFoundError
+from service.errors import NoArtifactError, NotFoundError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.names import RESULT
@@ -58,7 +58,7 @@ class Compressor:
         name = result_name(RESULT, format)
         result = await asyncio.to_thread(self._store.jobs.artifact, job.id, RESULT)
         if result is None:
-            raise NotFoundError(f"Job {job.id} has no file {RESULT!r} (yet). Its artifacts list has all there are.")
+            raise NoArtifactError(job.id, RESULT)
         row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
         if row is None:
             task = self._tasks.get((job.id, name))

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import psutil
 
-from service.errors import BusyError, RefusedInputError
+from service.errors import BusyError, InspectionLimitError, RefusedInputError
 from service.files.blobs import Blobs
 from service.files.staging import stage
 from service.inspection.lanes import Lanes
@@ -27,6 +27,7 @@ from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.tables import BlobRow
+from sgsst_core.errors import WeightsError
 
 _log = logging.getLogger(__name__)
 
@@ -85,7 +86,7 @@ class InspectionProcess:
             BusyError: If too many requests wait already, or the process died twice.
         """
         if self._waiting >= _MAX_WAITING:
-            raise BusyError("Too many files are being checked. Try again later.", retry_after=10)
+            raise BusyError
         self._waiting += 1
         try:
             async with self._lock:
@@ -96,7 +97,7 @@ class InspectionProcess:
                         return answer
         finally:
             self._waiting -= 1
-        raise BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10)
+        raise BusyError("Files cannot be checked at the moment. Try again later.")
 
     async def warm(self) -> None:
         """Start the process in advance, so that the first request does not wait for it."""
@@ -224,7 +225,7 @@ class Inspector:
             self._warming = asyncio.create_task(self._validating.slots[1].warm())
         async with self._lanes(work, inputs).turn(owner) as process:
             answer = await self._ask_process(process, work, inputs, rows, parameters, show)
-        transient = answer.get("error", {}).get("code") in ("inspection-limit", "invalid-weights")
+        transient = answer.get("error", {}).get("code") in (InspectionLimitError.code, WeightsError.code)
         if not transient:  # a later check may succeed
             key = self._key(work, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
@@ -315,8 +316,6 @@ def findings_of(answer: Mapping[str, Any]) -> dict[str, Any]:
     """
     if "error" in answer:
         error = answer["error"]
-        raise RefusedInputError(
-            error["message"], error["code"], **({"input": error["input"]} if error["input"] else {})
-        )
+        raise RefusedInputError(error["message"], error["code"], error["input"])
     found: dict[str, Any] = answer["found"]
     return found

@@ -39,7 +39,7 @@ class Lanes(Generic[Slot]):
         """
         queue = self._waiting.setdefault(owner, deque())
         if len(queue) >= MAX_WAITING:
-            raise BusyError("Too many files of this key are being checked. Try again later.", retry_after=10)
+            raise BusyError("Too many files of this key are being checked. Try again later.")
         granted: asyncio.Future[Slot] = asyncio.get_running_loop().create_future()
         queue.append(granted)
         self._grant_turns()

@@ -26,6 +26,13 @@ from typing import Any, NoReturn
 import psutil
 import torch
 
+from service.errors import (
+    ImageTooLargeError,
+    InspectionLimitError,
+    TooManyGaussiansError,
+    TooManyPixelsError,
+    TooManyViewsError,
+)
 from service.files.staging import Staged
 from service.inspection.sandbox import confine, installation
 from service.parameters import JobParameters
@@ -63,14 +70,6 @@ MAX_ANSWER = 64 << 20
 _THREAD_BYTES = 1 << 28
 
 
-class RefusedError(Exception):
-    """Input that exceeds the service's own limits, with a code and a message for the user."""
-
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.code = code
-
-
 @dataclass(frozen=True)
 class _Inputs:
     """Inputs of a job in memory.
@@ -92,8 +91,8 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
         `gaussians`, `dropped`, `sh_degree`, `views`, `pixels` (of all views), `style` (width, height), `photos`.
 
     Raises:
-        RefusedError, InvalidInputError: If an input cannot be used; the error's attribute `role` is the role of the
-            input.
+        RefusedInputError, InvalidInputError: If an input cannot be used; the error's attribute `role` is the input's
+            role.
     """
     return _read_inputs(staged, parameters, limits)[0]
 
@@ -109,11 +108,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         header = read_scene_header(staged.scene)
         declared = int(header.count * settings.refine)
         if declared > limits["gaussians"]:
-            raise RefusedError(
-                "too-many-gaussians",
-                f"The scene has {declared:,} Gaussians{_refinement_note(settings)}. "
-                f"At most {limits['gaussians']:,} are allowed.",
-            )
+            raise TooManyGaussiansError(declared, limits["gaussians"], _refinement_note(settings))
     with _errors_of("cameras"):
         if source.cameras is not None and staged.photos is None:
             _check_frames_have_sizes(source.cameras)
@@ -133,14 +128,10 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         capture = read_capture(source, file.scene, staged.photos).fitted(settings)
         cameras = capture.cameras
         if len(cameras) > limits["views"]:
-            raise RefusedError(
-                "too-many-views", f"There are {len(cameras):,} views. At most {limits['views']:,} are allowed."
-            )
+            raise TooManyViewsError(len(cameras), limits["views"])
         pixels = _pixels(cameras)
         if pixels > limits["pixels"]:
-            raise RefusedError(
-                "too-many-pixels", f"All views have {pixels:,} pixels. At most {limits['pixels']:,} are allowed."
-            )
+            raise TooManyPixelsError(pixels, limits["pixels"])
         check_scales(settings.scales, cameras, settings.coarsest_side)
         check_something_in_view(file.scene, cameras, source.near)
     with _errors_of("style"):
@@ -247,10 +238,7 @@ def _check_network_weights(backbone: str) -> None:
 def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
     width, height = image_size(path)
     if width * height > limits["image_pixels"]:
-        raise RefusedError(
-            "image-too-large",
-            f"{path.name}: has {width} x {height} pixels. At most {limits['image_pixels']:,} are allowed.",
-        )
+        raise ImageTooLargeError(path.name, width, height, limits["image_pixels"])
 
 
 def _check_frames_have_sizes(path: Path) -> None:
@@ -280,21 +268,23 @@ def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
         staged = Staged.of_json(request["staged"])
         work = WORK[request["work"]]
         return {"found": work(staged, JobParameters(**request["parameters"]), request["limits"], show)}
-    except (RefusedError, InvalidInputError) as error:
-        return _refusal(error.code, str(error), getattr(error, "role", None))
     except MemoryError as error:
-        return _refusal("inspection-limit", "Reading it takes more memory than allowed.", getattr(error, "role", None))
+        return _over_limit("Reading it takes more memory than allowed.", getattr(error, "role", None))
     except SgsstError as error:
         return _refusal(error.code, str(error), getattr(error, "role", None))
     except Exception as error:  # a crash of a reader is attributed to the file
         if "memory" in str(error).lower():
-            return _refusal("inspection-limit", "Reading it takes more memory than allowed.", None)
-        refusal = _refusal("invalid-input", "The files cannot be read.", getattr(error, "role", None))
+            return _over_limit("Reading it takes more memory than allowed.")
+        refusal = _refusal(InvalidInputError.code, "The files cannot be read.", getattr(error, "role", None))
         return {**refusal, "log": f"{type(error).__name__}: {error}"}
 
 
 def _refusal(code: str, message: str, role: str | None) -> dict[str, Any]:
     return {"error": {"code": code, "message": message.removeprefix(f"{role}/"), "input": role}}
+
+
+def _over_limit(message: str, role: str | None = None) -> dict[str, Any]:
+    return _refusal(InspectionLimitError.code, message, role)
 
 
 def _limit_resources(seconds: float, size: int) -> None:
@@ -329,7 +319,7 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
         _, status = os.waitpid(child, 0)
     # the child is dead, so it can no longer change the files that the response refers to
     if answer is None:
-        answer = {**_refusal("inspection-limit", _limit_text(request), None), "log": f"wait status {status}, no answer"}
+        answer = {**_over_limit(_limit_text(request)), "log": f"wait status {status}, no answer"}
     if answer.pop("compiled", False):
         _compile_kernels()
     if "log" in answer:
@@ -357,7 +347,7 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
             try:
                 uncompiled = _confine(request)
             except OSError as error:
-                refusal = _refusal("inspection-limit", "The files cannot be checked at the moment.", None)
+                refusal = _over_limit("The files cannot be checked at the moment.")
                 print(json.dumps({**refusal, "log": f"cannot be confined: {error}"}), file=file)
             else:
                 answer = _inspect(request, show)

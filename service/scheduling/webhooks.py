@@ -23,7 +23,7 @@ from functools import cached_property
 
 import httpx
 
-from service.errors import RefusedInputError
+from service.errors import InvalidWebhookError, WebhooksOffError
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.operations import Delivery
@@ -63,18 +63,15 @@ def check_url(url: str, settings: ServiceSettings) -> None:
     """Check that a URL may be used as a webhook; the addresses of its host are checked at each delivery.
 
     Raises:
-        RefusedInputError: If webhooks are off or the URL cannot be called.
+        WebhooksOffError: If the service sends no webhooks.
+        InvalidWebhookError: If the URL cannot be called.
     """
     if not settings.webhooks:
-        raise RefusedInputError("Webhooks are switched off on this service.", "webhooks-off", input="webhook")
+        raise WebhooksOffError
     try:
         parse_url(url)
     except ValueError as error:
-        raise RefusedInputError(
-            f"{url[:100]!r} cannot be called: {error}. Give a URL such as 'https://example.com/hook'.",
-            "invalid-webhook",
-            input="webhook",
-        ) from error
+        raise InvalidWebhookError(url, error) from error
 
 
 def parse_url(url: str) -> httpx.URL:

@@ -18,9 +18,9 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
-from service.errors import IdempotencyError
+from service.errors import DatabaseBusyError, IdempotencyError
 from service.store.clocks import Clock, ServerClock, expiry_time
-from service.store.outages import Gate, busy, impatient_connection, translated
+from service.store.outages import Gate, impatient_connection, translated
 from service.store.rollback import NEWEST_EVENT, Marker
 from service.store.tables import Base, CounterRow, IdempotencyRow
 
@@ -112,7 +112,7 @@ class Database:
             yield
             return
         if not self._turn.acquire(timeout=self._answer_seconds):
-            raise busy()
+            raise DatabaseBusyError
         try:
             yield
         finally:
@@ -271,7 +271,7 @@ def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, no
     session.execute(insert.on_conflict_do_nothing())
     row = session.get_one(IdempotencyRow, (owner, key), with_for_update=True)
     if row.fingerprint != fingerprint:
-        raise IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key.")
+        raise IdempotencyError
     return row
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import bindparam, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
-from service.errors import ConflictError, NotFoundError
+from service.errors import NotFoundError, NoUploadError, OffsetError, TooManyUploadsError
 from service.store.changes import release_blobs
 from service.store.database import Database, idempotency_row, new_id, upsert
 from service.store.quotas import IS_RECEIPT, NO_QUOTAS, RECEIPT, Quotas, check_bytes, lock_owner
@@ -37,7 +37,7 @@ _INSPECTION = select(Base.metadata.tables["inspections"].c.result).where(Inspect
 def check_offset(upload: UploadRow, offset: int) -> None:
     """Raise ConflictError if an upload's next byte is at a different offset."""
     if upload.offset != offset:
-        raise ConflictError(f"Upload-Offset is {offset}, but the next byte is {upload.offset}.", offset=upload.offset)
+        raise OffsetError(offset, upload.offset)
 
 
 class Inputs:
@@ -172,7 +172,7 @@ class Inputs:
                 if known is not None:
                     return known
             if _count_open_uploads(session, owner) >= most:
-                raise ConflictError(f"There are {most} unfinished uploads of this key. Finish or delete some.")
+                raise TooManyUploadsError(most)
             row = UploadRow(id=new_id("upl", now), owner=owner, length=length, offset=0, filename=filename)
             row.metadata_header, row.created_at, row.expires_at = header, now, now + seconds
             session.add(row)
@@ -191,7 +191,7 @@ class Inputs:
         with self._database.reading() as session:
             row = session.get(UploadRow, upload_id)
         if row is None or row.owner != owner or row.expires_at < self._database.clock():
-            raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+            raise NoUploadError(upload_id)
         return row
 
     def uploads(self, upload_ids: Sequence[str], owner: str) -> dict[str, UploadRow]:
@@ -223,7 +223,7 @@ class Inputs:
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None:
-                raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+                raise NoUploadError(upload_id)
             check_offset(row, start)
             if location is not None:
                 session.add(UploadPartRow(upload_id=upload_id, start=start, size=size, location=location))
@@ -246,7 +246,7 @@ class Inputs:
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None:
-                raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+                raise NoUploadError(upload_id)
             row.offset, row.sha256, row.expires_at = row.length, sha256, self._database.clock() + seconds
             session.execute(delete(UploadPartRow).where(UploadPartRow.upload_id == upload_id))
             use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
@@ -261,7 +261,7 @@ class Inputs:
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None or row.owner != owner:
-                raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+                raise NoUploadError(upload_id)
             session.delete(row)
             return release_blobs(session, f"upload:{upload_id}")
 
@@ -355,7 +355,7 @@ def _lock_upload(session: Session, upload_id: str) -> UploadRow:
     """Lock and return an upload's row; call this before locking rows of blobs, so that no deadlock occurs."""
     row = session.get(UploadRow, upload_id, with_for_update=True)
     if row is None:
-        raise NotFoundError(f"There is no upload {upload_id}, or it has expired.")
+        raise NoUploadError(upload_id)
     return row
 
 

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Float, Select, String, bindparam, func, inser
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service.errors import ConflictError, NotFoundError, QueueFullError
+from service.errors import CancelError, DeleteError, NoJobError, NotFoundError, QueueFullError, RetryError
 from service.store.changes import add_status_event, end, forget, holder_name, move
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import Point, points
@@ -143,7 +143,7 @@ class Jobs:
         """Return a job of this owner, or of any owner if None.
 
         Raises:
-            NotFoundError: If there is no such job or it belongs to another owner.
+            NoJobError: If there is no such job or it belongs to another owner.
         """
         with self._database.reading() as session:
             return _job_of_owner(session, job_id, owner)
@@ -152,12 +152,12 @@ class Jobs:
         """Return a job, its queue position, its attempts, and the name of its newest preview, all in one snapshot.
 
         Raises:
-            NotFoundError: If there is no such job or it belongs to another owner.
+            NoJobError: If there is no such job or it belongs to another owner.
         """
         with self._database.reading_rows() as connection:
             row = connection.execute(_JOB, {"job_id": job_id}).one_or_none()
             if row is None or (owner is not None and row.owner != owner):
-                raise NotFoundError(f"There is no job {job_id}.")
+                raise NoJobError(job_id)
             job = JobRow(**row._mapping)
             found = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if job.attempt else ()
             attempts = [AttemptRow(**each._mapping) for each in found]
@@ -192,13 +192,13 @@ class Jobs:
         A job that is already canceled is returned unchanged.
 
         Raises:
-            ConflictError: If the job has ended in another way.
+            CancelError: If the job has ended in another way.
         """
         now = self._database.clock()
         with self._database.writing() as session:
             job = _job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.CANCEL):
-                raise ConflictError(f"The job has {job.status} and cannot be canceled.", job_status=job.status)
+                raise CancelError(job.status)
             if job.status in ACTIONS[Transition.CANCEL]:
                 if next_status(job.status, Transition.CANCEL) in ENDED:
                     end(session, job, Transition.CANCEL, now, self._retention)
@@ -212,7 +212,7 @@ class Jobs:
         A retry counts toward the day's jobs.
 
         Raises:
-            ConflictError: If the job has another status.
+            RetryError: If the job has another status.
             QueueFullError: If the owner has `limit` unfinished jobs.
             QuotaError: If the job would exceed one of the owner's quotas.
         """
@@ -221,10 +221,7 @@ class Jobs:
             lock_owner(session, _job_of_owner(session, job_id, owner).owner)
             job = _job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.RETRY):
-                raise ConflictError(
-                    f"The job has status {job.status}; only failed or canceled jobs can be retried.",
-                    job_status=job.status,
-                )
+                raise RetryError(job.status)
             _check_queue(session, job.owner, limit)
             count_job(session, job.owner, quotas, now)
             check_bytes(session, job.owner, quotas)
@@ -237,7 +234,7 @@ class Jobs:
         """Change the display name of a job.
 
         Raises:
-            NotFoundError: If there is no such job or it belongs to another owner.
+            NoJobError: If there is no such job or it belongs to another owner.
         """
         with self._database.writing() as session:
             _job_of_owner(session, job_id, owner, lock=True).name = name
@@ -249,15 +246,12 @@ class Jobs:
             Locations of inputs that are no longer used, for `Blobs.remove`.
 
         Raises:
-            ConflictError: If the job has not ended.
+            DeleteError: If the job has not ended.
         """
         with self._database.writing() as session:
             job = _job_of_owner(session, job_id, owner, lock=True)
             if job.status not in ENDED:
-                first = "It ends in some seconds" if job.status == JobStatus.CANCELING else "Cancel it first"
-                raise ConflictError(
-                    f"The job has status {job.status}. {first}; delete it once it has ended.", job_status=job.status
-                )
+                raise DeleteError(job.status)
             return forget(session, job)
 
     def artifacts(self, job_id: str) -> list[ArtifactRow]:
@@ -334,16 +328,13 @@ def _row_of_new_job(new: NewJob, now: float) -> dict[str, Any]:
 def _check_queue(session: Session, owner: str, limit: int) -> None:
     """Raise QueueFullError if an owner has `limit` unfinished jobs."""
     if session.execute(_UNFINISHED_OF, {"owner": owner}).scalar_one() >= limit:
-        raise QueueFullError(
-            f"There are already {limit} unfinished jobs of this key. Wait for one to finish, or cancel one.",
-            limit=limit,
-        )
+        raise QueueFullError(limit)
 
 
 def _job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
     job = session.get(JobRow, job_id, with_for_update=lock, populate_existing=lock)
     if job is None or (owner is not None and job.owner != owner):
-        raise NotFoundError(f"There is no job {job_id}.")
+        raise NoJobError(job_id)
     return job
 
 

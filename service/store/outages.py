@@ -12,8 +12,6 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service.errors import DatabaseBusyError, DatabaseUnavailableError
 
-#: Time in seconds after which clients should retry.
-_RETRY_SECONDS = 5
 #: Time in seconds that a transaction waits for a probing transaction before it is rejected.
 _PROBE_SECONDS = 0.2
 #: Names of SQLite errors for a locked database and for an unusable file; all other errors are bugs of the service.
@@ -44,7 +42,7 @@ class Gate:
         """
         refusal = self._refusal
         if refusal is not None and not self._probe.acquire(timeout=_PROBE_SECONDS):
-            raise type(refusal)(str(refusal), **refusal.extra)
+            raise type(refusal)
         try:
             with translated():
                 yield
@@ -67,7 +65,7 @@ def translated() -> Iterator[None]:
     try:
         yield
     except PoolTimeoutError as error:
-        raise busy() from error
+        raise DatabaseBusyError from error
     except DBAPIError as error:
         found = _refusal(error)
         if found is None:
@@ -75,23 +73,16 @@ def translated() -> Iterator[None]:
         raise found from error
 
 
-def busy() -> DatabaseBusyError:
-    """Return the error for a wait for the database that took too long."""
-    return DatabaseBusyError("The service's database is busy. Try again later.", retry_after=_RETRY_SECONDS)
-
-
 def _refusal(error: DBAPIError) -> DatabaseUnavailableError | None:
     """Convert a driver's error to an exception for callers; return None if the error is a bug of the service."""
     sqlite: str | None = getattr(error.orig, "sqlite_errorname", None)
     sqlstate: str = getattr(error.orig, "sqlstate", None) or ""
     if (sqlite or "").startswith(_SQLITE_BUSY) or sqlstate.startswith(_POSTGRESQL_BUSY):
-        return busy()
+        return DatabaseBusyError()
     away = isinstance(error, OperationalError | InterfaceError) if sqlite is None else sqlite.startswith(_SQLITE_AWAY)
     if not away and not error.connection_invalidated:
         return None
-    return DatabaseUnavailableError(
-        "The service's database does not answer. Try again later.", retry_after=_RETRY_SECONDS
-    )
+    return DatabaseUnavailableError()
 
 
 def impatient_connection(seconds: float) -> Any:

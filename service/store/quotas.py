@@ -9,14 +9,12 @@ from typing import Any, Self
 from sqlalchemy import BindParameter, String, bindparam, func, or_, select, text, union
 from sqlalchemy.orm import Session
 
-from service.errors import QuotaError
+from service.errors import BytesQuotaError, QuotaError
 from service.settings import ServiceSettings
 from service.store.database import Database, upsert
 from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, UploadRow, UsageRow
 
 _DAY = 86_400
-#: Retry delay of an exceeded storage quota in seconds: by then data may have been deleted or expired.
-_BYTES_AGAIN = 3600
 
 _USAGE = Base.metadata.tables[UsageRow.__tablename__]
 #: Prefix of the ids of receipts, and the SQL condition for receipts. A receipt charges a key for the bytes of one
@@ -116,16 +114,16 @@ def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
     if quotas.jobs_a_day is not None and jobs > quotas.jobs_a_day:
         raise QuotaError(
             f"This key may submit {quotas.jobs_a_day:,} jobs a day, and has done so. Try again tomorrow (UTC).",
-            quota="jobs-a-day",
-            limit=quotas.jobs_a_day,
+            "jobs-a-day",
+            quotas.jobs_a_day,
             retry_after=tomorrow,
         )
     if quotas.gpu_seconds_a_day is not None and seconds >= quotas.gpu_seconds_a_day:
         raise QuotaError(
             f"This key may use {quotas.gpu_seconds_a_day:,.0f} GPU seconds a day, and has used them. "
             "Try again tomorrow (UTC).",
-            quota="gpu-seconds-a-day",
-            limit=quotas.gpu_seconds_a_day,
+            "gpu-seconds-a-day",
+            quotas.gpu_seconds_a_day,
             retry_after=tomorrow,
         )
 
@@ -145,13 +143,7 @@ def check_bytes(session: Session, owner: str, quotas: Quotas) -> None:
     """
     limit = quotas.stored_bytes
     if limit is not None and (used := stored_bytes(session, owner)) > limit:
-        raise QuotaError(
-            f"With this, {used:,} bytes would be kept for this key. At most {limit:,} are allowed. "
-            "Delete jobs or uploads first.",
-            quota="stored-bytes",
-            limit=limit,
-            retry_after=_BYTES_AGAIN,
-        )
+        raise BytesQuotaError(used, limit)
 
 
 def stored_bytes(session: Session, owner: str) -> int:

@@ -14,12 +14,12 @@ from fastapi.responses import StreamingResponse
 from api.http.context import CallerDep, Context, ContextDep
 from api.http.documentation import Responses, invalid, links, problems
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import JOB_ID, SHA256, ArtifactList, artifact_view
+from api.http.schemas import ArtifactList, artifact_view
 from api.http.sending import (
-    JUST_REMOVED,
-    NO_SUCH_RANGE,
     IfNoneMatch,
     IfRange,
+    JustRemovedError,
+    RangeError,
     RangeHeader,
     SentFile,
     file_answers,
@@ -28,15 +28,18 @@ from api.http.sending import (
 from service.errors import (
     BusyError,
     DamagedFileError,
+    InspectionLimitError,
     LostFileError,
+    NoArtifactError,
+    NoJobError,
     NoSpaceError,
-    NotFoundError,
     RefusedInputError,
     StoreError,
 )
 from service.files.artifacts import media_type
 from service.files.names import RESULT
 from service.store.tables import ArtifactRow, JobRow
+from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import EXTRA_FORMATS, RESULT_FORMATS, ResultName, by_name, listed, result_name
 from sgsst_core.files.formats.ply import PLY
 
@@ -49,9 +52,6 @@ _SANDBOX = (
 )
 
 
-_NO_JOB = NotFoundError(f"There is no job {JOB_ID}.")
-
-
 @router.get(
     "/{job_id}/artifacts",
     response_model=ArtifactList,
@@ -61,7 +61,7 @@ _NO_JOB = NotFoundError(f"There is no job {JOB_ID}.")
                 "get_artifact", "head_artifact", job_id="$request.path.job_id", name="$response.body#/artifacts/0/name"
             )
         },
-        **problems(_NO_JOB),
+        **problems(NoJobError),
     },
     operation_id="list_artifacts",
 )
@@ -84,19 +84,19 @@ _CONTENT = {
 _ANSWERS: Responses = {
     **file_answers(_CONTENT),
     **problems(
-        NotFoundError(f"Job {JOB_ID} has no file 'stylized.ply' (yet). Its artifacts list has all there are."),
-        NO_SUCH_RANGE,
+        NoArtifactError,
+        RangeError,
         invalid("query.format", f"Input should be {listed([repr(each.name) for each in RESULT_FORMATS])}"),
         RefusedInputError(
             "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",
-            "invalid-output",
+            OutputError.code,
         ),
-        RefusedInputError("Packing the result takes more time or memory than allowed.", "inspection-limit"),
-        BusyError("Files cannot be checked at the moment. Try again later.", retry_after=10),
-        NoSpaceError("The service's disk is too full to take this in. Try again later."),
-        StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
-        LostFileError.of(SHA256),
-        DamagedFileError.of(SHA256),
+        InspectionLimitError("Packing the result takes more time or memory than allowed."),
+        BusyError,
+        NoSpaceError,
+        StoreError,
+        LostFileError,
+        DamagedFileError,
     ),
 }
 
@@ -156,7 +156,7 @@ async def _find_artifact(context: Context, job: JobRow, name: str, form: ResultN
         return await context.compressor.compressed(job, by_name(form))
     row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
     if row is None:
-        raise NotFoundError(f"Job {job.id} has no file {name[:80]!r} (yet). Its artifacts list has all there are.")
+        raise NoArtifactError(job.id, name[:80])
     return row
 
 
@@ -165,14 +165,14 @@ def _check(context: Context, row: ArtifactRow) -> None:
 
     Raises:
         LostFileError, DamagedFileError: If the file is missing or damaged.
-        NotFoundError: If the file has just been replaced by another one, or its job has been deleted.
+        JustRemovedError: If the file has just been replaced by another one, or its job has been deleted.
     """
     try:
         context.artifacts.check(row.location, row.sha256)
     except LostFileError:
         now = context.store.jobs.artifact(row.job_id, row.name)
         if now is None or now.location != row.location:
-            raise JUST_REMOVED from None
+            raise JustRemovedError from None
         raise
 
 

@@ -13,8 +13,8 @@ from api.http.context import CallerDep, ContextDep
 from api.http.documentation import headers, invalid, problems
 from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import JOB_ID, SHA256
-from service.errors import NotFoundError
+from service.errors import NoJobError
+from service.examples import SHA256
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -64,7 +64,7 @@ _EXAMPLES = {
         },
         204: {"description": "The job has ended, and `Last-Event-ID` was its last event: do not come back."},
         **problems(
-            NotFoundError(f"There is no job {JOB_ID}."),
+            NoJobError,
             invalid("header.Last-Event-ID", "Input should be greater than or equal to 0"),
         ),
     },

@@ -14,18 +14,19 @@ from fastapi.responses import StreamingResponse
 from api.http.context import Caller, CallerDep, Context, ContextDep
 from api.http.documentation import Responses, links, problems
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import JOB_ID, SHA256, InputList, input_views
+from api.http.schemas import InputList, input_views
 from api.http.sending import (
-    JUST_REMOVED,
-    NO_SUCH_RANGE,
     IfNoneMatch,
     IfRange,
+    JustRemovedError,
+    RangeError,
     RangeHeader,
     SentFile,
     file_answers,
     send_file,
 )
-from service.errors import DamagedFileError, LostFileError, NotFoundError, StoreError
+from service.errors import DamagedFileError, LostFileError, NoJobError, NotFoundError, StoreError
+from service.examples import JOB_ID
 from service.files.blobs import BLOBS
 from service.store.states import JobStatus
 from service.store.tables import BlobRow
@@ -43,7 +44,16 @@ _KINDS = {
 #: Content-Security-Policy of inputs. Users provide these files, so no script in them may run.
 _POLICY = "sandbox; default-src 'none'"
 
-_NO_JOB = NotFoundError(f"There is no job {JOB_ID}.")
+
+class NoInputError(NotFoundError):
+    """An input that a job does not have, or has released when it expired."""
+
+    example = (JOB_ID, "style:1")
+
+    def __init__(self, job_id: str, role: str) -> None:
+        super().__init__(f"Job {job_id} has no input {role!r} (any more). Its list of inputs has all there are.")
+
+
 _CONTENT: dict[str, Any] = {
     "application/octet-stream": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
     "application/json": [{"id": 0, "img_name": "view_0", "width": 64, "height": 48}],
@@ -54,11 +64,11 @@ _CONTENT: dict[str, Any] = {
 _ANSWERS: Responses = {
     **file_answers(_CONTENT, always_policy=True),
     **problems(
-        NotFoundError(f"Job {JOB_ID} has no input 'style:1' (any more). Its list of inputs has all there are."),
-        NO_SUCH_RANGE,
-        StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
-        LostFileError.of(SHA256),
-        DamagedFileError.of(SHA256),
+        NoInputError,
+        RangeError,
+        StoreError,
+        LostFileError,
+        DamagedFileError,
     ),
 }
 
@@ -72,7 +82,7 @@ _ANSWERS: Responses = {
                 "get_input", "head_input", job_id="$request.path.job_id", role="$response.body#/inputs/0/role"
             )
         },
-        **problems(_NO_JOB),
+        **problems(NoJobError),
     },
     operation_id="list_inputs",
 )
@@ -120,13 +130,13 @@ def _check(context: Context, row: BlobRow) -> None:
 
     Raises:
         LostFileError, DamagedFileError: If the file is missing or damaged.
-        NotFoundError: If the file has just been deleted with its job.
+        JustRemovedError: If the file has just been deleted with its job.
     """
     try:
         context.blobs.objects.check_once(f"{BLOBS}/{row.location}", row.sha256)
     except LostFileError:
         if not context.store.inputs.blobs([row.sha256]):
-            raise JUST_REMOVED from None
+            raise JustRemovedError from None
         raise
 
 
@@ -134,7 +144,7 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
     """Return the job's entry for an input file, and the database row of its blob.
 
     Raises:
-        NotFoundError: If the job has no such input, or has expired and released its inputs.
+        NoInputError: If the job has no such input, or has expired and released its inputs.
     """
     job = find(context, caller, job_id)
     match = re.fullmatch(r"([a-z]{1,10})(?::(\d{1,6}))?", role, re.ASCII)
@@ -145,4 +155,4 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
         row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
         if row is not None:
             return entry, row
-    raise NotFoundError(f"Job {job.id} has no input {role[:40]!r} (any more). Its list of inputs has all there are.")
+    raise NoInputError(job.id, role[:40])

@@ -15,11 +15,13 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.multipart import (
-    BadRequestError,
-    MediaTypeError,
+    BodyTypeError,
+    NotUtf8Error,
     Received,
     TooSlowError,
     check_file,
+    check_media_type,
+    media_type,
     parse_json,
     read_json,
     receive,
@@ -28,7 +30,6 @@ from api.http.numbers import Digits
 from api.http.planning import DRY_RUN, answer_plan
 from api.http.receipts import Receipt
 from api.http.schemas import (
-    JOB_ID,
     MOST_POINTS,
     JobChange,
     JobDetail,
@@ -44,14 +45,19 @@ from api.http.schemas import (
 from api.http.sending import IfNoneMatch, names_etag
 from api.http.submission import BODY, REFUSALS, JobFromUploads
 from service.errors import (
-    ConflictError,
+    CancelError,
     DamagedWeightsError,
-    NotFoundError,
+    DeleteError,
+    NoJobError,
     QueueFullError,
     QuotaError,
     RefusedInputError,
+    RetryError,
     TooLargeError,
+    UnfinishedUploadError,
+    UnknownUploadError,
 )
+from service.examples import JOB_ID
 from service.files.staging import check_roles, clean_name, default_job_name, region_styles
 from service.inspection.inspector import Show
 from service.parameters import JobParameters, stored_parameters
@@ -81,7 +87,6 @@ IdempotencyHeader = Annotated[
 JobId = Annotated[str, Path(description="Of a job.", examples=[JOB_ID])]
 #: Headers of a response that shows a job.
 _SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
-_NOT_THERE = NotFoundError(f"There is no job {JOB_ID}.")
 #: Operations that a client may call next on a job.
 _FOLLOWING_OPERATIONS = (
     "get_job",
@@ -124,8 +129,8 @@ async def create_job(
     """Queue a job. All files are read and checked before the answer; unusable ones are refused with 422."""
     async with AsyncExitStack() as stack:
         receipt = await stack.enter_async_context(context.receipts.of(caller.owner, caller.quotas))
-        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-        reading = _from_json(request, context) if kind == "application/json" else _from_form(request, context, receipt)
+        is_json = media_type(request) == "application/json"
+        reading = _from_json(request, context) if is_json else _from_form(request, context, receipt)
         wanted = await context.threads.run(caller.owner, _find_files, context, caller, await reading)
         if not wanted.checked:
             await context.inspector.inspect("validate", caller.owner, wanted.inputs, wanted.rows, wanted.parameters)
@@ -240,12 +245,7 @@ def _resolve_inputs(
     for _, role, upload_id in received.uploads:
         upload = uploads.get(upload_id)
         if upload is None:
-            raise RefusedInputError(
-                f"{upload_id[:60]!r} is not the ID of a usable upload, and {role!r} has no file name. Send an upload's "
-                "ID, or a file with its name.",
-                "unknown-upload",
-                input=role,
-            )
+            raise UnknownUploadError(upload_id, role)
         digests.append(_upload_digest(context, upload, role))
     rows = context.store.inputs.hold(sorted({*digests, *(entry["sha256"] for entry in inputs)}))
     for number, ((place, role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
@@ -261,11 +261,7 @@ def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
     if sha256 is None and upload.offset == upload.length:  # the service died before it recorded the upload as complete
         sha256 = context.blobs.finish_upload(upload, context.settings.upload_hours * 3600)
     if sha256 is None:
-        raise RefusedInputError(
-            f"Upload {upload.id} has {upload.offset:,} of {upload.length:,} bytes. Finish it first.",
-            "unfinished-upload",
-            input=role,
-        )
+        raise UnfinishedUploadError(upload.id, upload.offset, upload.length, role)
     return sha256
 
 
@@ -316,7 +312,7 @@ def list_jobs(
     responses={
         200: {"headers": _SHOWN, "links": links(*_FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
         304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
-        **problems(_NOT_THERE),
+        **problems(NoJobError),
     },
     operation_id="get_job",
 )
@@ -343,22 +339,19 @@ def get_job(
     responses={
         200: {"headers": _SHOWN, "links": links(*_FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
         **problems(
-            _NOT_THERE,
+            NoJobError,
             invalid("name", "String should have at most 200 characters"),
-            MediaTypeError("The body must be application/json."),
-            TooLargeError(
-                "The request has more than 4,096 bytes. JSON only names uploads, or a key.", limit=_MAX_CHANGE
-            ),
-            BadRequestError("The body is not UTF-8."),
-            TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
+            BodyTypeError("application/json"),
+            TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", _MAX_CHANGE),
+            NotUtf8Error,
+            TooSlowError,
         ),
     },
     operation_id="change_job",
 )
 async def change_job(request: Request, job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Rename a job, whatever its status."""
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise MediaTypeError("The body must be application/json.")
+    check_media_type(request, "application/json")
     change = JobChange.model_validate(await read_json(request, context.settings, _MAX_CHANGE))
     return await asyncio.to_thread(_rename, context, caller, job_id, change.name)
 
@@ -372,7 +365,7 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Respons
 @router.get(
     "/{job_id}/progress",
     response_model=ProgressHistory,
-    responses=problems(_NOT_THERE),
+    responses=problems(NoJobError),
     operation_id="get_progress",
 )
 def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
@@ -388,7 +381,7 @@ def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> Progr
             "headers": _SHOWN,
             "links": links("get_job", "retry_job", "delete_job", "watch_job", job_id="$response.body#/id"),
         },
-        **problems(_NOT_THERE, ConflictError("The job has succeeded and cannot be canceled.", job_status="succeeded")),
+        **problems(NoJobError, CancelError),
     },
     operation_id="cancel_job",
 )
@@ -410,26 +403,16 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
             "links": links("get_job", "cancel_job", "list_artifacts", job_id="$response.body#/id"),
         },
         **problems(
-            _NOT_THERE,
-            ConflictError(
-                "The job has status running; only failed or canceled jobs can be retried.",
-                job_status="running",
-            ),
-            QueueFullError(
-                "There are already 100 unfinished jobs of this key. Wait for one to finish, or cancel one.", limit=100
-            ),
-            QuotaError(
-                "This key may submit 1,000 jobs a day, and has done so. Try again tomorrow (UTC).",
-                quota="jobs-a-day",
-                limit=1000,
-                retry_after=30_000,
-            ),
+            NoJobError,
+            RetryError,
+            QueueFullError,
+            QuotaError,
             RefusedInputError(
                 "Setting sharpness = 3: Extra inputs are not permitted. The job was stored by an earlier version "
                 "that accepted this. Submit a new job without it.",
                 "invalid-settings",
             ),
-            DamagedWeightsError(),
+            DamagedWeightsError,
         ),
     },
     operation_id="retry_job",
@@ -447,12 +430,7 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
     status_code=204,
     responses={
         204: {"description": "It is gone, with its results."},
-        **problems(
-            _NOT_THERE,
-            ConflictError(
-                "The job has status running. Cancel it first; delete it once it has ended.", job_status="running"
-            ),
-        ),
+        **problems(NoJobError, DeleteError),
     },
     operation_id="delete_job",
 )
@@ -468,16 +446,16 @@ def find(context: Context, caller: Caller, job_id: str) -> JobRow:
     """Return the caller's job with this id.
 
     Raises:
-        NotFoundError: If there is no such job, or it belongs to another caller.
+        NoJobError: If there is no such job, or it belongs to another caller.
     """
     check_id(job_id)
     return context.store.jobs.get(job_id, caller.owner)
 
 
 def check_id(job_id: str) -> None:
-    """Raise NotFoundError if a text cannot be a job's id."""
+    """Raise NoJobError if a text cannot be a job's id."""
     if not is_id(job_id):
-        raise NotFoundError(f"There is no job {job_id[:60]}.")
+        raise NoJobError(job_id[:60])
 
 
 def _job_response(

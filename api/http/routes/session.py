@@ -11,11 +11,11 @@ from api.http.context import (
     Context,
     ContextDep,
     CrossOriginError,
-    NoKeyError,
+    UnknownKeyError,
     check_origin,
 )
 from api.http.documentation import headers, invalid, problems
-from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError, read_json
+from api.http.multipart import BodyTypeError, NotUtf8Error, TooSlowError, check_media_type, read_json
 from api.http.schemas import SessionView, SignIn
 from api.http.sign_ins import TooManyTriesError
 from service.errors import TooLargeError
@@ -24,7 +24,6 @@ router = APIRouter(prefix="/v1/session", tags=["session"])
 
 #: Maximum bytes of a body, which holds only a key.
 _MAX_BODY = 4096
-_ELSEWHERE = CrossOriginError("Pages of 'https://example.com' may not use the sessions of this service.")
 
 
 @router.post(
@@ -41,14 +40,14 @@ _ELSEWHERE = CrossOriginError("Pages of 'https://example.com' may not use the se
     responses={
         204: {"description": "The cookie is the session.", "headers": headers("Set-Cookie", "Cache-Control")},
         **problems(
-            NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one."),
-            _ELSEWHERE,
-            TooManyTriesError("Too many invalid keys came from this address. Try again later."),
+            UnknownKeyError,
+            CrossOriginError,
+            TooManyTriesError,
             invalid("key", "Field required"),
-            MediaTypeError("The body must be application/json."),
-            TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", limit=_MAX_BODY),
-            BadRequestError("The body is not UTF-8."),
-            TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
+            BodyTypeError("application/json"),
+            TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", _MAX_BODY),
+            NotUtf8Error,
+            TooSlowError,
             key=False,
         ),
     },
@@ -60,15 +59,14 @@ async def sign_in(request: Request, context: ContextDep) -> Response:
     (`SGSST_SESSION_DAYS`), with `DELETE`, or when its key is revoked.
     """
     check_origin(request, required=False)
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise MediaTypeError("The body must be application/json.")
+    check_media_type(request, "application/json")
     wanted = SignIn.model_validate(await read_json(request, context.settings, _MAX_BODY))
     address = request.client.host if request.client else ""
     context.sign_ins.check(address)
     key = await asyncio.to_thread(context.store.keys.find, wanted.key)
     if key is None:
         context.sign_ins.failed(address)
-        raise NoKeyError("The API key is unknown or was revoked. `sgsst keys create NAME` makes one.")
+        raise UnknownKeyError
     context.sign_ins.succeeded(address)
     await _end(request, context)
     text = await asyncio.to_thread(context.store.sessions.create, key.id)
@@ -91,7 +89,7 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     operation_id="sign_out",
     responses={
         204: {"description": "The session is over.", "headers": headers("Set-Cookie", "Cache-Control")},
-        **problems(_ELSEWHERE, key=False),
+        **problems(CrossOriginError, key=False),
     },
 )
 async def sign_out(request: Request, context: ContextDep) -> Response:

@@ -6,35 +6,41 @@ import asyncio
 import base64
 from datetime import UTC, datetime
 from email.utils import format_datetime
+from types import MappingProxyType
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Request, Response
 
 from api.http.context import CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
-from api.http.multipart import BadRequestError, MediaTypeError, TooSlowError, body_blocks
+from api.http.multipart import BadRequestError, BodyTypeError, TooSlowError, body_blocks, check_media_type
 from api.http.numbers import Digits
-from api.http.receiving import ALGORITHMS, ChecksumError, append_body, parse_checksum
+from api.http.receiving import ALGORITHMS, ChecksumError, LongerThanDeclaredError, append_body, parse_checksum
 from api.http.routes.jobs import IdempotencyHeader
-from api.http.schemas import UPLOAD_ID, UploadView, upload_view
+from api.http.schemas import UploadView, upload_view
 from service.errors import (
+    BytesQuotaError,
     ConflictError,
+    FileTooLargeError,
     IdempotencyError,
     LockedError,
     NoSpaceError,
-    NotFoundError,
-    QuotaError,
+    NoUploadError,
+    OffsetError,
     ServiceError,
     StoreError,
-    TooLargeError,
+    TooManyUploadsError,
 )
+from service.examples import UPLOAD_ID
 from service.files.staging import clean_name
-from service.store.inputs import MAX_OPEN_UPLOADS, check_offset
+from service.store.inputs import check_offset
 from service.store.tables import UploadRow
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
 VERSION = "1.0.0"
+#: Media type of a part of a file.
+_PART_TYPE = "application/offset+octet-stream"
 _HEADERS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 
 
@@ -42,6 +48,18 @@ class WrongVersionError(ServiceError):
     """An unsupported version of the tus protocol."""
 
     code, status = "unsupported-tus-version", 412
+    headers = MappingProxyType({"Tus-Version": VERSION})
+    example = ("0.2.2",)
+
+    def __init__(self, version: str) -> None:
+        wrong = f"{version[:20]!r} is not supported" if version else "is missing"
+        super().__init__(f"Tus-Resumable: {wrong}. Send {VERSION}.")
+
+
+class EmptyFileError(BadRequestError):
+    """An upload of a file without content."""
+
+    message = "The file is empty. Give its size as Upload-Length."
 
 
 UploadId = Annotated[str, Path(description="Of an upload.", examples=[UPLOAD_ID])]
@@ -61,8 +79,6 @@ OffsetHeader = Annotated[
     Digits, Header(alias="Upload-Offset", ge=0, lt=2**60, description="Where these bytes begin.", examples=[16384])
 ]
 
-_NOT_THERE = NotFoundError(f"There is no upload {UPLOAD_ID}, or it has expired.")
-
 
 def check_version(tus: Tus = "") -> None:
     """Refuse a request that does not state the protocol version. tus requires it for all methods except OPTIONS.
@@ -71,12 +87,7 @@ def check_version(tus: Tus = "") -> None:
         WrongVersionError: If the version is missing or not supported.
     """
     if tus != VERSION:
-        raise _wrong_version(tus)
-
-
-def _wrong_version(version: str) -> WrongVersionError:
-    wrong = f"{version[:20]!r} is not supported" if version else "is missing"
-    return WrongVersionError(f"Tus-Resumable: {wrong}. Send {VERSION}.", headers={"Tus-Version": VERSION})
+        raise WrongVersionError(tus)
 
 
 _SPEAKS_TUS = [Depends(check_version)]
@@ -127,23 +138,14 @@ def describe_uploads(context: ContextDep) -> Response:
             "links": _following_operations(upload_id="$response.body#/id"),
         },
         **problems(
-            BadRequestError("The file is empty. Give its size as Upload-Length."),
-            ConflictError(f"There are {MAX_OPEN_UPLOADS} unfinished uploads of this key. Finish or delete some."),
-            _wrong_version("0.2.2"),
-            TooLargeError(
-                "The file has 20,000,000,000 bytes. At most 16,000,000,000 are allowed.", limit=16_000_000_000
-            ),
+            EmptyFileError,
+            TooManyUploadsError,
+            WrongVersionError,
+            FileTooLargeError,
             invalid("header.Upload-Length", "Field required"),
-            IdempotencyError("This Idempotency-Key was used for another request. Give each request its own key."),
-            QuotaError(
-                "With this, 120,000,000,000 bytes would be kept for this key. At most 100,000,000,000 are allowed. "
-                "Delete jobs or "
-                "uploads first.",
-                quota="stored-bytes",
-                limit=100_000_000_000,
-                retry_after=3600,
-            ),
-            NoSpaceError("The service's disk is too full to take this in. Try again later."),
+            IdempotencyError,
+            BytesQuotaError,
+            NoSpaceError,
         ),
     },
 )
@@ -165,9 +167,9 @@ def create_upload(
     """Start an upload. Send its bytes with PATCH to the `Location` of the answer."""
     limit = context.settings.max_upload_bytes
     if length > limit:
-        raise TooLargeError(f"The file has {length:,} bytes. At most {limit:,} are allowed.", limit=limit)
+        raise FileTooLargeError(length, limit)
     if not length:
-        raise BadRequestError("The file is empty. Give its size as Upload-Length.")
+        raise EmptyFileError
     context.blobs.ensure_room(length)
     name = clean_name("photos", _file_name(metadata), 0)[-200:]
     seconds = context.settings.upload_hours * 3600
@@ -180,7 +182,7 @@ def create_upload(
     return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")
 
 
-@router.get("/{upload_id}", response_model=UploadView, responses=problems(_NOT_THERE), operation_id="get_upload")
+@router.get("/{upload_id}", response_model=UploadView, responses=problems(NoUploadError), operation_id="get_upload")
 def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> UploadView:
     """Get the state of an upload as JSON."""
     return upload_view(_find_upload(context, caller.owner, upload_id))
@@ -201,7 +203,7 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
                 maybe=("Upload-Metadata",),
             ),
         },
-        **problems(_NOT_THERE, _wrong_version("")),
+        **problems(NoUploadError, WrongVersionError("")),
     },
     operation_id="head_upload",
     response_class=Response,
@@ -224,7 +226,7 @@ _PATCH_BODY = {
     "requestBody": {
         "required": True,
         "content": {
-            "application/offset+octet-stream": {
+            _PART_TYPE: {
                 "schema": {"type": "string", "format": "binary"},
                 "example": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
             }
@@ -243,18 +245,18 @@ _PATCH_BODY = {
             "headers": headers("Upload-Offset", "Upload-Expires", "Tus-Resumable", "Cache-Control"),
         },
         **problems(
-            BadRequestError("The request was cut off."),
-            _NOT_THERE,
-            TooSlowError("Nothing has come for 60 s, or less than 1000 bytes per second."),
-            ConflictError("Upload-Offset is 0, but the next byte is 16384.", offset=16384),
-            _wrong_version("0.2.2"),
-            TooLargeError("More bytes come than the 42,301 of Upload-Length.", limit=42_301),
-            MediaTypeError("The Content-Type must be application/offset+octet-stream."),
+            BadRequestError,
+            NoUploadError,
+            TooSlowError,
+            OffsetError,
+            WrongVersionError,
+            LongerThanDeclaredError,
+            BodyTypeError(_PART_TYPE),
             invalid("header.Upload-Offset", "Field required"),
-            LockedError(),
-            ChecksumError("The part's digest is not that of Upload-Checksum; it was thrown away. Send it again."),
-            NoSpaceError("The service's disk is too full to take this in. Try again later."),
-            StoreError("The service's store of files does not answer. Try again later.", retry_after=10),
+            LockedError,
+            ChecksumError,
+            NoSpaceError,
+            StoreError,
         ),
     },
     operation_id="append_upload",
@@ -277,8 +279,7 @@ async def append_upload(
     ] = None,
 ) -> Response:
     """Send the next part. If the connection breaks, received bytes are kept unless a checksum was announced."""
-    if request.headers.get("content-type", "").lower() != "application/offset+octet-stream":
-        raise MediaTypeError("The Content-Type must be application/offset+octet-stream.")
+    check_media_type(request, _PART_TYPE)
     wanted = parse_checksum(checksum) if checksum else None
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     if row.sha256 is not None and offset != row.length:
@@ -291,7 +292,7 @@ async def append_upload(
         expires = await append_body(request, context, row, wanted)
     else:
         async for _ in body_blocks(request, context.settings):
-            raise TooLargeError(f"More bytes come than the {row.length:,} of Upload-Length.", limit=row.length)
+            raise LongerThanDeclaredError(row.length)
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     return Response(
         status_code=204,
@@ -305,7 +306,7 @@ async def append_upload(
     dependencies=_SPEAKS_TUS,
     responses={
         204: {"description": "It is gone.", "headers": headers("Tus-Resumable", "Cache-Control")},
-        **problems(_NOT_THERE, _wrong_version("")),
+        **problems(NoUploadError, WrongVersionError("")),
     },
     operation_id="delete_upload",
 )
@@ -320,7 +321,7 @@ def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -
 
 def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
     if not is_id(upload_id):
-        raise NotFoundError(f"There is no upload {upload_id[:60]}.")
+        raise NoUploadError(upload_id[:60])
     return context.store.inputs.upload(upload_id, owner)
 
 

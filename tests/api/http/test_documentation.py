@@ -11,6 +11,7 @@ from openapi_spec_validator import validate
 
 from api.http.app import create_app
 from api.http.problems import MEDIA_TYPE
+from service.errors import LeaseLostError, ServiceError
 from service.settings import ServiceSettings
 
 DOCUMENT: dict[str, Any] = create_app(ServiceSettings()).openapi()
@@ -93,3 +94,22 @@ def test_every_refusal_has_its_codes(label: str, operation: dict[str, Any]) -> N
         assert codes
         assert list(shown) == codes
         assert all(value["code"] == code and value["status"] == status for code, value in shown.items())
+
+
+def subclasses(kind: type[ServiceError]) -> Iterator[type[ServiceError]]:
+    for each in kind.__subclasses__():
+        yield each
+        yield from subclasses(each)
+
+
+def test_document_lists_every_error_code() -> None:
+    """Errors of the service that reach a client are documented by at least one operation."""
+    documented = {
+        code
+        for _, operation in OPERATIONS
+        for answer in operation["responses"].values()
+        if MEDIA_TYPE in answer.get("content", {})
+        for code in answer["content"][MEDIA_TYPE]["schema"]["allOf"][1]["properties"]["code"]["enum"]
+    }
+    internal = {LeaseLostError.code}
+    assert {kind.code for kind in subclasses(ServiceError)} - internal <= documented

@@ -38,7 +38,7 @@ def test_a_rate_is_kept_on_average() -> None:
         rates.take("alice", 2.0)
     with pytest.raises(RateLimitError) as caught:
         rates.take("alice", 2.0)
-    assert caught.value.extra == {"limit": 2.0, "retry_after": 1}
+    assert (caught.value.extra, caught.value.retry_after) == ({"limit": 2.0}, 1)
     rates.take("bob", 2.0)
     clock.now += 0.4
     with pytest.raises(RateLimitError):
@@ -57,7 +57,7 @@ def test_who_comes_back_when_told_is_let_in(a_second: float) -> None:
         try:
             rates.take("alice", a_second)
         except RateLimitError as error:
-            clock.now += float(str(error.extra["retry_after"]))
+            clock.now += error.retry_after or 0
             rates.take("alice", a_second)
 
 

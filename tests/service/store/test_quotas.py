@@ -22,10 +22,10 @@ def submit(store: Store, quotas: Quotas, owner: str = "local") -> str:
     return store.jobs.create(new_job(owner), limit=100, quotas=quotas)[0].id
 
 
-def refusal(store: Store, quotas: Quotas, owner: str = "local") -> dict[str, object]:
+def refusal(store: Store, quotas: Quotas, owner: str = "local") -> QuotaError:
     with pytest.raises(QuotaError) as caught:
         submit(store, quotas, owner)
-    return caught.value.extra
+    return caught.value
 
 
 def test_daily_jobs_are_limited(store: Store, clock: Clock) -> None:
@@ -33,11 +33,12 @@ def test_daily_jobs_are_limited(store: Store, clock: Clock) -> None:
     quotas = Quotas(jobs_a_day=2)
     first = submit(store, quotas)
     submit(store, quotas)
-    assert refusal(store, quotas) == {"quota": "jobs-a-day", "limit": 2, "retry_after": 6400}
+    error = refusal(store, quotas)
+    assert (error.extra, error.retry_after) == ({"quota": "jobs-a-day", "limit": 2}, 6400)
     assert len(store.jobs.page("local")) == store.usage.of("local").jobs == 2, "nothing of it stays"
     submit(store, quotas, "other")
     store.jobs.cancel(first, "local")
-    assert refusal(store, quotas)["quota"] == "jobs-a-day", "it was one of today's"
+    assert refusal(store, quotas).extra["quota"] == "jobs-a-day", "it was one of today's"
     clock.now += 6400
     submit(store, quotas)
 
@@ -54,7 +55,7 @@ def test_gpu_seconds_count_held_gpus(store: Store, clock: Clock) -> None:
     clock.now += 15
     store.leases.succeed(held, [], {})
     assert store.usage.of("local").gpu_seconds == 110
-    assert refusal(store, quotas)["quota"] == "gpu-seconds-a-day"
+    assert refusal(store, quotas).extra["quota"] == "gpu-seconds-a-day"
     assert lease(store).job.owner == "local", "what was accepted runs"
     clock.now += DAY
     submit(store, quotas)
@@ -92,12 +93,12 @@ def test_stored_bytes_count_uploads_inputs_and_results(store: Store, clock: Cloc
     with pytest.raises(QuotaError) as caught:
         store.inputs.create_upload("local", 3, "x", "", 1000, quotas=quotas)
     assert caught.value.extra["quota"] == "stored-bytes"
-    assert caught.value.extra["retry_after"]
+    assert caught.value.retry_after
     assert store.usage.of("local").stored_bytes == 8
     held = lease(store)
     store.leases.succeed(held, [Published("stylized.ply", "x/1", 4, SHA)], {})
     assert store.usage.of("local").stored_bytes == 12
-    assert refusal(store, quotas)["quota"] == "stored-bytes"
+    assert refusal(store, quotas).extra["quota"] == "stored-bytes"
     assert held.job_id == job_id
     store.jobs.delete(job_id, "local")
     submit(store, quotas)
