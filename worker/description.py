@@ -49,7 +49,8 @@ def _describe_scene(job: Job) -> str:
     notes = f", {job.scene_file.dropped:,} invalid ones dropped" if job.scene_file.dropped else ""
     if job.scene_file.clamped:
         notes += f", {job.scene_file.clamped:,} infinite opacities read as almost 0 or 1"
-    return f"{len(scene):,} Gaussians{notes}, SH degree {scene.sh_degree}"
+    more = "".join(f"; {note}" for note in job.scene_file.notes)
+    return f"{len(scene):,} Gaussians{notes}, SH degree {scene.sh_degree}{more}"
 
 
 def _describe_views(job: Job) -> str:

@@ -171,11 +171,13 @@ class Converted:
 
     Attributes:
         count: Number of Gaussians.
+        notes: Notes on what of the scene was not read, or read in another way than stored.
         decisions: Lines about the scene's axes and the cameras.
         loss: Difference of the written scene; None if it was not measured.
     """
 
     count: int
+    notes: tuple[str, ...]
     decisions: tuple[Decision, ...]
     loss: CompressionLoss | None
 
@@ -197,7 +199,8 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
     if compare and source.cameras is None:
         source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
     axes, decisions = choose_axes(source)
-    scene = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes).scene
+    file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+    scene = file.scene
     cameras: list[Camera] = []
     if source.cameras or source.orbit:
         capture = read_capture(source, scene).checked(scene, source.near)
@@ -205,4 +208,4 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
     out.parent.mkdir(parents=True, exist_ok=True)
     write_scene(out, scene, format)
     loss = measure_compression(out, scene, cameras, near=source.near) if compare else None
-    return Converted(len(scene), tuple(decisions), loss)
+    return Converted(len(scene), file.notes, tuple(decisions), loss)

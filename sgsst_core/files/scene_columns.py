@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.ply import PROPERTIES
+from sgsst_core.files.formats.ply import PROPERTIES, RGB
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS
 from sgsst_core.scene.stored_harmonics import RowLayout
 
@@ -43,6 +44,8 @@ class SceneColumns:
         count: Number of rows.
         coefficients: Number of SH coefficients per color channel to load.
         stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
+        stored_coefficients: Number of SH coefficients per color channel in the rows; None for `coefficients`.
+        sources: Properties in the rows by the name of the usual property that they replace; see `PlySceneHeader`.
 
     Attributes:
         arrays: float32 arrays by the names of the scene's tensors.
@@ -51,8 +54,16 @@ class SceneColumns:
             almost 0 and 1 that compressed formats use, because exporters write an alpha of 255 as infinity.
     """
 
-    def __init__(self, count: int, coefficients: int, stored: RowLayout | None) -> None:
+    def __init__(
+        self,
+        count: int,
+        coefficients: int,
+        stored: RowLayout | None,
+        stored_coefficients: int | None = None,
+        sources: dict[str, str] | None = None,
+    ) -> None:
         self._stored = stored
+        self._sources = sources or {}
         self.arrays: dict[str, NDArray[Any]] = {
             name: np.empty((count, len(names)), np.float32) for name, names in PROPERTIES.items()
         }
@@ -62,8 +73,9 @@ class SceneColumns:
             prop: self.arrays[name][:, i] for name, names in PROPERTIES.items() for i, prop in enumerate(names)
         }
         self._targets["opacity"] = self.arrays["opacities"]
-        for i in range(3 * coefficients):
-            self._targets[f"f_rest_{i}"] = self.arrays["sh_rest"][:, i % coefficients, i // coefficients]
+        stride = coefficients if stored_coefficients is None else stored_coefficients
+        for channel, i in itertools.product(range(3), range(coefficients)):
+            self._targets[f"f_rest_{channel * stride + i}"] = self.arrays["sh_rest"][:, i, channel]
         self.flaws: list[_Flaws] = []
         self.clamped: list[int] = []
 
@@ -72,7 +84,8 @@ class SceneColumns:
         block = slice(start, start + len(rows))
         with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite and is reported as such
             for name, target in self._targets.items():
-                target[block] = rows[name]
+                source = self._sources.get(name, name)
+                target[block] = (rows[source] / 255 - COLOR_OFFSET) / SH_C0 if source in RGB else rows[source]
         self.check(start, len(rows), rows)
 
     def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:

@@ -61,11 +61,12 @@ class SceneFile:
     Attributes:
         path: Path of the file.
         scene: Gaussians of the file, without dropped ones.
-        header: PLY header, whose file `write_stylized` preserves; None for other formats.
+        header: PLY header, whose file `write_stylized` preserves; None for other formats and variants of PLY.
         retained: Mask [rows] bool of the file's rows that the scene contains; None if it contains all.
         stamp: Size in bytes and modification time in ns of the file when it was read.
         format: Name of the file's format.
         clamped: Number of infinite opacities that were replaced by finite ones. The stylized PLY keeps them.
+        notes: Notes on what of the file is not read, or read in another way than stored.
         copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
         sh_attenuation: SH attenuation that the scene has, but not the file.
     """
@@ -77,6 +78,7 @@ class SceneFile:
     stamp: tuple[int, int]
     format: str = PLY.name
     clamped: int = 0
+    notes: tuple[str, ...] = ()
     copies: NDArray[np.int64] | None = None
     sh_attenuation: float = 0.0
 
@@ -120,7 +122,7 @@ class SceneFile:
 def read_scene(
     path: Path, *, drop_invalid: bool = False, held_bytes: int | None = None, spz_axes: SpzAxes = "auto"
 ) -> SceneFile:
-    """Read a 3DGS scene of SH degree 0 to 3. The format is detected from the file's content.
+    """Read a 3DGS scene of SH degree 0 to 4, of which 0 to 3 are used. The format is detected from the file's content.
 
     Scenes of other formats than PLY are decompressed into memory.
 
@@ -145,9 +147,9 @@ def read_scene(
     file = RowFile(path)
     stamp = file.stamp
     stored = _row_layout(path, ply, stamp, offset) if ply and stays_in_file(header, held_bytes) else None
-    columns = SceneColumns(header.count, 0 if stored else header.coefficients, stored)
+    columns, notes = _columns(header, stored), header.notes
     if ply is None:
-        _read_arrays(file, header, columns)
+        notes += _read_arrays(file, header, columns)
     elif ply.text:
         rows = text_vertices(path, ply)
         for start in range(0, len(rows), BLOCK_ROWS):
@@ -158,19 +160,30 @@ def read_scene(
     retained = columns.valid_rows(path, drop_invalid)
     arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in columns.arrays.items()}
     if stored:
-        arrays["sh_rest"] = StoredHarmonics(stored, file=file)
+        arrays["sh_rest"] = StoredHarmonics(stored, coefficients=header.coefficients, file=file)
     scene = Scene(**arrays)
     if retained is not None:
         scene = scene.subset(torch.from_numpy(retained))
-    return SceneFile(path, scene, ply, retained, stamp, header.format.name, sum(columns.clamped))
+    if isinstance(header, PlySceneHeader) and header.sources:
+        ply = None
+    return SceneFile(path, scene, ply, retained, stamp, header.format.name, sum(columns.clamped), notes)
 
 
-def _read_arrays(file: RowFile, header: SceneHeader, columns: SceneColumns) -> None:
-    """Read a scene in any format other than PLY."""
+def _columns(header: SceneHeader, stored: RowLayout | None) -> SceneColumns:
+    """Return the arrays to read a scene into."""
+    coefficients = 0 if stored else header.coefficients
+    if isinstance(header, PlySceneHeader):
+        return SceneColumns(header.count, coefficients, stored, header.stored_coefficients, header.sources)
+    return SceneColumns(header.count, coefficients, stored)
+
+
+def _read_arrays(file: RowFile, header: SceneHeader, columns: SceneColumns) -> tuple[str, ...]:
+    """Read a scene in any format other than PLY, and return the reader's notes."""
     assert header.format.read is not None
-    header.format.read(file, header, columns.arrays)
+    notes = header.format.read(file, header, columns.arrays)
     for start in range(0, header.count, BLOCK_ROWS):
         columns.check(start, min(BLOCK_ROWS, header.count - start))
+    return notes or ()
 
 
 def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
@@ -179,7 +192,7 @@ def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
     They do if they would take more than `held_bytes` and the file has the layout of 3DGS trainers: binary
     little-endian, float32 coefficients, in order.
     """
-    if not isinstance(declared, PlySceneHeader) or not declared.coefficients:
+    if not isinstance(declared, PlySceneHeader) or not declared.coefficients or declared.sources:
         return False
     header = declared.ply
     names = [prop.name for prop in header.vertex.properties]

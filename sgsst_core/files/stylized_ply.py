@@ -18,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.formats.ply import PROPERTIES
+from sgsst_core.files.formats.ply import PROPERTIES, RGB
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
 from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, file_stamp, write_scene
 from sgsst_core.scene.gaussians import attenuation_factor
@@ -30,9 +31,10 @@ from sgsst_core.scene.stored_harmonics import changed
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
     """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
 
-    A color keeps its bytes too if its float32 value does not change. The rest of the file changes in three cases:
+    A color keeps its bytes too if its float32 value does not change. The rest of the file changes in four cases:
 
     - With an SH attenuation, f_rest_* change.
+    - Colors of 8 bits in red, green and blue, for programs that show only points, become those of f_dc_*.
     - Dropped rows are absent, and the count in the header is adjusted.
     - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
 
@@ -149,8 +151,15 @@ _NewColumns = dict[str, NDArray[np.float32]]
 
 
 def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
-    """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes."""
+    """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes.
+
+    Colors that the file also has with 8 bits are among them.
+    """
     columns = dict(zip(PROPERTIES["sh_dc"], colors.numpy().T, strict=True))
+    kinds = {prop.name: prop.kind for prop in source.header.vertex.properties} if source.header else {}
+    if all(kinds.get(name) == "u1" for name in RGB):
+        shown = (255 * (COLOR_OFFSET + SH_C0 * colors.double()).clamp(0, 1)).round().float()
+        columns |= dict(zip(RGB, shown.numpy().T, strict=True))
     if source.copies is not None:
         columns["opacity"] = source.scene.opacities.numpy()
         for names, values in ((PROPERTIES["means"], source.scene.means), (PROPERTIES["scales"], source.scene.scales)):
@@ -265,6 +274,6 @@ def _changed_line(
         token = tokens[slot]
         if np.float32(token[0]) != value:
             # shortest text that parses to the same number in the precision that the file declares
-            text = str(value) if kind == "f4" else repr(float(value))
+            text = str(value) if kind == "f4" else str(int(value)) if kind == "u1" else repr(float(value))
             line = line[: token.start()] + text + line[token.end() :]
     return line

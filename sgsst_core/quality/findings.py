@@ -108,6 +108,7 @@ def scene_findings(file: SceneFile) -> list[Finding]:
     """Return the findings about a scene read with `drop_invalid`; indices are rows of the file."""
     scene = _Scene(file)
     return [
+        *scene.notes(),
         *scene.invalid(),
         *scene.infinite_opacities(),
         *scene.rotations(),
@@ -179,6 +180,9 @@ class _Scene:
                 done,
             )
         ]
+
+    def notes(self) -> list[Finding]:
+        return [Finding("scene", note, len(self.scene), len(self.scene), "", "") for note in self.file.notes]
 
     def infinite_opacities(self) -> list[Finding]:
         if not self.file.clamped:

@@ -67,7 +67,10 @@ function elementsOf(lines) {
 export function plainPly(reader, { elements }) {
   const [vertex] = elements, names = Object.keys(vertex?.columns ?? {}), rest = names.filter((name) => name.startsWith("f_rest_")).length;
   const wrong = vertex?.name !== "vertex" || !(vertex.count > 0) || !(vertex.stride > 0) || NEEDED.some((name) => !vertex.columns[name]);
-  if (wrong || !(rest in DEGREES)) throw new SceneError(words.scene.notGaussians);
+  if (wrong || !(rest in DEGREES)) {
+    const variant = vertex?.columns.opacity && vertex.columns.rot_0; // such as colors of 8 bits, or SH degree 4
+    throw new SceneError(variant ? words.scene.notShown("This kind of PLY") : words.scene.notGaussians);
+  }
   return {
     count: vertex.count, degree: DEGREES[rest], width: names.length,
     at: Object.fromEntries(names.map((name, place) => [name, place])),

@@ -2,6 +2,8 @@
 
 The properties are those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023): x y z,
 f_dc_0..2, f_rest_* (channel-major: all coefficients of red first), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
+
+Two variants are read too: colors of 8 bits in red, green and blue instead of f_dc_* (nerfstudio), and a single scale.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import numpy as np
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.ply_header import PlyHeader, check_length, read_header
-from sgsst_core.files.formats.scene_format import Arrays, FileStart, SceneFormat, SceneHeader
+from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, SceneFormat, SceneHeader
 
 #: Properties of the scene's tensors; opacity and f_rest_* follow.
 PROPERTIES = {
@@ -25,14 +27,26 @@ PROPERTIES = {
     "scales": ("scale_0", "scale_1", "scale_2"),
     "sh_dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
 }
+#: Colors of 8 bits, which nerfstudio writes instead of f_dc_* on request, and others beside them.
+RGB = ("red", "green", "blue")
+#: Stored SH coefficients per color channel above degree 0, by SH degree. Those of degree 4 are not drawn.
+_STORED_COEFFICIENTS = {**COEFFICIENTS, 4: 24}
 _BLOCK_ROWS = 1 << 16
 
 
 @dataclass(frozen=True)
 class PlySceneHeader(SceneHeader):
-    """Header of a PLY."""
+    """Header of a PLY.
+
+    Attributes:
+        ply: Parsed header.
+        stored_coefficients: SH coefficients per color channel above degree 0 in the file.
+        sources: Properties of a variant by the name of the usual property that they replace; empty if there are none.
+    """
 
     ply: PlyHeader
+    stored_coefficients: int
+    sources: dict[str, str]
 
 
 def _matches(start: FileStart) -> bool:
@@ -41,16 +55,44 @@ def _matches(start: FileStart) -> bool:
 
 def _read_header(start: FileStart) -> PlySceneHeader:
     header = read_header(start.path)
-    coefficients = _check_properties(start.path, header)
+    stored, sources = _check_properties(start.path, header)
     check_length(start.path, header)
-    return PlySceneHeader(PLY, header.vertex.count, coefficients, header)
+    coefficients = min(stored, COEFFICIENTS[3])
+    return PlySceneHeader(
+        PLY, header.vertex.count, coefficients, header, stored, sources, notes=_notes(coefficients < stored, sources)
+    )
 
 
-def _check_properties(path: Path, header: PlyHeader) -> int:
-    """Check that a PLY is a 3DGS scene before any data is read, and return its SH coefficients per channel."""
+def _notes(above: bool, sources: dict[str, str]) -> tuple[str, ...]:
+    """Return notes on a PLY with SH bands above degree 3, or of a variant."""
+    found = ["SH bands above degree 3 are not drawn; only a stylized PLY keeps them"] if above else []
+    if sources:
+        found.append(f"{', '.join(dict.fromkeys(sources.values()))} become the usual properties of a stylized PLY")
+    return tuple(found)
+
+
+def _sources(kinds: dict[str, str]) -> dict[str, str]:
+    """Return the properties of a variant, by the name of the usual property that they replace."""
+    found: dict[str, str] = {}
+    if all(kinds.get(name) == "u1" for name in RGB) and not any(name in kinds for name in PROPERTIES["sh_dc"]):
+        found |= dict(zip(PROPERTIES["sh_dc"], RGB, strict=True))
+    scales = [name for name in ("scale", *PROPERTIES["scales"]) if name in kinds]
+    if scales in (["scale"], ["scale_0"]):
+        found |= dict.fromkeys(PROPERTIES["scales"], scales[0])
+    return found
+
+
+def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str]]:
+    """Check that a PLY is a 3DGS scene before any data is read.
+
+    Returns:
+        Stored SH coefficients per channel, and `PlySceneHeader.sources`.
+    """
     vertex = header.vertex if "vertex" in header.names else None
     kinds = {prop.name: prop.kind for prop in vertex.properties if not prop.length_kind} if vertex else {}
-    missing = [name for names in (*PROPERTIES.values(), ("opacity",)) for name in names if name not in kinds]
+    sources = _sources(kinds)
+    known = {*kinds, *sources}
+    missing = [name for names in (*PROPERTIES.values(), ("opacity",)) for name in names if name not in known]
     if vertex is None or missing:
         raise SceneError(f"{path}: is not a 3DGS scene but {_likely_content(header)}; missing: {', '.join(missing)}.")
     if vertex.count == 0:
@@ -61,21 +103,21 @@ def _check_properties(path: Path, header: PlyHeader) -> int:
             f"{path}: vertex property {name!r} is a list, which 3DGS scenes do not have. Export without it."
         )
     for name in PROPERTIES["sh_dc"]:
-        if kinds[name][0] != "f":
+        if name not in sources and kinds[name][0] != "f":
             raise SceneError(
                 f"{path}: {name} is stored as integers; new colors need float or double. Convert it first."
             )
     rest = [name for name in kinds if re.fullmatch(r"f_rest_\d+", name)]
-    if len(rest) not in (0, 9, 24, 45):
+    if len(rest) // 3 not in _STORED_COEFFICIENTS.values() or len(rest) % 3:
         raise SceneError(
-            f"{path}: has {len(rest)} f_rest properties; SH degree 0, 1, 2, 3 have 0, 9, 24, 45. Export it again."
+            f"{path}: has {len(rest)} f_rest properties; SH degree 0 to 4 have 0, 9, 24, 45, 72. Export it again."
         )
     absent = [f"f_rest_{i}" for i in range(len(rest)) if f"f_rest_{i}" not in kinds]
     if absent:
         raise SceneError(
             f"{path}: f_rest properties are not numbered 0 to {len(rest) - 1}; missing: {', '.join(absent)}."
         )
-    return len(rest) // 3
+    return len(rest) // 3, sources
 
 
 def _likely_content(header: PlyHeader) -> str:

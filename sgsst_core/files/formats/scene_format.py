@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -50,11 +50,13 @@ class SceneHeader:
         format: Format of the file.
         count: Number of Gaussians.
         coefficients: SH coefficients per color channel above degree 0.
+        notes: Notes on what is not read, or read in another way than stored.
     """
 
     format: SceneFormat
     count: int
     coefficients: int
+    notes: tuple[str, ...] = field(default=(), kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,9 @@ class SceneFormat:
             size of the file. Raises a SceneError if the header is wrong or the file is truncated. It runs in the API
             process.
         bytes_per_gaussian: Typical size of a Gaussian of SH degree 3 in a file.
-        read: Reader, which fills the arrays of a scene, allocated for the header's numbers. It need not check for
-            non-finite values. None for PLY, whose scenes are written back with all other data (`scene_file`).
+        read: Reader, which fills the arrays of a scene, allocated for the header's numbers, and may return notes beyond
+            the header's. It need not check for non-finite values. None for PLY, whose scenes are written back with all
+            other data (`scene_file`).
         write: Writer of a scene's arrays, which raises an OutputError without path if it cannot represent them. None if
             the format is only read.
         shown: Whether the page shows scenes of this format (`api/static/viewer`).
@@ -86,7 +89,7 @@ class SceneFormat:
     matches: Callable[[FileStart], bool]
     read_header: Callable[[FileStart], SceneHeader]
     bytes_per_gaussian: int
-    read: Callable[[OpenScene, SceneHeader, Arrays], None] | None = None
+    read: Callable[[OpenScene, SceneHeader, Arrays], tuple[str, ...] | None] | None = None
     write: Callable[[BinaryIO, Arrays], None] | None = None
     shown: bool = False
     magic: bytes = b""

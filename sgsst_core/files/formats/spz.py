@@ -61,6 +61,8 @@ _AXES_NUMBERS: dict[int, Axes] = {0: "rub", 4: "rub", 6: "rdf"}
 #: Extension record of written files, which states the axes of a PLY.
 _AXES_RECORD = struct.pack("<III", _AXES_EXTENSION, 4, 6)
 _HAS_EXTENSIONS = 2
+#: Maximum number of unknown extensions that a note names.
+_NOTED_EXTENSIONS = 8
 
 #: Stored SH coefficients per color channel above degree 0, by SH degree.
 _STORED_COEFFICIENTS = {**COEFFICIENTS, 4: 24}
@@ -189,16 +191,25 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
         sections,
         tuple(streams),
         stated_axes=axes,
+        notes=_notes(degree, records),
     )
 
 
-def _stated_axes(path: Path, records: bytes) -> Axes | None:
-    """Return the axes that extension records state: type (uint32), length in bytes (uint32) and content of each."""
-    position = 0
-    while position + 8 <= len(records):
-        kind, length = struct.unpack_from("<II", records, position)
-        content = records[position + 8 : position + 8 + length]
-        if kind == _AXES_EXTENSION and len(content) == length >= 4:
+def _extension_records(data: bytes) -> list[tuple[int, bytes]]:
+    """Return type and content of whole extension records: type and length in bytes (uint32), then the content."""
+    found, position = [], 0
+    while position + 8 <= len(data):
+        kind, length = struct.unpack_from("<II", data, position)
+        position += 8 + length
+        if position <= len(data):
+            found.append((kind, data[position - length : position]))
+    return found
+
+
+def _stated_axes(path: Path, data: bytes) -> Axes | None:
+    """Return the axes that extension records state; None if they do not."""
+    for kind, content in _extension_records(data):
+        if kind == _AXES_EXTENSION and len(content) >= 4:
             number = int.from_bytes(content[:4], "little")
             if number not in _AXES_NUMBERS:
                 raise SceneError(
@@ -206,8 +217,16 @@ def _stated_axes(path: Path, records: bytes) -> Axes | None:
                     f"{advice('scene.spz')}"
                 )
             return _AXES_NUMBERS[number]
-        position += 8 + length
     return None
+
+
+def _notes(degree: int, data: bytes) -> tuple[str, ...]:
+    """Return notes on SH bands and extensions that are not read."""
+    notes = ["SH bands above degree 3 are left out"] if degree > 3 else []
+    unknown = sorted({kind for kind, _ in _extension_records(data)} - {_AXES_EXTENSION})[:_NOTED_EXTENSIONS]
+    if unknown:
+        notes.append(f"SPZ extensions {', '.join(f'{kind:#x}' for kind in unknown)} are unknown and left out")
+    return tuple(notes)
 
 
 def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, tuple[int, ...]]:
@@ -239,8 +258,12 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
     return version, count, degree, fractional_bits, sections
 
 
-def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> None:
-    """Fill the arrays of a scene; raise a SceneError if a stream is damaged or not as long as the header declares."""
+def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
+    """Fill the arrays of a scene, and return notes on version 1 to 3.
+
+    Raises:
+        SceneError: If a stream is damaged, or not as long as the header declares.
+    """
     assert isinstance(spz, SpzHeader)
     path = file.path
     decoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
@@ -271,6 +294,7 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> None:
         axes = spz.stated_axes or (_stated_axes(path, bytes(records)) if spz.extended else None) or "rdf"
     if axes == "rub":
         _rotate(into)
+    return () if spz.streams else _notes(spz.degree, bytes(records) if spz.extended else b"")
 
 
 def _rotate(arrays: Arrays) -> None:

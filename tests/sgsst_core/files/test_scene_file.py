@@ -439,7 +439,7 @@ def test_what_is_no_3dgs_scene_is_refused_with_the_reason(tmp_path: Path, data: 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"none\.ply: cannot be read: No such file"):
         read_scene(tmp_path / "none.ply")
-    with pytest.raises(SceneError, match="Is a directory"):
+    with pytest.raises(SceneError, match="is a folder"):
         read_scene(tmp_path)
 
 

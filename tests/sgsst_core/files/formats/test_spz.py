@@ -107,6 +107,17 @@ def test_stated_axes_are_followed_unless_others_are_requested(tmp_path: Path, ve
 
 
 @pytest.mark.parametrize("version", [3, 4])
+def test_unknown_extensions_are_noted(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "scene"
+    write_spz(path, gsply_of(cloud(700)), version=version)
+    data = path.read_bytes()
+    assert not read_scene(path).notes
+    records = axes_record(6) + struct.pack("<II", 0xADBE0002, 3) + b"abc" + struct.pack("<II", 7, 0)
+    path.write_bytes(with_records(data, records + struct.pack("<II", 9, 1000)))
+    assert read_scene(path).notes == ("SPZ extensions 0x7, 0xadbe0002 are unknown and left out",)
+
+
+@pytest.mark.parametrize("version", [3, 4])
 def test_unknown_axes_and_broken_records(tmp_path: Path, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=1)), version=version)
