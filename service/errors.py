@@ -9,7 +9,7 @@ from typing import Any, Self
 from service.examples import JOB_ID, SHA256, UPLOAD_ID
 from sgsst_core.errors import InfrastructureError, SgsstError
 
-_AGAIN = "If you uploaded it, upload it again; if it is a result, run the job again."
+_RECOVERY = "If you uploaded it, upload it again; if it is a result, run the job again."
 
 
 class ServiceError(SgsstError):
@@ -391,7 +391,7 @@ class LostFileError(ServiceError):
     example = (SHA256,)
 
     def __init__(self, sha256: str) -> None:
-        super().__init__(f"The service has lost the file with SHA-256 {sha256}. {_AGAIN}")
+        super().__init__(f"The service has lost the file with SHA-256 {sha256}. {_RECOVERY}")
 
 
 class DamagedFileError(ServiceError):
@@ -401,7 +401,7 @@ class DamagedFileError(ServiceError):
     example = (SHA256,)
 
     def __init__(self, sha256: str) -> None:
-        super().__init__(f"The service's copy of the file with SHA-256 {sha256} is damaged. {_AGAIN}")
+        super().__init__(f"The service's copy of the file with SHA-256 {sha256} is damaged. {_RECOVERY}")
 
 
 class LockedError(ServiceError):

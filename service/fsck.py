@@ -105,15 +105,15 @@ class FileCheck:
         kind = file.fault() and file.is_current() and file.fault()
         if not kind:
             return None
-        found = Finding(kind, file.what, file.name, file.holders())
+        finding = Finding(kind, file.what, file.name, file.holders())
         if not mend:
-            return found
+            return finding
         done = ""
         if kind == "damaged":
             target = f"{QUARANTINE}/{file.name.replace('/', '_')}-{secrets.token_hex(3)}"
             file.objects.move(file.name, target)
             done = f"moved to {target}; "
-        return replace(found, mended=done + file.forget())
+        return replace(finding, mended=done + file.forget())
 
     # --- files that rows refer to ----------------------------------------------------------------------------------
 
@@ -123,9 +123,9 @@ class FileCheck:
         while page := self._page_of_blobs(last):
             last = page[-1].sha256
             yield [self._input(row) for row in page]
-        place = ("", "")
-        while results := self._page_of_artifacts(place):
-            place = (results[-1].job_id, results[-1].name)
+        last_artifact = ("", "")
+        while results := self._page_of_artifacts(last_artifact):
+            last_artifact = (results[-1].job_id, results[-1].name)
             yield [self._result(row) for row in results]
         last = ""
         while uploads := self._page_of_uploads(last):

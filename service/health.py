@@ -29,7 +29,7 @@ def main() -> int:
             from service.settings import ServiceSettings
             from service.store import Store
 
-            return 0 if dispatcher_is_well(Store(ServiceSettings(), answer_seconds=_ANSWER_SECONDS)) else 1
+            return 0 if dispatcher_is_healthy(Store(ServiceSettings(), answer_seconds=_ANSWER_SECONDS)) else 1
     print("usage: python -m service.health api|dispatcher", file=sys.stderr)
     return 2
 
@@ -43,7 +43,7 @@ def _answers(url: str) -> bool:
         return False
 
 
-def dispatcher_is_well(store: Store) -> bool:
+def dispatcher_is_healthy(store: Store) -> bool:
     """Return whether a dispatcher of this machine or container has sent a heartbeat lately, or the database is down."""
     from service.errors import DatabaseUnavailableError
     from service.scheduling.machine import is_of_this_machine

@@ -54,14 +54,14 @@ class JobParameters(StylizeOptions):
         Raises:
             SettingsError: If the regions are inconsistent, or one is selected by a mask.
         """
-        found = region_requests(self.regions or (), exists=lambda path: False)
-        for region in found:
+        requests = region_requests(self.regions or (), exists=lambda path: False)
+        for region in requests:
             if region.selection is not None and region.selection.path is not None:
                 raise SettingsError(
                     f"Region {region.name!r} is selected by {region.selection.kind}=, which the service does not "
                     "accept: only sgsst stylize accepts masks. Use a box, sphere, half-space or property."
                 )
-        return found
+        return requests
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
@@ -71,18 +71,18 @@ def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
         SettingsError: If this version does not support them.
     """
     try:
-        return checked(JobParameters, _with_present_names(values))
+        return checked(JobParameters, _with_current_names(values))
     except SettingsError as error:
         raise SettingsError(
             f"{error} The job was stored by an earlier version that accepted this. Submit a new job without it."
         ) from error
 
 
-def _with_present_names(values: Mapping[str, Any]) -> dict[str, Any]:
+def _with_current_names(values: Mapping[str, Any]) -> dict[str, Any]:
     """Rename stored parameters of a job or region to their current names."""
-    found = {RENAMED.get(name, name): value for name, value in values.items()}
-    if found.get("regions"):
-        found["regions"] = [_with_present_names(region) for region in found["regions"]]
-    if "unseen" in found:
-        found["unseen"] = {"neighbours": "neighbors", "keep": "freeze"}.get(found["unseen"], found["unseen"])
-    return found
+    renamed = {RENAMED.get(name, name): value for name, value in values.items()}
+    if renamed.get("regions"):
+        renamed["regions"] = [_with_current_names(region) for region in renamed["regions"]]
+    if "unseen" in renamed:
+        renamed["unseen"] = {"neighbours": "neighbors", "keep": "freeze"}.get(renamed["unseen"], renamed["unseen"])
+    return renamed

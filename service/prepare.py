@@ -17,7 +17,7 @@ from service.private import keep_private
 from service.settings import ServiceSettings
 from service.store import open_store
 
-_ASK_AGAIN_SECONDS = 2.0
+_RETRY_SECONDS = 2.0
 
 
 def main() -> int:
@@ -43,7 +43,7 @@ def _make_bucket(objects: ObjectStore, patience: float) -> None:
         except StoreError:
             if time.monotonic() >= until:
                 raise
-            time.sleep(_ASK_AGAIN_SECONDS)
+            time.sleep(_RETRY_SECONDS)
         else:
             return
 

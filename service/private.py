@@ -25,16 +25,16 @@ def keep_private(settings: ServiceSettings) -> None:
     """
     os.umask(0o077)
     settings.folder.mkdir(parents=True, exist_ok=True)
-    for path in [settings.folder, *_folder_of_results(settings), *_database_files(settings)]:
+    for path in [settings.folder, *_result_folder(settings), *_database_files(settings)]:
         mode = stat.S_IMODE(path.stat().st_mode)
         if mode & 0o077:
             try:
                 path.chmod(mode & 0o700)
             except PermissionError:
-                _log.warning("%s can be read by other users of this machine, and belongs to another user", path)
+                _log.warning("file readable by other users, and owned by another user: path=%s", path)
 
 
-def _folder_of_results(settings: ServiceSettings) -> list[Path]:
+def _result_folder(settings: ServiceSettings) -> list[Path]:
     store = ObjectStore(settings.artifacts_url)
     folder = Path(store.root)
     return [folder] if store.local and folder.is_dir() else []

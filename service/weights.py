@@ -17,12 +17,12 @@ def check_weights() -> None:
     Raises:
         DamagedWeightsError: If any weights are damaged.
     """
-    if found := damaged_weights():
-        for damage in found:
+    if damages := damaged_weights():
+        for damage in damages:
             _log_once(damage)
         raise DamagedWeightsError
 
 
 @lru_cache
 def _log_once(damage: str) -> None:
-    _log.error("no job is accepted or started: %s", damage)
+    _log.error("weights damaged, no job is accepted or started: %s", damage)

@@ -76,7 +76,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
                 {
                     "database": store.operations.check,
                     "artifacts": results.ping,
-                    "disk": lambda: blobs.ensure_room(0),
+                    "disk": lambda: blobs.ensure_space(0),
                     "weights": check_weights,
                 }
             ),

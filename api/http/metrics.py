@@ -81,7 +81,7 @@ class _StoreCollector(Collector):
     def collect(self) -> Iterable[Metric]:
         operations = self._store.operations
         depth = GaugeMetricFamily("sgsst_jobs", "Jobs by status.", labels=["status"])
-        found = operations.depths()
+        found = operations.job_counts()
         for status in JobStatus:
             depth.add_metric([status], found.get(status, 0))
         yield depth

@@ -342,7 +342,7 @@ class _Form:
             except ServiceError:
                 file.discard()
                 raise
-            sha256 = self._blobs.keep(file.path, self._receipt.id)
+            sha256 = self._blobs.add(file.path, self._receipt.id)
             entry = {"role": self._role, "name": self._name, "sha256": sha256, "size": file.size}
             self.received.files.append(entry)
             return

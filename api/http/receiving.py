@@ -64,7 +64,7 @@ class _Writer:
     def write(self, block: bytes) -> None:
         if self._offset + len(block) > self._row.length:
             raise LongerThanDeclaredError(self._row.length)
-        self._context.blobs.ensure_room(len(block))
+        self._context.blobs.ensure_space(len(block))
         self._part.write(block)
         self._offset += len(block)
         if self._digest is not None:

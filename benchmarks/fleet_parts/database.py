@@ -128,13 +128,13 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
         "lease into kept room": lambda: take(*keeping(True)),
         "keep room, in vain": lambda: store.leases.take(threading.current_thread().name, *keeping(False)),
         "gpus": lambda: store.leases.hold_gpus(some(), 2),
-        "begin": lambda: store.leases.begin(some()),
+        "begin": lambda: store.leases.start(some()),
         "progress": lambda: store.leases.report_progress(some(), progress),
         "publish": lambda: store.leases.publish(some(), [checkpoint]),
         "renew eight": lambda: store.leases.renew(own()[:8]),
         "look at eight": lambda: store.leases.statuses(own()[:8]),
-        "look at the queue": lambda: (store.operations.alive(), store.leases.waiting(1000)),
-        "alive": lambda: store.operations.beat(threading.current_thread().name, 8, 0),
+        "look at the queue": lambda: (store.operations.dispatcher_count(), store.leases.waiting(1000)),
+        "alive": lambda: store.operations.record_heartbeat(threading.current_thread().name, 8, 0),
         "end": lambda: store.leases.succeed(own().pop(), [Published("stylized.ply", "x", 1, _SHA)], {}),
     }
     return {name: _cost(store, port, each) for name, each in what.items()}

@@ -146,7 +146,7 @@ class Fleet:
             capacity = Capacity(Machine(names, 64, 1 << 40), settings.parallel_jobs)
             clocks = ClockWatch(self.store, settings.lease_seconds)
             self.hosts.append(Host(JobSelector(f"host-{number}", self.store, capacity, clocks), gpus_each))
-            self.store.operations.beat(f"host-{number}", gpus_each, gpus_each)
+            self.store.operations.record_heartbeat(f"host-{number}", gpus_each, gpus_each)
 
     def _prepare_store(self) -> None:
         engine = self.store.database.engine
@@ -273,7 +273,7 @@ class Fleet:
         if host.life != life:
             return
         self._do("begin")
-        self.store.leases.begin(attempt.lease)
+        self.store.leases.start(attempt.lease)
         record = attempt.record
         self._account(attempt)
         record.planned = record.job.planned(attempt.grant.ranks)
@@ -339,14 +339,14 @@ class Fleet:
         self._do("failure")
         held = self.store.leases.waiting()
         self.store.leases.expire(host.selector.dispatcher)
-        self.store.operations.gone(host.selector.dispatcher)
+        self.store.operations.remove_dispatcher(host.selector.dispatcher)
         self._waiting += self.store.leases.waiting() - held
         self._at(self._soon(), self._somebody_looks)
 
     def _repair(self, host: Host) -> None:
         host.up, host.keeps_room_for = True, None
         self._do("failure")
-        self.store.operations.beat(host.selector.dispatcher, host.gpus, host.gpus)
+        self.store.operations.record_heartbeat(host.selector.dispatcher, host.gpus, host.gpus)
         self._look(host)
         self._fail_some_day(host)
 

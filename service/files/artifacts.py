@@ -54,14 +54,14 @@ class Artifacts:
         """
         location = f"{job_id}/{epoch}/{secrets.token_hex(6)}/{name}"
         if not self.local:
-            with _held(source) as held:
-                size, sha256 = held.stat().st_size, file_digest(held)
-                self.objects.put(held, location)
+            with _snapshot(source) as snapshot:
+                size, sha256 = snapshot.stat().st_size, file_digest(snapshot)
+                self.objects.put(snapshot, location)
             return Published(name, location, size, sha256)
         target = Path(self.objects.root, location)
         target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(target) as temporary:
-            if not (final and _linked(source, temporary)):
+            if not (final and _link(source, temporary)):
                 shutil.copyfile(source, temporary)
             size, sha256 = temporary.stat().st_size, file_digest(temporary)
         return Published(name, location, size, sha256)
@@ -88,9 +88,9 @@ class Artifacts:
         try:
             with atomic_path(target) as temporary:
                 self.objects.get(location, temporary)
-                found = file_digest(temporary)
-                if found != sha256:
-                    _log.error("%s is damaged: its SHA-256 is %s, and should be %s", location, found, sha256)
+                digest = file_digest(temporary)
+                if digest != sha256:
+                    _log.error("file damaged: name=%s sha256=%s expected=%s", location, digest, sha256)
                     raise DamagedFileError(sha256)
         except FileNotFoundError as error:
             raise LostFileError(sha256) from error
@@ -103,16 +103,16 @@ class Artifacts:
         """Remove all files of a job."""
         self.objects.remove_below(job_id)
 
-    def sweep(self, job_id: str, epoch: int, kept: set[str]) -> None:
+    def sweep(self, job_id: str, epoch: int, retained: set[str]) -> None:
         """Remove files that interrupted attempts at a job left behind and that no database row refers to.
 
         Args:
             epoch: Latest lease epoch whose files are removed; files of later leases may not have their rows yet.
-            kept: Locations that database rows refer to; their files are not removed.
+            retained: Locations that database rows refer to; their files are not removed.
         """
         for location in self.objects.below(job_id):
             below = location.partition("/")[2]
-            if location not in kept and int(below.partition("/")[0]) <= epoch:
+            if location not in retained and int(below.partition("/")[0]) <= epoch:
                 self.remove(location)
 
     def ping(self) -> None:
@@ -126,7 +126,7 @@ def media_type(name: str) -> str:
     return known or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
-def _linked(source: Path, target: Path) -> bool:
+def _link(source: Path, target: Path) -> bool:
     """Replace `target` with a hard link to `source`; return False if the file system does not support that."""
     target.unlink()
     try:
@@ -139,17 +139,17 @@ def _linked(source: Path, target: Path) -> bool:
 
 
 @contextmanager
-def _held(source: Path) -> Iterator[Path]:
+def _snapshot(source: Path) -> Iterator[Path]:
     """Provide a second hard link to a file, so that replacing the file during its upload does not affect the upload."""
-    held = source.with_name(f".{secrets.token_hex(6)}-{source.name}")
+    link = source.with_name(f".{secrets.token_hex(6)}-{source.name}")
     try:
-        os.link(source, held)
+        os.link(source, link)
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
         yield source
         return
     try:
-        yield held
+        yield link
     finally:
-        held.unlink(missing_ok=True)
+        link.unlink(missing_ok=True)

@@ -35,13 +35,13 @@ _MIN_FREE_INODES = 1000
 
 
 class Receiver:
-    """File that is being received; `Blobs.keep` turns it into a blob."""
+    """File that is being received; `Blobs.add` turns it into a blob."""
 
-    def __init__(self, path: Path, limit: int, room: Callable[[int], None]) -> None:
+    def __init__(self, path: Path, limit: int, ensure_space: Callable[[int], None]) -> None:
         self.path = path
         self.size = 0
         self._limit = limit
-        self._room = room
+        self._ensure_space = ensure_space
         self._file = path.open("wb", buffering=0)
 
     def write(self, data: bytes) -> None:
@@ -54,7 +54,7 @@ class Receiver:
         self.size += len(data)
         if self.size > self._limit:
             raise TooLargeError(f"A file has more than {self._limit:,} bytes.", self._limit)
-        self._room(len(data))
+        self._ensure_space(len(data))
         write_all(self._file, data)
 
     def close(self) -> None:
@@ -103,7 +103,7 @@ class Blobs(ABC):
         self.incoming.mkdir(parents=True, exist_ok=True)
         self._inputs, self._min_free = inputs, min_free
 
-    def ensure_room(self, size: int) -> None:
+    def ensure_space(self, size: int) -> None:
         """Raise NoSpaceError if `size` more bytes would leave too little free disk space."""
         if shutil.disk_usage(self.incoming).free - size < self._min_free:
             raise NoSpaceError
@@ -113,11 +113,11 @@ class Blobs(ABC):
 
     def receive(self, limit: int) -> Receiver:
         """Return a new file to write to."""
-        self.ensure_room(0)
-        return Receiver(self.incoming / f"{secrets.token_hex(12)}.part", limit, self.ensure_room)
+        self.ensure_space(0)
+        return Receiver(self.incoming / f"{secrets.token_hex(12)}.part", limit, self.ensure_space)
 
     @abstractmethod
-    def keep(self, path: Path, upload_id: str | None = None) -> str:
+    def add(self, path: Path, upload_id: str | None = None) -> str:
         """Turn a received, durable file into a blob and return its SHA-256; `path` no longer exists afterwards.
 
         The digest is computed from the file that becomes the blob. If there is a blob with the same digest already and
@@ -139,7 +139,7 @@ class Blobs(ABC):
         """
 
     @abstractmethod
-    def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
+    def fetch(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
         """Return the local paths of blobs by digest, after verifying each blob.
 
         Args:
@@ -162,13 +162,13 @@ class Blobs(ABC):
         return self.objects.read(f"{BLOBS}/{row.location}", start, stop)
 
     @contextmanager
-    def lent(self, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:
-        """Provide blobs as local files for the duration of the block, like `bring`."""
+    def local_files(self, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:
+        """Provide blobs as local files for the duration of the block, like `fetch`."""
         with tempfile.TemporaryDirectory(dir=self.incoming) as folder:
-            yield self.bring(rows, Path(folder))
+            yield self.fetch(rows, Path(folder))
 
     @abstractmethod
-    def begin_upload(self, upload_id: str) -> None:
+    def start_upload(self, upload_id: str) -> None:
         """Prepare for receiving the bytes of a new upload, whose database row exists already."""
 
     @abstractmethod
@@ -197,7 +197,7 @@ class Blobs(ABC):
         """
 
     @abstractmethod
-    def forget_upload(self, upload_id: str) -> None:
+    def discard_upload(self, upload_id: str) -> None:
         """Remove the received bytes of an upload whose database row is gone."""
 
     def collect(self) -> int:
@@ -206,7 +206,7 @@ class Blobs(ABC):
         After a rollback of the database no blob is removed, because the rows of jobs that use it may have been lost.
         """
         for upload_id in self._inputs.expire_uploads():
-            self.forget_upload(upload_id)
+            self.discard_upload(upload_id)
         removed = 0 if self._inputs.rolled_back else self._collect_blobs()
         before = self._expiry() - _ORPHAN_SECONDS
         for path in self.incoming.iterdir():
@@ -233,19 +233,19 @@ class BlobFolder(Blobs):
         for path in (self._blobs, self.uploads):
             path.mkdir(parents=True, exist_ok=True)
 
-    def keep(self, path: Path, upload_id: str | None = None, *, leave: bool = False) -> str:
+    def add(self, path: Path, upload_id: str | None = None, *, link: bool = False) -> str:
         """Move or link a received file to its final path and return its SHA-256.
 
         Args:
             path: Complete file that is no longer written to.
             upload_id: Upload or receipt (`service.store.inputs`) that holds the blob from now on; None for none.
-            leave: Whether to hard-link the file instead of moving it, so that `path` remains.
+            link: Whether to hard-link the file instead of moving it, so that `path` remains.
         """
         path.chmod(0o400)
         size, sha256 = path.stat().st_size, file_digest(path)
         final = self._blobs / sha256[:2] / f"{sha256}-{secrets.token_hex(4)}"
         final.parent.mkdir(exist_ok=True)
-        if leave:
+        if link:
             os.link(path, final)
         else:
             path.replace(final)
@@ -268,13 +268,13 @@ class BlobFolder(Blobs):
         for location in locations:
             (self._blobs / location).unlink(missing_ok=True)
 
-    def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (base signature)
+    def fetch(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (base signature)
         """Return the paths of the verified blobs; `folder` is not used."""
         for sha256, row in rows.items():
             self.objects.check(f"{BLOBS}/{row.location}", sha256)
         return {sha256: self._blobs / row.location for sha256, row in rows.items()}
 
-    def begin_upload(self, upload_id: str) -> None:
+    def start_upload(self, upload_id: str) -> None:
         """Create an empty file for the upload."""
         self.upload_path(upload_id).touch()
 
@@ -293,7 +293,7 @@ class BlobFolder(Blobs):
                     return known
                 if path.stat().st_size != upload.length:
                     raise LostUploadError(upload.id)
-                sha256 = self.keep(path, upload.id, leave=True)
+                sha256 = self.add(path, upload.id, link=True)
                 self._inputs.finish_upload(upload.id, sha256, seconds)
                 path.unlink(missing_ok=True)
                 return sha256
@@ -303,7 +303,7 @@ class BlobFolder(Blobs):
                 raise LostUploadError(upload.id) from None
             return known
 
-    def forget_upload(self, upload_id: str) -> None:
+    def discard_upload(self, upload_id: str) -> None:
         """Remove the upload's file."""
         self.upload_path(upload_id).unlink(missing_ok=True)
 

@@ -26,9 +26,9 @@ _CHUNK = 1 << 20
 #: Number of fetches with a wrong digest after which the file counts as damaged in the store.
 _TRIES = 2
 #: Age in seconds at which partially fetched files are removed; no fetch takes that long, so their processes have died.
-_HALF_SECONDS = 6 * 3600.0
+_PARTIAL_SECONDS = 6 * 3600.0
 #: Error numbers of a full disk.
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ Fetch = Callable[[Path], None]
 class _Entry:
     path: Path
     size: int
-    names: int
+    links: int
     used_at: int
 
 
@@ -53,9 +53,9 @@ class FileCache:
     """
 
     def __init__(self, folder: Path, limit: int) -> None:
-        self._files, self._locks, self._half = folder / "files", folder / "locks", folder / "half"
+        self._files, self._locks, self._partial = folder / "files", folder / "locks", folder / "half"
         self._limit = limit
-        for path in (self._files, self._locks, self._half):
+        for path in (self._files, self._locks, self._partial):
             path.mkdir(parents=True, exist_ok=True)
 
     def link(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
@@ -71,10 +71,10 @@ class FileCache:
             StoreError: If `fetch` raises it.
             NoSpaceError: If the disk is full even after evicting all unused files.
         """
-        if self._linked(sha256, target):
+        if self._link(sha256, target):
             return
         with self._locked(sha256[:2]):
-            if self._linked(sha256, target):
+            if self._link(sha256, target):
                 return
             self._fill(sha256, size, target, fetch)
         self.evict()
@@ -85,27 +85,27 @@ class FileCache:
             if self._path(sha256).exists():
                 source.unlink()
             else:
-                self._keep(source, sha256)
+                self._add(source, sha256)
         self.evict()
 
-    def evict(self, wanted: int = 0) -> None:
+    def evict(self, reserve: int = 0) -> None:
         """Evict the least recently used files that are not in use.
 
         Args:
-            wanted: Bytes to leave free below the limit.
+            reserve: Bytes to leave free below the limit.
         """
-        if self._total() + wanted <= self._limit:
+        if self._total() + reserve <= self._limit:
             return
         with self._locked("evict"):
             entries = sorted(self._entries(), key=lambda entry: entry.used_at)
-            total = sum(entry.size for entry in entries) + wanted
+            total = sum(entry.size for entry in entries) + reserve
             for entry in entries:
                 if total <= self._limit:
                     break
-                if entry.names == 1:
+                if entry.links == 1:
                     entry.path.unlink(missing_ok=True)
                     total -= entry.size
-            self._remove_half_files()
+            self._remove_partial_files()
 
     def free(self, size: int) -> None:
         """Evict unused files to free `size` bytes of disk space for other purposes."""
@@ -113,52 +113,52 @@ class FileCache:
 
     def _fill(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
         self.evict(size)
-        half, found = self._half / secrets.token_hex(8), ""
+        partial, digest = self._partial / secrets.token_hex(8), ""
         try:
             for _ in range(_TRIES):
-                self._fetch(half, fetch)
-                found = file_digest(half)
-                if found == sha256:
-                    os.link(half, target)  # link first: a file without other links could be evicted
-                    self._keep(half, sha256)
+                self._fetch(partial, fetch)
+                digest = file_digest(partial)
+                if digest == sha256:
+                    os.link(partial, target)  # link first: a file without other links could be evicted
+                    self._add(partial, sha256)
                     return
         except FileNotFoundError as error:
             raise LostFileError(sha256) from error
         finally:
-            half.unlink(missing_ok=True)
-        _log.error("the file with SHA-256 %s is damaged in the store: the received file has %s", sha256, found)
+            partial.unlink(missing_ok=True)
+        _log.error("file damaged in the store: sha256=%s received=%s", sha256, digest)
         raise DamagedFileError(sha256)
 
-    def _fetch(self, half: Path, fetch: Fetch) -> None:
+    def _fetch(self, partial: Path, fetch: Fetch) -> None:
         """Fetch a file; if the disk is full, evict all unused files and retry."""
         try:
-            fetch(half)
+            fetch(partial)
             return
         except Exception as error:
             if not is_full(error):
                 raise
-        half.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
         self.evict(self._limit)
         try:
-            fetch(half)
+            fetch(partial)
         except Exception as error:
             if is_full(error):
                 raise NoSpaceError(f"The disk of {self._files.parent} is full.") from error
             raise
 
-    def _keep(self, source: Path, sha256: str) -> None:
+    def _add(self, source: Path, sha256: str) -> None:
         """Move a file into the cache.
 
         The modification time is derived from the digest, so that it is the same on every host and after every fetch.
         """
-        moment = int(sha256[:8], 16)
+        seconds = int(sha256[:8], 16)
         source.chmod(0o400)
-        os.utime(source, ns=(time.time_ns(), moment * 1_000_000_000))
+        os.utime(source, ns=(time.time_ns(), seconds * 1_000_000_000))
         final = self._path(sha256)
         final.parent.mkdir(exist_ok=True)
         source.replace(final)
 
-    def _linked(self, sha256: str, target: Path) -> bool:
+    def _link(self, sha256: str, target: Path) -> bool:
         path = self._path(sha256)
         try:
             os.link(path, target)
@@ -168,7 +168,7 @@ class FileCache:
             return False
         if file_digest(target) == sha256:
             return True
-        _log.error("%s is damaged; fetching it again", path)
+        _log.error("cached file damaged, fetching it again: path=%s", path)
         target.unlink()
         path.unlink(missing_ok=True)
         return False
@@ -185,11 +185,11 @@ class FileCache:
                 status = path.stat()
                 yield _Entry(path, status.st_size, status.st_nlink, status.st_atime_ns)
 
-    def _remove_half_files(self) -> None:
-        for path in self._half.iterdir():
+    def _remove_partial_files(self) -> None:
+        for path in self._partial.iterdir():
             with contextlib.suppress(FileNotFoundError):
                 # ctime, because a complete file has a synthetic modification time shortly before it is moved
-                if path.stat().st_ctime < time.time() - _HALF_SECONDS:
+                if path.stat().st_ctime < time.time() - _PARTIAL_SECONDS:
                     path.unlink()
 
     @contextlib.contextmanager
@@ -209,7 +209,7 @@ def file_digest(path: Path) -> str:
 def is_full(error: BaseException | None) -> bool:
     """Return whether an error, or one of its causes, reports a full disk."""
     while error is not None:
-        if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -59,12 +59,12 @@ class ObjectStore:
             self._files.retries = _TRIES
 
     def _protocols(self) -> tuple[str, ...]:
-        found = self._files.protocol
-        return (found,) if isinstance(found, str) else tuple(found)
+        protocol = self._files.protocol
+        return (protocol,) if isinstance(protocol, str) else tuple(protocol)
 
     def put(self, source: Path, name: str) -> None:
         """Upload a file atomically; it must not change during the upload."""
-        with self._told(name):
+        with self._translated(name):
             options = {"chunksize": _PIECE_BYTES, "max_concurrency": _PIECES} if self._s3 else {}
             self._files.put_file(str(source), self._path(name), **options)
 
@@ -74,7 +74,7 @@ class ObjectStore:
         Raises:
             FileNotFoundError: If there is no such object.
         """
-        with self._told(name):
+        with self._translated(name):
             if self._s3:
                 self._get_pieces(self._path(name), target)
             else:
@@ -98,7 +98,7 @@ class ObjectStore:
             FileNotFoundError: If there is no such object.
             TruncatedError: If the object ends before `stop`.
         """
-        with self._told(name), self._files.open(self._path(name), "rb") as file:
+        with self._translated(name), self._files.open(self._path(name), "rb") as file:
             file.seek(start)
             left = stop - start
             while left > 0:
@@ -110,7 +110,7 @@ class ObjectStore:
 
     def exists(self, name: str) -> bool:
         """Return whether the object exists, bypassing caches."""
-        with self._told(name):
+        with self._translated(name):
             self._files.invalidate_cache()
             return bool(self._files.isfile(self._path(name)))
 
@@ -120,7 +120,7 @@ class ObjectStore:
         Raises:
             FileNotFoundError: If there is no such object.
         """
-        with self._told(name):
+        with self._translated(name):
             if self.local:
                 status = Path(self._path(name)).stat()
                 return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
@@ -141,7 +141,7 @@ class ObjectStore:
         Raises:
             FileNotFoundError: If there is no such object.
         """
-        with self._told(name), self._files.open(self._path(name), "rb") as file:
+        with self._translated(name), self._files.open(self._path(name), "rb") as file:
             digest = hashlib.sha256()
             while data := file.read(_CHUNK):
                 digest.update(data)
@@ -156,17 +156,17 @@ class ObjectStore:
         """
         fault = self.fault(name, sha256)
         if fault is not None:
-            _log.error("%s in %s, which should have the SHA-256 %s, is %s", name, self.url, sha256, fault)
+            _log.error("file %s: store=%s name=%s sha256=%s", fault, self.url, name, sha256)
             raise LostFileError(sha256) if fault == "missing" else DamagedFileError(sha256)
 
     def fault(self, name: str, sha256: str) -> Literal["missing", "damaged"] | None:
         """Return the fault of an object that should have this SHA-256; None if it is intact."""
         try:
             before = self.stamp(name)
-            found = self.digest(name)
+            digest = self.digest(name)
         except FileNotFoundError:
             return "missing"
-        if found != sha256:
+        if digest != sha256:
             return "damaged"
         self._checked[name] = before, sha256, time.monotonic()
         if len(self._checked) > _MAX_CHECKED:
@@ -190,30 +190,32 @@ class ObjectStore:
 
     def move(self, name: str, new_name: str) -> None:
         """Rename an object."""
-        with self._told(name):
+        with self._translated(name):
             if self.local:
                 Path(self._path(new_name)).parent.mkdir(parents=True, exist_ok=True)
             self._files.mv(self._path(name), self._path(new_name))
 
     def remove(self, name: str) -> None:
         """Remove an object if it exists."""
-        with self._told(name), contextlib.suppress(FileNotFoundError):
+        with self._translated(name), contextlib.suppress(FileNotFoundError):
             self._files.rm_file(self._path(name))
 
     def remove_below(self, folder: str) -> None:
         """Remove all objects in a folder."""
-        with self._told(folder), contextlib.suppress(FileNotFoundError):
+        with self._translated(folder), contextlib.suppress(FileNotFoundError):
             self._files.invalidate_cache()
             self._files.rm(self._path(folder), recursive=True)
 
     def below(self, folder: str) -> dict[str, float]:
         """Return the modification times of all objects in a folder by name, in seconds since 1970 (0 if unknown)."""
-        with self._told(folder):
+        with self._translated(folder):
             self._files.invalidate_cache()
             inside = f"{self._path(folder).rstrip('/')}/"
-            found = self._files.find(inside, detail=True)  # some stores list an empty folder as an object
+            entries = self._files.find(inside, detail=True)  # some stores list an empty folder as an object
             return {
-                path[len(self.root) + 1 :]: _changed(entry) for path, entry in found.items() if path.startswith(inside)
+                path[len(self.root) + 1 :]: _changed(entry)
+                for path, entry in entries.items()
+                if path.startswith(inside)
             }
 
     def can_join(self, sizes: list[int]) -> bool:
@@ -223,20 +225,20 @@ class ObjectStore:
 
     def join(self, parts: list[str], name: str) -> None:
         """Concatenate objects on the server, by an S3 multipart upload with copied parts; see `can_join`."""
-        with self._told(name):
-            where = dict(zip(("Bucket", "Key"), self._path(name).split("/", 1), strict=True))
-            begun = self._files.call_s3("create_multipart_upload", **where)
-            where["UploadId"] = begun["UploadId"]
+        with self._translated(name):
+            target = dict(zip(("Bucket", "Key"), self._path(name).split("/", 1), strict=True))
+            created = self._files.call_s3("create_multipart_upload", **target)
+            target["UploadId"] = created["UploadId"]
             try:
                 done = []
                 for number, part in enumerate(parts, 1):
                     source = dict(zip(("Bucket", "Key"), self._path(part).split("/", 1), strict=True))
-                    copied = self._files.call_s3("upload_part_copy", **where, PartNumber=number, CopySource=source)
+                    copied = self._files.call_s3("upload_part_copy", **target, PartNumber=number, CopySource=source)
                     done.append({"PartNumber": number, "ETag": copied["CopyPartResult"]["ETag"]})
-                self._files.call_s3("complete_multipart_upload", **where, MultipartUpload={"Parts": done})
+                self._files.call_s3("complete_multipart_upload", **target, MultipartUpload={"Parts": done})
             except BaseException:
                 with contextlib.suppress(Exception):
-                    self._files.call_s3("abort_multipart_upload", **where)
+                    self._files.call_s3("abort_multipart_upload", **target)
                 raise
             self._files.invalidate_cache()
 
@@ -245,9 +247,9 @@ class ObjectStore:
         if not self._s3:
             return 0
         bucket, _, prefix = self.root.partition("/")
-        with self._told(prefix):
-            found = self._files.call_s3("list_multipart_uploads", Bucket=bucket, Prefix=prefix)
-            old = [entry for entry in found.get("Uploads", ()) if entry["Initiated"].timestamp() < before]
+        with self._translated(prefix):
+            listing = self._files.call_s3("list_multipart_uploads", Bucket=bucket, Prefix=prefix)
+            old = [entry for entry in listing.get("Uploads", ()) if entry["Initiated"].timestamp() < before]
             for entry in old:
                 self._files.call_s3(
                     "abort_multipart_upload", Bucket=bucket, Key=entry["Key"], UploadId=entry["UploadId"]
@@ -257,17 +259,17 @@ class ObjectStore:
     def ping(self) -> None:
         """Raise OSError or StoreError if the store cannot be reached."""
         # a prefix of a bucket does not exist before the first object in it
-        place = self.root if self.local else self.root.partition("/")[0]
-        with self._told(place):
+        root = self.root if self.local else self.root.partition("/")[0]
+        with self._translated(root):
             self._files.invalidate_cache()
-            if not self._files.exists(place):
-                raise FileNotFoundError(f"The results' place {place!r} is not there, or cannot be reached.")
+            if not self._files.exists(root):
+                raise FileNotFoundError(f"The file store {root!r} does not exist or cannot be reached.")
 
     def make_bucket(self) -> None:
         """Create the bucket of an S3 store if it does not exist."""
         if self._s3:
             bucket = self.root.partition("/")[0]
-            with self._told(bucket):
+            with self._translated(bucket):
                 self._files.invalidate_cache()
                 if not self._files.exists(bucket):
                     self._files.mkdir(bucket)
@@ -280,7 +282,7 @@ class ObjectStore:
         return f"{self.root}/{name}"
 
     @contextlib.contextmanager
-    def _told(self, name: str) -> Iterator[None]:
+    def _translated(self, name: str) -> Iterator[None]:
         """Convert all errors of a remote store, whatever library raises them, to `StoreError`."""
         try:
             yield
@@ -309,8 +311,8 @@ def _options(url: str) -> dict[str, Any]:
 
 def _changed(entry: dict[str, Any]) -> float:
     """Return the modification time of an object from its file system entry."""
-    found = entry.get("LastModified") or entry.get("created")
-    if isinstance(found, float):  # local file: ctime changes with the file's links, mtime does not
-        return max(found, float(entry.get("mtime", 0.0)))
-    found = found or entry.get("mtime")
-    return found.timestamp() if isinstance(found, datetime) else float(found or 0.0)
+    modified = entry.get("LastModified") or entry.get("created")
+    if isinstance(modified, float):  # local file: ctime changes with the file's links, mtime does not
+        return max(modified, float(entry.get("mtime", 0.0)))
+    modified = modified or entry.get("mtime")
+    return modified.timestamp() if isinstance(modified, datetime) else float(modified or 0.0)

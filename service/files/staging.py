@@ -56,12 +56,12 @@ def clean_name(role: str, name: str, number: int) -> str:
     Photos keep their folders, because cameras may refer to them; other files keep only the last path component.
     """
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", ".")]
-    plain = [_last_bytes(re.sub(r"[^\w .+@,=()-]+", "_", part)).strip() for part in parts]
-    kept = [part if not part.startswith(".") else f"_{part[1:]}" for part in plain if part]
+    stripped = [_last_bytes(re.sub(r"[^\w .+@,=()-]+", "_", part)).strip() for part in parts]
+    cleaned = [part if not part.startswith(".") else f"_{part[1:]}" for part in stripped if part]
     if role != "photos":
-        kept = kept[-1:]
+        cleaned = cleaned[-1:]
     fallback = {"scene": "scene.ply", "style": "style", "cameras": "cameras.json"}.get(role, f"photo_{number}")
-    return "/".join(kept[-_MAX_DEPTH:]) or fallback
+    return "/".join(cleaned[-_MAX_DEPTH:]) or fallback
 
 
 def _last_bytes(part: str) -> str:
@@ -99,13 +99,13 @@ def check_roles(
     Raises:
         RefusedInputError: If a file is missing, superfluous or inconsistent with the parameters.
     """
-    found = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
+    by_role = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
     for role, most in (("scene", 1), ("style", MOST_STYLES)):
-        if not 1 <= len(found[role]) <= most:
-            what = "is missing" if not found[role] else f"is there {len(found[role])} times"
+        if not 1 <= len(by_role[role]) <= most:
+            what = "is missing" if not by_role[role] else f"is there {len(by_role[role])} times"
             times = "once" if most == 1 else f"once, or up to {most} of them"
             raise RefusedInputError(f"The file {role!r} {what}. Send it {times}.", "invalid-request", input=role)
-    own = _check_region_styles([entry["name"] for entry in found["style"]], of_regions)
+    own = _check_region_styles([entry["name"] for entry in by_role["style"]], of_regions)
     if weights is not None and len(weights) != own:
         raise RefusedInputError(
             f"style_weights has {len(weights)} values for {own} files 'style' that belong to no region. Give one per "
@@ -113,32 +113,32 @@ def check_roles(
             "invalid-request",
             input="style_weights",
         )
-    if not found["cameras"] and not orbit:
+    if not by_role["cameras"] and not orbit:
         raise RefusedInputError(
             "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit'.",
             "invalid-cameras",
             input="cameras",
         )
-    if found["cameras"] and orbit:
+    if by_role["cameras"] and orbit:
         raise RefusedInputError(
             "Both 'cameras' and the parameter 'orbit' were sent. Send only one of them.",
             "invalid-cameras",
             input="cameras",
         )
-    if found["photos"] and orbit:
+    if by_role["photos"] and orbit:
         raise RefusedInputError(
             "'photos' requires 'cameras', and cannot be combined with 'orbit'. Send 'cameras' instead.",
             "invalid-cameras",
             input="photos",
         )
-    _check_camera_files([entry["name"] for entry in found["cameras"]])
+    _check_camera_files([entry["name"] for entry in by_role["cameras"]])
     names = [(entry["role"], entry["name"].lower()) for entry in inputs]
     twice = (
         next((name for name in names if names.count(name) > 1), None) if len(names) < 50 else _first_duplicate(names)
     )
     if twice:
         raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}. Rename one.", "invalid-request")
-    _check_folders(found["photos"])
+    _check_folders(by_role["photos"])
 
 
 def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int:

@@ -30,7 +30,7 @@ from service.store.tables import BlobRow, UploadPartRow, UploadRow
 #: Age in seconds at which objects without a database row are removed; younger objects may not have their row yet.
 _ORPHAN_SECONDS = 6 * 3600.0
 #: Interval between searches of the store for objects without a database row, in seconds.
-_LOOK_SECONDS = 3600.0
+_SEARCH_SECONDS = 3600.0
 
 _log = logging.getLogger(__name__)
 
@@ -53,23 +53,23 @@ class StoredBlobs(Blobs):
     def __init__(self, settings: ServiceSettings, inputs: Inputs, objects: ObjectStore) -> None:
         super().__init__(settings.folder, inputs, settings.min_free_bytes, objects)
         self._cache = open_cache(settings)
-        self._before = settings.folder / "blobs"  # inputs from a time when the file store was local
-        self._looked_at = float("-inf")
+        self._local = settings.folder / "blobs"  # inputs from a time when the file store was local
+        self._searched_at = float("-inf")
 
-    def ensure_room(self, size: int) -> None:
+    def ensure_space(self, size: int) -> None:
         """Raise NoSpaceError if `size` more bytes do not fit, even after evicting cached files."""
         try:
-            super().ensure_room(size)
+            super().ensure_space(size)
         except NoSpaceError:
             self._cache.free(size + self._min_free - shutil.disk_usage(self.incoming).free)
-            super().ensure_room(size)
+            super().ensure_space(size)
 
-    def keep(self, path: Path, upload_id: str | None = None) -> str:
+    def add(self, path: Path, upload_id: str | None = None) -> str:
         """Upload a received file unless its content is already stored, and move it into the cache."""
         sha256, size = file_digest(path), path.stat().st_size
         location = self._inputs.hold_known(sha256, size, upload_id)
         if location is not None:
-            self._heal(location, sha256, path)
+            self._repair(location, sha256, path)
         else:
             location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
             self.objects.put(path, f"{BLOBS}/{location}")
@@ -83,17 +83,17 @@ class StoredBlobs(Blobs):
             try:
                 self.objects.remove(f"{BLOBS}/{location}")
             except StoreError as error:
-                _log.warning("an unused input stays until the next sweep of the store: %s", error.__cause__)
+                _log.warning("unused input not deleted yet: name=%s error=%s", location, error.__cause__)
 
-    def bring(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
+    def fetch(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
         """Return links in `folder` to this host's cached copies, after fetching missing ones."""
-        place = folder / ".inputs"
-        place.mkdir()
-        found = {}
+        target = folder / ".inputs"
+        target.mkdir()
+        paths = {}
         for sha256, row in rows.items():
-            found[sha256] = place / sha256
-            self._cache.link(sha256, row.size, found[sha256], partial(self.objects.get, f"{BLOBS}/{row.location}"))
-        return found
+            paths[sha256] = target / sha256
+            self._cache.link(sha256, row.size, paths[sha256], partial(self.objects.get, f"{BLOBS}/{row.location}"))
+        return paths
 
     def _register(self, sha256: str, location: str, size: int, upload_id: str | None) -> str:
         """Register an object as a blob and return the blob's location; a duplicate object is removed.
@@ -110,7 +110,7 @@ class StoredBlobs(Blobs):
             self.remove([location])
         return known
 
-    def _heal(self, location: str, sha256: str, path: Path) -> None:
+    def _repair(self, location: str, sha256: str, path: Path) -> None:
         """Replace a blob with this file if the blob is lost or damaged."""
         try:
             self.objects.check_once(f"{BLOBS}/{location}", sha256)
@@ -119,7 +119,7 @@ class StoredBlobs(Blobs):
 
     # --- uploads ---------------------------------------------------------------------------------------------------
 
-    def begin_upload(self, upload_id: str) -> None:
+    def start_upload(self, upload_id: str) -> None:
         """Do nothing: no preparation is needed."""
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
@@ -140,7 +140,7 @@ class StoredBlobs(Blobs):
             self._inputs.finish_upload(upload.id, sha256, seconds)
         finally:
             whole.unlink(missing_ok=True)
-        self.forget_upload(upload.id)
+        self.discard_upload(upload.id)
         return sha256
 
     def _finish(self, upload: UploadRow, whole: Path) -> str:
@@ -156,17 +156,17 @@ class StoredBlobs(Blobs):
         parts = self._inputs.parts(upload.id)
         if sum(part.size for part in parts) != upload.length:
             raise FileNotFoundError(upload.id)
-        self.ensure_room(upload.length)
+        self.ensure_space(upload.length)
         joined = self._join(upload.id, parts)
         if joined is None:
             self._gather([part.location for part in parts], whole)
-            return self.keep(whole, upload.id)
+            return self.add(whole, upload.id)
         # hash the stored object itself, because it becomes the blob
         self.objects.get(f"{BLOBS}/{joined}", whole)
         sha256 = file_digest(whole)
         location = self._register(sha256, joined, upload.length, upload.id)
         if location != joined:
-            self._heal(location, sha256, whole)
+            self._repair(location, sha256, whole)
         self._cache.adopt(whole, sha256)
         return sha256
 
@@ -178,7 +178,7 @@ class StoredBlobs(Blobs):
         try:
             self.objects.join([part.location for part in parts], f"{BLOBS}/{location}")
         except StoreError as error:
-            _log.warning("the store cannot join parts; sending the whole file: %s", error.__cause__)
+            _log.warning("joining parts failed, sending the whole file: %s", error.__cause__)
             return None
         return location
 
@@ -195,7 +195,7 @@ class StoredBlobs(Blobs):
         finally:
             piece.unlink(missing_ok=True)
 
-    def forget_upload(self, upload_id: str) -> None:
+    def discard_upload(self, upload_id: str) -> None:
         """Remove the upload's objects."""
         self.objects.remove_below(f"{UPLOADS}/{upload_id}")
 
@@ -206,8 +206,8 @@ class StoredBlobs(Blobs):
         self.remove(unused)
         removed = len(unused)
         self._cache.evict()
-        if time.monotonic() - self._looked_at > _LOOK_SECONDS:
-            self._looked_at = time.monotonic()
+        if time.monotonic() - self._searched_at > _SEARCH_SECONDS:
+            self._searched_at = time.monotonic()
             self._take_over()
             removed += self._collect_orphans() + self.objects.abort_old_parts(self._expiry() - _ORPHAN_SECONDS)
         return removed
@@ -227,8 +227,8 @@ class StoredBlobs(Blobs):
 
     def _take_over(self) -> None:
         """Upload inputs that remain from a time when the file store was a local folder."""
-        known = self._inputs.locations() if self._before.is_dir() else set()
-        for path in self._before.glob("*/*"):
+        known = self._inputs.locations() if self._local.is_dir() else set()
+        for path in self._local.glob("*/*"):
             location = f"{path.parent.name}/{path.name}"
             if location in known:
                 self.objects.put(path, f"{BLOBS}/{location}")

@@ -74,11 +74,11 @@ class Compressor:
 
     async def _compress(self, job: JobRow, result: ArtifactRow, name: str) -> None:
         """Compress the result, store the files, and make them visible."""
-        self._blobs.ensure_room(3 * result.size)
+        self._blobs.ensure_space(3 * result.size)
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
             staged = await asyncio.to_thread(self._stage, Path(folder), job, result)
             request = {
-                "work": "pack",
+                "work": "compress",
                 "folder": folder,
                 "staged": staged.as_json(),
                 "parameters": stored_parameters(job.parameters).model_dump(mode="json"),
@@ -92,7 +92,7 @@ class Compressor:
     def _stage(self, folder: Path, job: JobRow, result: ArtifactRow) -> Staged:
         """Stage the job's inputs, with the result in place of the scene."""
         rows = self._store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
-        staged = stage(folder, job.inputs, self._blobs.bring(rows, folder))
+        staged = stage(folder, job.inputs, self._blobs.fetch(rows, folder))
         self._artifacts.fetch(result.location, folder / RESULT, result.sha256)
         return replace(staged, scene=Path(RESULT))
 
@@ -105,7 +105,7 @@ class Compressor:
             self._artifacts.put(job.id, epoch, f"{name}.json", loss_file, final=True),
             self._artifacts.put(job.id, epoch, name, folder / name, final=True),
         ]
-        for location in self._store.jobs.add_made(result, files):
+        for location in self._store.jobs.add_derived(result, files):
             self._artifacts.remove(location)
 
     async def close(self) -> None:

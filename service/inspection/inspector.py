@@ -172,7 +172,7 @@ class Inspector:
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
         for feature in missing():
-            _log.warning("files are read without %s", feature)
+            _log.warning("confinement incomplete: missing %s", feature)
         for leftover in self._folder.iterdir():  # left behind by a killed process
             if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
                 shutil.rmtree(leftover, ignore_errors=True)
@@ -248,7 +248,7 @@ class Inspector:
     ) -> dict[str, Any]:
         seconds = await asyncio.to_thread(self._seconds, work, _size(inputs), inputs, parameters)
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
-            paths = await asyncio.to_thread(self._blobs.bring, rows, Path(folder))
+            paths = await asyncio.to_thread(self._blobs.fetch, rows, Path(folder))
             staged = await asyncio.to_thread(stage, Path(folder), inputs, paths)
             request = {
                 "work": work,
@@ -317,5 +317,5 @@ def findings_of(answer: Mapping[str, Any]) -> dict[str, Any]:
     if "error" in answer:
         error = answer["error"]
         raise RefusedInputError(error["message"], error["code"], error["input"])
-    found: dict[str, Any] = answer["found"]
-    return found
+    findings: dict[str, Any] = answer["found"]
+    return findings

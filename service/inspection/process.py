@@ -102,7 +102,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
-    found: dict[str, Any] = {}
+    findings: dict[str, Any] = {}
     source = scene_request(staged, parameters)
     with _errors_of("scene"):
         header = read_scene_header(staged.scene)
@@ -116,13 +116,13 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         axes, about_axes = choose_axes(source, staged.photos)
         file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
         check_sh_attenuation(file, settings.sh_attenuation)
-        found |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
+        findings |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _errors_of("style"):
         for path in staged.styles:
             _check_pixel_count(path, limits)
         job = stylize_request(staged, parameters)
         style = load_styles(job.styles, job.style_background)
-        found["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
+        findings["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
     with _errors_of("cameras"):
         check_choice(source)
         capture = read_capture(source, file.scene, staged.photos).fitted(settings)
@@ -141,14 +141,14 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         for photo in capture.photos or []:
             _check_pixel_count(photo.path, limits)
             load_image(photo.path)
-        found["photos"] = len(capture.photos or [])
+        findings["photos"] = len(capture.photos or [])
     with _errors_of("cameras"):
         capture = capture.checked(file.scene, source.near)
-        found |= {"views": len(capture.cameras), "pixels": _pixels(capture.cameras)}
+        findings |= {"views": len(capture.cameras), "pixels": _pixels(capture.cameras)}
     with _errors_of("regions"):
         regions = read_regions(job, file, capture.cameras)
     capture = replace(capture, decisions=(*about_axes, *capture.decisions))
-    return found, _Inputs(file.scene, capture, style, regions)
+    return findings, _Inputs(file.scene, capture, style, regions)
 
 
 def _pixels(cameras: Sequence[Camera]) -> int:
@@ -163,21 +163,21 @@ def _refinement_note(settings: Settings) -> str:
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """Return the findings of `validate` and the plan of `sgsst plan`; `show` receives the progress."""
-    found, read = _read_inputs(staged, parameters, limits)
+    findings, inputs = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
-    settings, regions, cameras = request.settings, read.regions, read.capture.cameras
-    refinement = refine(read.scene, cameras, read.style, settings, weights=weights, regions=regions, show=show)
+    settings, regions, cameras = request.settings, inputs.regions, inputs.capture.cameras
+    refinement = refine(inputs.scene, cameras, inputs.style, settings, weights=weights, regions=regions, show=show)
     job_plan, _ = make_plan(
-        refined(read.scene, refinement),
+        refined(inputs.scene, refinement),
         cameras,
         settings,
         weights=weights,
         measured=True,
         show=show,
-        orbit=read.capture.orbit,
-        about_inputs=read.capture.decisions,
-        style=read.style,
+        orbit=inputs.capture.orbit,
+        about_inputs=inputs.capture.decisions,
+        style=inputs.style,
         regions=regions and regions.refined(refinement),
         refinement=refinement,
     )
@@ -187,7 +187,7 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
         coarse = job_plan.prediction.seconds_coarse or job_plan.prediction.seconds
         seconds = job_plan.prediction.seconds * request.settings.steps_sos + coarse * job_plan.steps_coarse
     return {
-        **found,
+        **findings,
         "plan": plan_json(job_plan),
         "estimated_seconds": seconds,
         "memory_bytes": memory,
@@ -195,7 +195,7 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
     }
 
 
-def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]:
+def compress(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]:
     """Compress a job's result, staged in place of its scene, into a file whose suffix determines the format.
 
     Returns:
@@ -213,7 +213,7 @@ def pack(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]
 WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], dict[str, Any]]] = {
     "validate": lambda staged, parameters, limits, show: validate(staged, parameters, limits),
     "plan": plan,
-    "pack": lambda staged, parameters, limits, show: pack(staged, parameters, limits["name"]),
+    "compress": lambda staged, parameters, limits, show: compress(staged, parameters, limits["name"]),
 }
 
 
@@ -337,7 +337,7 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
             torch.set_num_threads(request["threads"])
         _die_first()
         # threads that wait for each other use CPU time too
-        _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _memory_beside_reading(request))
+        _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _memory_besides_reading(request))
         with os.fdopen(writing, "w") as file:
 
             def show(now: PlanningProgress) -> None:
@@ -375,7 +375,7 @@ def _confine(request: dict[str, Any]) -> list[None]:
     links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
     linked = [path.resolve() for path in links if path.is_symlink()]
     result, most_bytes = None, 0
-    if request["work"] == "pack":
+    if request["work"] == "compress":
         result = folder / request["limits"]["name"]
         result.touch()
         most_bytes = (folder / request["staged"]["scene"]).stat().st_size + (1 << 20)  # a compressed scene is smaller
@@ -415,7 +415,7 @@ def _die_first() -> None:
         Path("/proc/self/oom_score_adj").write_text("500")
 
 
-def _memory_beside_reading(request: dict[str, Any]) -> int:
+def _memory_besides_reading(request: dict[str, Any]) -> int:
     """Return the memory limit in bytes for everything but reading: threads, and planning or compressing."""
     threads: int = request["threads"] * _THREAD_BYTES
     if request["work"] == "validate":

@@ -88,12 +88,12 @@ _NUMBER_AT, _ARCHITECTURE_AT, _FIRST_ARGUMENT_AT = 0, 4, 16
 
 def missing() -> list[str]:
     """Return messages for the operator about the confinement features that this kernel lacks."""
-    found = []
+    messages = []
     if _landlock_version() < 1:
-        found.append("Landlock (Linux 5.13): a reader that is taken over can read what this user can read")
+        messages.append("Landlock (Linux 5.13): a reader that is taken over can read what this user can read")
     if not _has_seccomp():
-        found.append("seccomp filters: a reader that is taken over can use the network and signal other processes")
-    return found
+        messages.append("seccomp filters: a reader that is taken over can use the network and signal other processes")
+    return messages
 
 
 def confine(readable: Iterable[Path], writable: Path | None, most_bytes: int) -> None:

@@ -94,7 +94,7 @@ class Dispatcher:
             if is_dead(name):
                 _log.info("taking over jobs of a dead dispatcher: name=%s", name)
                 self._store.leases.expire(name)
-                self._store.operations.gone(name)
+                self._store.operations.remove_dispatcher(name)
         if self._work.parent.is_dir():
             for path in self._work.parent.iterdir():
                 if is_dead(path.name):
@@ -120,7 +120,7 @@ class Dispatcher:
         """Send a heartbeat if it is due."""
         if time.monotonic() - self._announced_at >= RENEW_FRACTION * self._settings.lease_seconds:
             free = self._capacity.free([attempt.grant for attempt in self._running.values()])
-            self._store.operations.beat(self.name, self._capacity.size, free)
+            self._store.operations.record_heartbeat(self.name, self._capacity.size, free)
             self._announced_at = time.monotonic()
 
     def _start_attempt(self, lease: Lease, grant: Grant) -> None:
@@ -134,7 +134,7 @@ class Dispatcher:
         for attempt in self._running.values():
             attempt.release()
         with contextlib.suppress(DatabaseUnavailableError):
-            self._store.operations.gone(self.name)
+            self._store.operations.remove_dispatcher(self.name)
         while any(attempt.alive for attempt in self._running.values()):
             with contextlib.suppress(DatabaseUnavailableError, LeaseLostError):
                 self._lease_keeper.update()

@@ -185,7 +185,7 @@ class RunningAttempt:
         if message["kind"] == "stored":
             self._publisher.publish([Published(**message["file"])])
         if message["kind"] == "prepared":
-            self._store.leases.begin(self.lease)
+            self._store.leases.start(self.lease)
         self._progress.update(message)
 
     def _count_gpus(self) -> None:

@@ -74,7 +74,7 @@ class JobSelector:
         self._pace = measured_pace(holdings, self._pace)
         if self._capacity.free([each.grant for each in holdings]) < 1:
             return None  # without a query, which would lock rows that other dispatchers want
-        dispatchers = max(1, self._store.operations.alive())
+        dispatchers = max(1, self._store.operations.dispatcher_count())
         if not (waiting := self._store.leases.waiting(self._capacity.size * dispatchers)):
             return None
         waiting = -(-waiting // dispatchers)  # other dispatchers take their portion of the queue

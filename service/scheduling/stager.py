@@ -61,7 +61,7 @@ class Stager:
                 self._artifacts.fetch(checkpoint.location, target, checkpoint.sha256)
             except (LostFileError, DamagedFileError) as error:
                 _log.warning("checkpoint not usable, job restarts: %s", error, extra=lease.log_fields)
-        return stage(folder, lease.job.inputs, self._blobs.bring(self._input_rows(lease), folder))
+        return stage(folder, lease.job.inputs, self._blobs.fetch(self._input_rows(lease), folder))
 
     def _input_rows(self, lease: Lease) -> dict[str, BlobRow]:
         return self._store.inputs.blobs(sorted({entry["sha256"] for entry in lease.job.inputs}))

@@ -20,7 +20,7 @@ from service.store.retries import RetryPolicy
 from service.store.sessions import Sessions
 
 #: Interval between attempts to connect to an unavailable database, in seconds.
-_ASK_AGAIN_SECONDS = 1.0
+_RETRY_SECONDS = 1.0
 
 _log = logging.getLogger(__name__)
 
@@ -70,8 +70,8 @@ def open_store(
         except DatabaseUnavailableError as error:
             if time.monotonic() >= until:
                 raise
-            _log.warning("the database does not answer yet: %s", error.__cause__ or error)
-            time.sleep(_ASK_AGAIN_SECONDS)
+            _log.warning("database unavailable, retrying: %s", error.__cause__ or error)
+            time.sleep(_RETRY_SECONDS)
         else:
-            store.database.look_back()
+            store.database.detect_rollback()
             return store

@@ -31,7 +31,7 @@ Clock = Callable[[], float]
 #: Maximum speed of the expiry time, in seconds per second of a dispatcher's work.
 CATCH_UP = 24.0
 #: Interval between queries of the server's time, in seconds.
-_ASK_SECONDS = 10.0
+_QUERY_SECONDS = 10.0
 #: Name of the counter that stores the expiry time.
 _NAME = "sgsst_expiry_time"
 _EXPIRY = select(CounterRow.value).where(CounterRow.name == _NAME, CounterRow.labels == "")
@@ -43,23 +43,23 @@ class ServerClock:
     It is never ahead of the server's clock, and behind by at most the duration of a query.
 
     Args:
-        ask: Function that queries the server's time in seconds since 1970.
+        query: Function that queries the server's time in seconds since 1970.
     """
 
-    def __init__(self, ask: Clock) -> None:
-        self._ask = ask
-        self._asked_at = -math.inf
+    def __init__(self, query: Clock) -> None:
+        self._query = query
+        self._queried_at = -math.inf
         self._offset: float | None = None
 
     def __call__(self) -> float:
         """Return the time in seconds since 1970."""
         now = time.monotonic()
-        if self._offset is None or now - self._asked_at > _ASK_SECONDS:
-            self._asked_at = now  # other threads use the old offset meanwhile
+        if self._offset is None or now - self._queried_at > _QUERY_SECONDS:
+            self._queried_at = now  # other threads use the old offset meanwhile
             try:
-                server = self._ask()
+                server = self._query()
             except BaseException:
-                self._asked_at = -math.inf
+                self._queried_at = -math.inf
                 raise
             self._offset = server - time.monotonic()
         return self._offset + time.monotonic()
@@ -70,8 +70,8 @@ def expiry_time(connection: Connection | Session, now: float) -> float:
     return min(now, _stored_time(connection, now))
 
 
-def kept_until(connection: Connection | Session, now: float, seconds: float) -> float:
-    """Return the time at which data that are kept for `seconds` expire.
+def retained_until(connection: Connection | Session, now: float, seconds: float) -> float:
+    """Return the time at which data that are retained for `seconds` expire.
 
     The period starts at the later of the clock and the expiry time. If the clock is behind, data would otherwise expire
     as soon as the clock is corrected.
@@ -80,8 +80,8 @@ def kept_until(connection: Connection | Session, now: float, seconds: float) -> 
 
 
 def _stored_time(connection: Connection | Session, now: float) -> float:
-    found: float | None = connection.execute(_EXPIRY).scalar()
-    return now if found is None else found
+    stored: float | None = connection.execute(_EXPIRY).scalar()
+    return now if stored is None else stored
 
 
 def advance_expiry_time(session: Session, now: float, seconds: float) -> None:

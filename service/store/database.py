@@ -27,10 +27,10 @@ from service.store.tables import Base, CounterRow, IdempotencyRow
 #: Version of the newest migration; a database with this version is opened without loading the migrations.
 SCHEMA = "0006"
 MIGRATIONS = Path(__file__).with_name("migrations")
-#: Default timeout in seconds of each wait of a transaction: for its turn to write, a connection, and each response.
+#: Default timeout in seconds of each wait of a transaction: for the write lock, a connection, and each response.
 ANSWER_SECONDS = 30.0
 #: Timeout of health checks and of queries of the server's time, on separate connections, in seconds.
-_ASIDE_SECONDS = 2.0
+_RESERVED_SECONDS = 2.0
 #: Connection options for PostgreSQL: an unreachable server is detected within seconds rather than by TCP's own timeout.
 _LOST_AFTER = {
     "connect_timeout": 5,
@@ -56,7 +56,7 @@ class Database:
     Args:
         url: SQLAlchemy URL of the database.
         clock: Clock to use; None for the server's clock, or this machine's with SQLite.
-        answer_seconds: Timeout in seconds of each wait of a transaction: for its turn to write, a connection, and each
+        answer_seconds: Timeout in seconds of each wait of a transaction: for the write lock, a connection, and each
             response.
     """
 
@@ -70,9 +70,9 @@ class Database:
         self.engine = self._make_engine(answer_seconds, pool_size=20, max_overflow=30)
         self._writer = self.engine.execution_options(sgsst_writes=True)
         self._marker = Marker(Path(self.url.database)) if self.sqlite and self.url.database else None
-        self._aside = self._make_engine(_ASIDE_SECONDS, pool_size=2, max_overflow=0)
+        self._reserved = self._make_engine(_RESERVED_SECONDS, pool_size=2, max_overflow=0)
         # SQLite's writers wait for each other by polling; a lock avoids that within one process
-        self._turn = threading.Lock() if self.sqlite else None
+        self._write_lock = threading.Lock() if self.sqlite else None
         self._reads, self._writes = Gate(), Gate()
 
     def _make_engine(self, seconds: float | None, **pool: int) -> Engine:
@@ -96,7 +96,7 @@ class Database:
         """Provide a transaction that is committed at the end of the block; on SQLite it is the only writer."""
         with (
             self._writes.guarded(),
-            self._taking_turns(),
+            self._locked_for_writing(),
             Session(self._writer, expire_on_commit=False) as session,
             session.begin(),
         ):
@@ -106,17 +106,17 @@ class Database:
             self._marker.reach(newest)
 
     @contextmanager
-    def _taking_turns(self) -> Iterator[None]:
+    def _locked_for_writing(self) -> Iterator[None]:
         """Hold this process' write lock if the database is SQLite."""
-        if self._turn is None:
+        if self._write_lock is None:
             yield
             return
-        if not self._turn.acquire(timeout=self._answer_seconds):
+        if not self._write_lock.acquire(timeout=self._answer_seconds):
             raise DatabaseBusyError
         try:
             yield
         finally:
-            self._turn.release()
+            self._write_lock.release()
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -134,9 +134,9 @@ class Database:
             yield connection
 
     @contextmanager
-    def aside(self) -> Iterator[Connection]:
+    def reserved_connection(self) -> Iterator[Connection]:
         """Provide one of two reserved connections, as `reading_rows` does but with a shorter timeout."""
-        with translated(), self._aside.connect() as connection:
+        with translated(), self._reserved.connect() as connection:
             yield connection
 
     def expiry(self) -> float:
@@ -146,7 +146,7 @@ class Database:
             return expiry_time(connection, now)
 
     def _server_time(self) -> float:
-        with self.aside() as connection:
+        with self.reserved_connection() as connection:
             return float(connection.execute(_SERVER_TIME).scalar_one())
 
     def upgrade(self) -> None:
@@ -165,7 +165,7 @@ class Database:
         finally:
             engine.dispose()
 
-    def look_back(self) -> None:
+    def detect_rollback(self) -> None:
         """Detect whether an SQLite database was rolled back to an earlier state, and set `rolled_back` if so."""
         if self._marker is not None:
             with self._upgrading(self.engine):
@@ -186,7 +186,7 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self.engine.dispose()
-        self._aside.dispose()
+        self._reserved.dispose()
 
     def _version(self) -> str | None:
         try:

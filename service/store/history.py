@@ -56,11 +56,11 @@ _ALL = (
     .where(_OF_JOB)
     .order_by(_POINTS.c.attempt, _POINTS.c.step)
 )
-_PLACES = select(_POINTS.c.attempt, _POINTS.c.step).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
+_STEPS = select(_POINTS.c.attempt, _POINTS.c.step).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
 _COUNT = select(func.count()).where(_OF_JOB)
 
 
-def keep_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
+def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
     """Store a job's progress as a point if one is due; progress without a loss is ignored.
 
     Args:
@@ -83,23 +83,23 @@ def _halve(session: Session, job_id: str) -> None:
     """Delete every second point of a job that has too many; the first one remains."""
     if (session.scalar(_COUNT, {"job_id": job_id}) or 0) <= MOST_POINTS:
         return
-    places = session.execute(_PLACES, {"job_id": job_id}).all()
+    steps = session.execute(_STEPS, {"job_id": job_id}).all()
     one = delete(_POINTS).where(_OF_JOB, _OF_ATTEMPT, _POINTS.c.step == bindparam("at"))
-    session.execute(one, [{"job_id": job_id, "attempt": attempt, "at": step} for attempt, step in places[1::2]])
+    session.execute(one, [{"job_id": job_id, "attempt": attempt, "at": step} for attempt, step in steps[1::2]])
 
 
-def points(connection: Connection, job_id: str, present: dict[str, Any] | None, most: int) -> list[Point]:
+def points(connection: Connection, job_id: str, current: dict[str, Any] | None, most: int) -> list[Point]:
     """Return a job's loss history: its points, and its current progress as the last one.
 
     Args:
-        present: Current progress of the job; ignored if it is None or has no loss.
+        current: Current progress of the job; ignored if it is None or has no loss.
         most: Maximum number of points, at least 2; longer histories are sampled evenly, including both ends.
     """
-    found: list[Sequence[Any]] = list(connection.execute(_ALL, {"job_id": job_id}))
-    if present and present.get("loss") is not None and present.get("seconds") is not None:
-        now = [present.get(field.name) for field in fields(Point)]
-        if not found or now[:2] > list(found[-1][:2]):
-            found.append(now)
-    if len(found) > most:
-        found = [found[number * (len(found) - 1) // (most - 1)] for number in range(most)]
-    return [Point(*values) for values in found]
+    rows: list[Sequence[Any]] = list(connection.execute(_ALL, {"job_id": job_id}))
+    if current and current.get("loss") is not None and current.get("seconds") is not None:
+        now = [current.get(field.name) for field in fields(Point)]
+        if not rows or now[:2] > list(rows[-1][:2]):
+            rows.append(now)
+    if len(rows) > most:
+        rows = [rows[number * (len(rows) - 1) // (most - 1)] for number in range(most)]
+    return [Point(*values) for values in rows]

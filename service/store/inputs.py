@@ -18,7 +18,7 @@ from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, Uploa
 #: Lifetime of an unreferenced blob in seconds: the request that uploaded it may not have created its job yet.
 GRACE_SECONDS = 3600.0
 #: Fraction of `GRACE_SECONDS` within which a blob's `touched_at` is not updated again, which saves writes.
-_HOLD_SHARE = 0.1
+_HOLD_FRACTION = 0.1
 #: Maximum number of unfinished uploads per key.
 MAX_OPEN_UPLOADS = 1000
 #: Lifetime of an input's inspection result in seconds.
@@ -87,31 +87,31 @@ class Inputs:
         Raises:
             NotFoundError: If a blob is gone.
         """
-        found = self.blobs(digests)
+        blobs = self.blobs(digests)
         # `touched_at` is not updated if it is recent, so consecutive submissions of one scene need no write
-        recent = self._database.clock() - _HOLD_SHARE * GRACE_SECONDS
-        if any(sha256 not in found or found[sha256].touched_at < recent for sha256 in digests):
+        recent = self._database.clock() - _HOLD_FRACTION * GRACE_SECONDS
+        if any(sha256 not in blobs or blobs[sha256].touched_at < recent for sha256 in digests):
             with self._database.writing() as session:
                 now = self._database.clock()
                 for start in range(0, len(digests), 500):
-                    mine = BlobRow.sha256.in_(digests[start : start + 500])
+                    held = BlobRow.sha256.in_(digests[start : start + 500])
                     # the same lock order as in `release_blobs`
-                    session.execute(select(BlobRow.sha256).where(mine).order_by(BlobRow.sha256).with_for_update())
-                    session.execute(update(BlobRow).where(mine).values(touched_at=now))
-            found = self.blobs(digests)
-        missing = next((sha256 for sha256 in digests if sha256 not in found), None)
+                    session.execute(select(BlobRow.sha256).where(held).order_by(BlobRow.sha256).with_for_update())
+                    session.execute(update(BlobRow).where(held).values(touched_at=now))
+            blobs = self.blobs(digests)
+        missing = next((sha256 for sha256 in digests if sha256 not in blobs), None)
         if missing is not None:
             raise NotFoundError(f"There is no file with SHA-256 {missing}.")
-        return found
+        return blobs
 
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
         """Return blobs by digest; missing ones are left out."""
-        found: dict[str, BlobRow] = {}
+        blobs: dict[str, BlobRow] = {}
         with self._database.reading_rows() as connection:
             for start in range(0, len(digests), 500):
                 rows = connection.execute(_BLOBS, {"digests": digests[start : start + 500]})
-                found |= {row.sha256: BlobRow(**row._mapping) for row in rows}
-        return found
+                blobs |= {row.sha256: BlobRow(**row._mapping) for row in rows}
+        return blobs
 
     def collect(self) -> list[str]:
         """Delete the rows of blobs that have been unused for a while; return their locations for removing the files."""
@@ -197,12 +197,12 @@ class Inputs:
     def uploads(self, upload_ids: Sequence[str], owner: str) -> dict[str, UploadRow]:
         """Return uploads of this owner by id; missing and expired ones are left out."""
         now = self._database.clock()
-        found: dict[str, UploadRow] = {}
+        uploads: dict[str, UploadRow] = {}
         with self._database.reading_rows() as connection:
             for start in range(0, len(upload_ids), 500):
-                wanted = {"ids": upload_ids[start : start + 500], "owner": owner, "now": now}
-                found |= {row.id: UploadRow(**row._mapping) for row in connection.execute(_UPLOADS, wanted)}
-        return found
+                parameters = {"ids": upload_ids[start : start + 500], "owner": owner, "now": now}
+                uploads |= {row.id: UploadRow(**row._mapping) for row in connection.execute(_UPLOADS, parameters)}
+        return uploads
 
     def advance_upload(
         self, upload_id: str, start: int, size: int, seconds: float, location: str | None = None
@@ -333,8 +333,8 @@ class Inputs:
     def inspection(self, key: str) -> dict[str, Any] | None:
         """Return the result of an earlier inspection of the same content; None if there is none."""
         with self._database.reading_rows() as connection:
-            found: dict[str, Any] | None = connection.execute(_INSPECTION, {"key": key}).scalar()
-            return found
+            result: dict[str, Any] | None = connection.execute(_INSPECTION, {"key": key}).scalar()
+            return result
 
     def add_inspection(self, key: str, result: dict[str, Any]) -> None:
         """Store the result of an inspection, and delete old results."""
@@ -345,7 +345,7 @@ class Inputs:
             session.execute(delete(InspectionRow).where(InspectionRow.created_at < now - _INSPECTION_SECONDS))
 
 
-def hand_over(session: Session, receipt: str) -> None:
+def close_receipt(session: Session, receipt: str) -> None:
     """Delete a receipt whose blobs are now held by a job created in this transaction."""
     session.execute(delete(BlobUseRow).where(BlobUseRow.holder == f"upload:{receipt}"))
     session.execute(delete(UploadRow).where(UploadRow.id == receipt))
@@ -363,10 +363,10 @@ def _hold_for_upload(session: Session, upload_id: str, sha256: str, size: int) -
     """Hold a blob for an upload or receipt; a receipt's charge moves from the incoming bytes to the blob."""
     use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
     session.execute(use.on_conflict_do_nothing())
-    mine = update(UploadRow).where(UploadRow.id == upload_id, IS_RECEIPT).values(length=UploadRow.length - size)
-    session.execute(mine.execution_options(synchronize_session=False))
+    receipt = update(UploadRow).where(UploadRow.id == upload_id, IS_RECEIPT).values(length=UploadRow.length - size)
+    session.execute(receipt.execution_options(synchronize_session=False))
 
 
 def _count_open_uploads(session: Session, owner: str) -> int:
-    mine = select(func.count()).select_from(UploadRow)
-    return session.scalar(mine.where(UploadRow.owner == owner, UploadRow.sha256.is_(None), ~IS_RECEIPT)) or 0
+    count = select(func.count()).select_from(UploadRow)
+    return session.scalar(count.where(UploadRow.owner == owner, UploadRow.sha256.is_(None), ~IS_RECEIPT)) or 0

@@ -14,7 +14,7 @@ from service.errors import CancelError, DeleteError, NoJobError, NotFoundError, 
 from service.store.changes import add_status_event, end, forget, holder_name, move
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import Point, points
-from service.store.inputs import hand_over
+from service.store.inputs import close_receipt
 from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job, lock_owner
 from service.store.states import ACTIONS, ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
@@ -39,8 +39,10 @@ def _count_ahead() -> Select[int]:
     """Return the query that counts the queued jobs ahead of a job, in two ranges of the queue's index."""
     queued = select(func.count()).select_from(_JOBS).where(_JOBS.c.status == JobStatus.QUEUED)
     higher = queued.where(_JOBS.c.priority > bindparam("priority"))
-    own_place = tuple_(bindparam("queued_at", type_=Float), bindparam("job_id", type_=String))
-    earlier = queued.where(_JOBS.c.priority == bindparam("priority"), tuple_(_JOBS.c.queued_at, _JOBS.c.id) < own_place)
+    own_position = tuple_(bindparam("queued_at", type_=Float), bindparam("job_id", type_=String))
+    earlier = queued.where(
+        _JOBS.c.priority == bindparam("priority"), tuple_(_JOBS.c.queued_at, _JOBS.c.id) < own_position
+    )
     return select(higher.scalar_subquery() + earlier.scalar_subquery())
 
 
@@ -133,7 +135,7 @@ class Jobs:
             except IntegrityError as error:
                 raise NotFoundError("An input was deleted while it was being checked. Upload it again.") from error
             if receipt is not None:
-                hand_over(session, receipt)
+                close_receipt(session, receipt)
             check_bytes(session, new.owner, quotas)
             add_status_event(session, job, now)
             count(session, "sgsst_jobs_submitted_total")
@@ -159,8 +161,8 @@ class Jobs:
             if row is None or (owner is not None and row.owner != owner):
                 raise NoJobError(job_id)
             job = JobRow(**row._mapping)
-            found = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if job.attempt else ()
-            attempts = [AttemptRow(**each._mapping) for each in found]
+            rows = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if job.attempt else ()
+            attempts = [AttemptRow(**each._mapping) for each in rows]
             preview = _newest_previews(connection, [job_id] if job.attempt else []).get(job_id)
             return job, _queue_position(connection, job), attempts, preview
 
@@ -257,15 +259,15 @@ class Jobs:
     def artifacts(self, job_id: str) -> list[ArtifactRow]:
         """Return the published files of a job by name; internal ones start with a dot."""
         with self._database.reading() as session:
-            found = select(ArtifactRow).where(ArtifactRow.job_id == job_id).order_by(ArtifactRow.name)
-            return list(session.scalars(found))
+            query = select(ArtifactRow).where(ArtifactRow.job_id == job_id).order_by(ArtifactRow.name)
+            return list(session.scalars(query))
 
     def artifact(self, job_id: str, name: str) -> ArtifactRow | None:
         """Return a published file; None if there is none."""
         with self._database.reading() as session:
             return session.get(ArtifactRow, (job_id, name))
 
-    def add_made(self, source: ArtifactRow, files: Sequence[Published]) -> list[str]:
+    def add_derived(self, source: ArtifactRow, files: Sequence[Published]) -> list[str]:
         """Publish files derived from `source`, unless `source` has been removed or replaced.
 
         Returns:
@@ -275,15 +277,15 @@ class Jobs:
         with self._database.writing() as session:
             row = session.get(ArtifactRow, (source.job_id, source.name), with_for_update=True)
             for file in files:
-                there = session.get(ArtifactRow, (source.job_id, file.name))
-                if row is None or row.location != source.location or there is not None:
+                existing = session.get(ArtifactRow, (source.job_id, file.name))
+                if row is None or row.location != source.location or existing is not None:
                     unused.append(file.location)
                     continue
-                made = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
-                session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **made))
+                values = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
+                session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **values))
         return unused
 
-    def course(self, job: JobRow, most: int) -> list[Point]:
+    def loss_history(self, job: JobRow, most: int) -> list[Point]:
         """Return a job's loss history up to its current step, in at most `most` points."""
         with self._database.reading_rows() as connection:
             return points(connection, job.id, job.progress, most)

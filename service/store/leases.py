@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, observe, upsert
-from service.store.history import keep_point
+from service.store.history import add_point
 from service.store.queue import LOST, WAITING, mine, next_job, next_jobs, reserve
 from service.store.quotas import count_gpu_seconds
 from service.store.retries import FailureCount, RetryPolicy, Verdict
@@ -29,11 +29,11 @@ from sgsst_core.errors import InfrastructureError
 #: Expiry of a lease whose dispatcher is known to be dead.
 EXPIRED = 0.0
 #: Number of progress events stored per job; a client that resumes from an older event misses only old progress.
-KEPT_PROGRESS = 200
+MAX_PROGRESS_EVENTS = 200
 #: Maximum number of past attempts counted for the retry delay: by then the delay is at its maximum.
-_OUTAGES = 20
+_MAX_OUTAGES = 20
 #: Maximum number of candidates for backfilling, each from a different owner.
-_BACKFILLED = 16
+_MAX_BACKFILL_CANDIDATES = 16
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class Leases:
         self,
         dispatcher: str,
         fits: Callable[[JobRow], bool] = lambda job: True,
-        keeps: Callable[[JobRow], bool] = lambda job: True,
-        before: Callable[[JobRow], Callable[[JobRow], bool] | None] = lambda kept: None,
+        should_reserve: Callable[[JobRow], bool] = lambda job: True,
+        backfills: Callable[[JobRow], Callable[[JobRow], bool] | None] = lambda reserved: None,
         is_lost: Callable[[JobRow], bool] = lambda job: True,
     ) -> Lease | None:
         """Take the next job: by highest priority, then the owner who has waited longest, then the oldest job.
@@ -98,29 +98,29 @@ class Leases:
 
         If a job does not fit, it is reserved: this dispatcher takes no other job of the same priority until the
         reserved job fits, so that smaller jobs do not overtake it forever. Other dispatchers take the job if it fits
-        there first and skip it otherwise, so a large job blocks only one dispatcher. Jobs that may run `before` the
-        reserved one are taken meanwhile, and the reservation remains.
+        there first and skip it otherwise, so a large job blocks only one dispatcher. Jobs that `backfills` allows are
+        taken meanwhile, and the reservation remains.
 
         Args:
             dispatcher: Name of the dispatcher.
             fits: Callback that returns whether there is capacity for a job.
-            keeps: Callback that returns whether to reserve capacity for a job that does not fit; if not, the job is
-                skipped.
-            before: Callback that returns, for a reserved job, a predicate of jobs that would not delay it; None if no
-                job may run before it.
+            should_reserve: Callback that returns whether to reserve capacity for a job that does not fit; if not, the
+                job is skipped.
+            backfills: Callback that returns, for a reserved job, a predicate of jobs that would not delay it; None if
+                no job may run before it.
             is_lost: Callback that returns whether a job with an expired lease may be taken over; if not, the job is
                 skipped.
         """
-        passed: list[str] = []
+        skipped: list[str] = []
         while True:
             now = self._database.clock()
             with self._database.writing() as session:
-                job = next_job(session, dispatcher, now, passed)
+                job = next_job(session, dispatcher, now, skipped)
                 if job is None:
                     return None
                 lost = job.status in ACTIVE
                 if lost and not is_lost(job):
-                    passed.append(job.id)
+                    skipped.append(job.id)
                     continue
                 if lost and self._close_lost(session, job, now):
                     continue
@@ -128,37 +128,39 @@ class Leases:
                     return self._lease(session, job, dispatcher, now)
                 if lost:  # otherwise the same loss would be counted again next time
                     self._requeue(session, job, now, now)
-                if keeps(job) and reserve(session, job.id, dispatcher, now, self._seconds):
-                    return self._backfill(session, dispatcher, now, [*passed, job.id], before(job))
-                passed.append(job.id)
+                if should_reserve(job) and reserve(session, job.id, dispatcher, now, self._seconds):
+                    return self._backfill(session, dispatcher, now, [*skipped, job.id], backfills(job))
+                skipped.append(job.id)
 
     def waiting(self, most: int = 1_000_000) -> int:
         """Return the number of jobs that could be leased now, counting up to `most`."""
         now = self._database.clock()
-        found = 0
+        total = 0
         with self._database.reading_rows() as connection:
             for query in (WAITING, LOST):
-                found += connection.execute(query, {"now": now, "most": most - found}).scalar_one()
-        return found
+                total += connection.execute(query, {"now": now, "most": most - total}).scalar_one()
+        return total
 
     def _backfill(
         self,
         session: Session,
         dispatcher: str,
         now: float,
-        passed: Sequence[str],
-        harmless: Callable[[JobRow], bool] | None,
+        skipped: Sequence[str],
+        allowed: Callable[[JobRow], bool] | None,
     ) -> Lease | None:
         """Lease the first of the next jobs that does not delay the reserved one."""
-        if harmless is None:
+        if allowed is None:
             return None
-        for job in next_jobs(session, dispatcher, now, passed, _BACKFILLED):
-            if job.status == JobStatus.QUEUED and harmless(job):
-                return self._lease(session, job, dispatcher, now, keep=True)
+        for job in next_jobs(session, dispatcher, now, skipped, _MAX_BACKFILL_CANDIDATES):
+            if job.status == JobStatus.QUEUED and allowed(job):
+                return self._lease(session, job, dispatcher, now, keep_reservation=True)
         return None
 
-    def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float, *, keep: bool = False) -> Lease:
-        """Lease a job; `keep` preserves the dispatcher's reservation for another job."""
+    def _lease(
+        self, session: Session, job: JobRow, dispatcher: str, now: float, *, keep_reservation: bool = False
+    ) -> Lease:
+        """Lease a job; `keep_reservation` preserves the dispatcher's reservation for another job."""
         job.attempt += 1
         job.lease_epoch += 1
         job.lease_owner, job.lease_expires_at = dispatcher, now + self._seconds
@@ -167,7 +169,7 @@ class Leases:
         attempt.started_at = now
         session.add(attempt)
         of_job = ReservationRow.job_id == job.id
-        session.execute(delete(ReservationRow).where(of_job if keep else or_(mine(dispatcher), of_job)))
+        session.execute(delete(ReservationRow).where(of_job if keep_reservation else or_(mine(dispatcher), of_job)))
         served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
         turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
         session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
@@ -179,14 +181,14 @@ class Leases:
     def renew(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
         """Renew leases; return the status of each job, or None if its lease is lost."""
         until = self._database.clock() + self._seconds
-        found: dict[str, JobStatus | None] = {}
+        statuses: dict[str, JobStatus | None] = {}
         with self._database.writing() as session:
             for lease in leases:
-                job = self._held(session, lease)
+                job = self._leased_job(session, lease)
                 if job is not None:
                     job.lease_expires_at = until
-                found[lease.job_id] = JobStatus(job.status) if job is not None else None
-        return found
+                statuses[lease.job_id] = JobStatus(job.status) if job is not None else None
+        return statuses
 
     def statuses(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
         """Return what `renew` returns, without renewing the leases."""
@@ -215,20 +217,20 @@ class Leases:
         """Set the number of GPUs that the attempt holds, and charge its usage so far to the job's owner."""
         now = self._database.clock()
         with self._database.writing() as session:
-            job = self._held_or_raise(session, lease)
+            job = self._require_lease(session, lease)
             attempt = session.get_one(AttemptRow, (job.id, job.attempt))
             _count_gpus(session, job, attempt, now)
             attempt.gpus, attempt.gpus_since = gpus, now
 
     # --- while the job runs ----------------------------------------------------------------------------------------
 
-    def begin(self, lease: Lease) -> None:
+    def start(self, lease: Lease) -> None:
         """Mark a job as running once its inputs are read; a job that is being canceled keeps its status."""
         now = self._database.clock()
         with self._database.writing() as session:
-            job = self._held_or_raise(session, lease)
+            job = self._require_lease(session, lease)
             if job.status == JobStatus.STARTING:
-                move(session, job, Transition.BEGIN, now)
+                move(session, job, Transition.START, now)
 
     def report_progress(self, lease: Lease, progress: dict[str, Any]) -> None:
         """Replace the job's progress and add it to the loss history (`history`).
@@ -244,14 +246,14 @@ class Leases:
             if not changed.rowcount:
                 raise _lost(lease)
             add_event(session, lease.job_id, "progress", data, now)
-            keep_point(session, lease.job_id, data)
-            session.execute(_FORGET_PROGRESS, {"of_job": lease.job_id})
+            add_point(session, lease.job_id, data)
+            session.execute(_DELETE_OLD_PROGRESS, {"of_job": lease.job_id})
 
     def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
         """Publish files, replacing those of the same names; return the locations of the replaced files."""
         now = self._database.clock()
         with self._database.writing() as session:
-            job = self._held_or_raise(session, lease)
+            job = self._require_lease(session, lease)
             return _publish(session, job, files, now)
 
     # --- the end of an attempt -------------------------------------------------------------------------------------
@@ -263,7 +265,7 @@ class Leases:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            job = self._held_or_raise(session, lease)
+            job = self._require_lease(session, lease)
             unused = _publish(session, job, files, now)
             hidden = ArtifactRow.name.startswith(".")  # the checkpoint of an unfinished job
             session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, hidden))
@@ -288,7 +290,7 @@ class Leases:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            job = self._held_or_raise(session, lease)
+            job = self._require_lease(session, lease)
             verdict = self._close(session, job, AttemptOutcome.FAILED, error, now, permanent=permanent)
             if verdict.transition != Transition.STOP:
                 job.error = error
@@ -302,7 +304,7 @@ class Leases:
         """Return an unfinished job to the queue without counting a failure, because the dispatcher is shutting down."""
         now = self._database.clock()
         with self._database.writing() as session:
-            job = self._held_or_raise(session, lease)
+            job = self._require_lease(session, lease)
             verdict = self._close(session, job, AttemptOutcome.RELEASED, None, now)
             if verdict.transition == Transition.REQUEUE:
                 self._requeue(session, job, now, now)
@@ -313,7 +315,7 @@ class Leases:
         """End a job that was being canceled."""
         now = self._database.clock()
         with self._database.writing() as session:
-            job = self._held_or_raise(session, lease)
+            job = self._require_lease(session, lease)
             _close_attempt(session, job, AttemptOutcome.CANCELED, None, now)
             end(session, job, Transition.STOP, now, self._retention)
 
@@ -352,12 +354,12 @@ class Leases:
 
     # --- shared ----------------------------------------------------------------------------------------------------
 
-    def _held(self, session: Session, lease: Lease) -> JobRow | None:
+    def _leased_job(self, session: Session, lease: Lease) -> JobRow | None:
         job = session.get(JobRow, lease.job_id, with_for_update=True)
         return job if job is not None and _is_held(job, lease) else None
 
-    def _held_or_raise(self, session: Session, lease: Lease) -> JobRow:
-        job = self._held(session, lease)
+    def _require_lease(self, session: Session, lease: Lease) -> JobRow:
+        job = self._leased_job(session, lease)
         if job is None:
             raise _lost(lease)
         return job
@@ -369,14 +371,14 @@ class Leases:
         move(session, job, Transition.REQUEUE, now)
 
 
-def _forget_progress() -> Delete:
+def _delete_old_progress() -> Delete:
     """Return the statement that deletes all but the last progress events of a job."""
     mine = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
-    newest = select(EventRow.id).where(mine).order_by(EventRow.id.desc()).offset(KEPT_PROGRESS).limit(1)
+    newest = select(EventRow.id).where(mine).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
     return delete(EventRow).where(mine, EventRow.id <= newest.scalar_subquery())
 
 
-_FORGET_PROGRESS = _forget_progress()
+_DELETE_OLD_PROGRESS = _delete_old_progress()
 
 
 def _lost(lease: Lease) -> LeaseLostError:
@@ -409,7 +411,7 @@ def _outages(session: Session, job: JobRow) -> int:
     """Return the number of most recent consecutive attempts that ended by an outage."""
     query = select(AttemptRow.error).where(AttemptRow.job_id == job.id).order_by(AttemptRow.number.desc())
     count = 0
-    for error in session.scalars(query.limit(_OUTAGES)):
+    for error in session.scalars(query.limit(_MAX_OUTAGES)):
         if not error or error["code"] != InfrastructureError.code:
             break
         count += 1

@@ -53,7 +53,7 @@ class Operations:
         self._database = database
         self._lease_seconds = lease_seconds
 
-    def beat(self, name: str, places: int, free: int) -> None:
+    def record_heartbeat(self, name: str, places: int, free: int) -> None:
         """Record a dispatcher's heartbeat with its total and free capacity."""
         now = self._database.clock()
         values = {"seen_at": now, "places": places, "free": free}
@@ -61,7 +61,7 @@ class Operations:
             insert = upsert(session)(DispatcherRow).values(name=name, **values)
             session.execute(insert.on_conflict_do_update(index_elements=["name"], set_=values))
 
-    def gone(self, name: str) -> None:
+    def remove_dispatcher(self, name: str) -> None:
         """Remove a dispatcher that has ended."""
         with self._database.writing() as session:
             session.execute(delete(DispatcherRow).where(DispatcherRow.name == name))
@@ -72,7 +72,7 @@ class Operations:
         with self._database.reading() as session:
             return list(session.scalars(select(DispatcherRow).where(_IS_ALIVE).order_by(DispatcherRow.name), span))
 
-    def alive(self) -> int:
+    def dispatcher_count(self) -> int:
         """Return the number of live dispatchers."""
         span = self._span()
         with self._database.reading_rows() as connection:
@@ -85,7 +85,7 @@ class Operations:
             DatabaseUnavailableError: If the database does not respond within some seconds.
         """
         span = self._span()
-        with self._database.aside() as connection:
+        with self._database.reserved_connection() as connection:
             return connection.execute(_ALIVE, span).scalar_one()
 
     def heartbeats(self) -> dict[str, float]:
@@ -103,7 +103,7 @@ class Operations:
             rows = session.scalars(select(CounterRow).order_by(CounterRow.name, CounterRow.labels)).all()
         return [(row.name, row.labels, row.value) for row in rows]
 
-    def depths(self) -> dict[str, int]:
+    def job_counts(self) -> dict[str, int]:
         """Return the number of jobs by status."""
         query = select(JobRow.status, func.count()).group_by(JobRow.status)
         with self._database.reading() as session:
@@ -118,14 +118,14 @@ class Operations:
     def steps_and_seconds(self) -> list[tuple[int, float]]:
         """Return the number of steps of each running job, and their duration in seconds."""
         with self._database.reading() as session:
-            found = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
-        return [(progress["step"], progress["seconds"]) for progress in found if progress and progress.get("seconds")]
+            rows = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
+        return [(progress["step"], progress["seconds"]) for progress in rows if progress and progress.get("seconds")]
 
     def webhook_secret(self) -> str:
         """Return the secret that signs webhooks, in the format of Standard Webhooks; it is created on first use."""
-        made = "whsec_" + base64.b64encode(secrets.token_bytes(32)).decode()
+        secret = "whsec_" + base64.b64encode(secrets.token_bytes(32)).decode()
         with self._database.writing() as session:
-            insert = upsert(session)(SecretRow).values(name="webhooks", value=made)
+            insert = upsert(session)(SecretRow).values(name="webhooks", value=secret)
             session.execute(insert.on_conflict_do_nothing())
             return session.get_one(SecretRow, "webhooks").value
 

@@ -67,10 +67,10 @@ def translated() -> Iterator[None]:
     except PoolTimeoutError as error:
         raise DatabaseBusyError from error
     except DBAPIError as error:
-        found = _refusal(error)
-        if found is None:
+        refusal = _refusal(error)
+        if refusal is None:
             raise
-        raise found from error
+        raise refusal from error
 
 
 def _refusal(error: DBAPIError) -> DatabaseUnavailableError | None:

@@ -37,7 +37,7 @@ from service.store.tables import JobRow, ReservationRow, TurnRow
 #: Upper bound of lease durations and retry delays in seconds; a time further in the future comes from a wrong clock.
 _IMPLAUSIBLE_SECONDS = 3600.0
 #: Fraction of a reservation's duration; it is renewed when less than that remains, which saves writes.
-_RENEW_SHARE = 0.5
+_RENEW_FRACTION = 0.5
 
 
 def queued_now(now: float | BindParameter[float]) -> ColumnElement[bool]:
@@ -72,21 +72,21 @@ def mine(dispatcher: str | BindParameter[str]) -> ColumnElement[bool]:
     return ReservationRow.dispatcher == dispatcher
 
 
-def next_job(session: Session, dispatcher: str, now: float, passed: Sequence[str] = ()) -> JobRow | None:
+def next_job(session: Session, dispatcher: str, now: float, skipped: Sequence[str] = ()) -> JobRow | None:
     """Return a dispatcher's next job: by priority, then the dispatcher's reservation, then owners' turns, then age.
 
     The job's row is locked; rows locked by other transactions are skipped.
 
     Args:
-        passed: Ids of jobs to skip.
+        skipped: Ids of jobs to skip.
     """
-    return next(iter(next_jobs(session, dispatcher, now, passed, most=1)), None)
+    return next(iter(next_jobs(session, dispatcher, now, skipped, most=1)), None)
 
 
-def next_jobs(session: Session, dispatcher: str, now: float, passed: Sequence[str], most: int) -> Sequence[JobRow]:
+def next_jobs(session: Session, dispatcher: str, now: float, skipped: Sequence[str], most: int) -> Sequence[JobRow]:
     """Return up to `most` next jobs in order, at most one queued job per owner; otherwise as `next_job`."""
-    told = {"dispatcher": dispatcher, "now": now, "passed": list(passed)}
-    candidates = [found for found in session.scalars(_candidates(), told) if found is not None]
+    parameters = {"dispatcher": dispatcher, "now": now, "skipped": list(skipped)}
+    candidates = [job_id for job_id in session.scalars(_candidates(), parameters) if job_id is not None]
     if not candidates:
         return []
     # a separate statement: inside one query, PostgreSQL overestimates the candidates and reads all jobs
@@ -99,10 +99,10 @@ def next_jobs(session: Session, dispatcher: str, now: float, passed: Sequence[st
 def _candidates() -> Select[Any] | CompoundSelect[Any]:
     """Return the query for the ids of the jobs that may be next."""
     dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
-    passed = bindparam("passed", type_=String, expanding=True)
-    lost = select(JobRow.id).where(expired(now), JobRow.id.not_in(passed))
-    reserved = select(ReservationRow.job_id).where(mine(dispatcher), ReservationRow.job_id.not_in(passed))
-    return union_all(_first_of_each_owner(now, passed), lost, reserved)
+    skipped = bindparam("skipped", type_=String, expanding=True)
+    lost = select(JobRow.id).where(expired(now), JobRow.id.not_in(skipped))
+    reserved = select(ReservationRow.job_id).where(mine(dispatcher), ReservationRow.job_id.not_in(skipped))
+    return union_all(_first_of_each_owner(now, skipped), lost, reserved)
 
 
 @cache
@@ -110,20 +110,20 @@ def _first() -> Select[JobRow]:
     """Return the query for the first candidates, up to `most`."""
     dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
     turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
-    kept = case((mine(dispatcher), 0), else_=1)
+    not_reserved = case((mine(dispatcher), 0), else_=1)
     query = (
         select(JobRow)
         .outerjoin(TurnRow, TurnRow.owner == JobRow.owner)
         .outerjoin(ReservationRow, ReservationRow.job_id == JobRow.id)
         .where(JobRow.id.in_(bindparam("candidates", type_=String, expanding=True)))
-        # checked again, because rows may have changed since they were found
+        # checked again, because rows may have changed since they were selected
         .where(or_(queued_now(now), expired(now)))
     )
-    order = (JobRow.priority.desc(), kept, turn, JobRow.queued_at, JobRow.id)
+    order = (JobRow.priority.desc(), not_reserved, turn, JobRow.queued_at, JobRow.id)
     return query.order_by(*order).limit(bindparam("most", type_=Integer)).with_for_update(skip_locked=True, of=JobRow)
 
 
-def _first_of_each_owner(now: BindParameter[float], passed: BindParameter[str]) -> Select[Any]:
+def _first_of_each_owner(now: BindParameter[float], skipped: BindParameter[str]) -> Select[Any]:
     """Return the query for the id of each owner's next job."""
     job = aliased(JobRow)
     queued = job.status == JobStatus.QUEUED
@@ -132,7 +132,7 @@ def _first_of_each_owner(now: BindParameter[float], passed: BindParameter[str]) 
     owners = owners.union_all(select(following).where(owners.c.owner.is_not(None)))
     each = (
         select(job.id)
-        .where(queued, job.owner == owners.c.owner, _may_start(job, now), job.id.not_in(passed))
+        .where(queued, job.owner == owners.c.owner, _may_start(job, now), job.id.not_in(skipped))
         .order_by(job.priority.desc(), job.queued_at, job.id)
         .limit(1)
         .scalar_subquery()
@@ -150,7 +150,7 @@ def reserve(session: Session, job_id: str, dispatcher: str, now: float, seconds:
     row = session.get(ReservationRow, job_id)
     if row is not None and row.dispatcher != dispatcher and row.until >= now:
         return False
-    if row is None or row.dispatcher != dispatcher or row.until < now + _RENEW_SHARE * seconds:
+    if row is None or row.dispatcher != dispatcher or row.until < now + _RENEW_FRACTION * seconds:
         session.execute(delete(ReservationRow).where(mine(dispatcher), ReservationRow.job_id != job_id))
         values = {"dispatcher": dispatcher, "until": now + seconds}
         insert = upsert(session)(ReservationRow).values(job_id=job_id, **values)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import and_, delete, select, update
 
 from service.store.changes import forget, move, release_inputs
-from service.store.clocks import advance_expiry_time, expiry_time, kept_until
+from service.store.clocks import advance_expiry_time, expiry_time, retained_until
 from service.store.database import IDEMPOTENCY_SECONDS, Database
 from service.store.states import FINISHED, JobStatus, Transition
 from service.store.tables import ArtifactRow, DispatcherRow, IdempotencyRow, JobRow
@@ -50,7 +50,7 @@ class Retention:
                 if job.status == JobStatus.EXPIRED:
                     forget(session, job)
                     continue
-                job.expires_at = kept_until(session, clock, self._retention)
+                job.expires_at = retained_until(session, clock, self._retention)
                 session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
                 release_inputs(session, job.id)
                 move(session, job, Transition.EXPIRE, clock)

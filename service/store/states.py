@@ -37,7 +37,7 @@ class Transition(StrEnum):
     #: A dispatcher leases the job, for the first time or after its previous lease was lost.
     TAKE = "take"
     #: The inputs have been read and the first step starts.
-    BEGIN = "begin"
+    START = "start"
     SUCCEED = "succeed"
     #: An attempt failed and is not followed by another one.
     FAIL = "fail"
@@ -71,7 +71,7 @@ TITLES: Mapping[JobStatus, str] = {
 #: stopped however its attempt ends, unless the attempt succeeds first.
 TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
     Transition.TAKE: dict.fromkeys((_S.QUEUED, _S.STARTING, _S.RUNNING), _S.STARTING),
-    Transition.BEGIN: {_S.STARTING: _S.RUNNING, _S.RUNNING: _S.RUNNING, _S.CANCELING: _S.CANCELING},
+    Transition.START: {_S.STARTING: _S.RUNNING, _S.RUNNING: _S.RUNNING, _S.CANCELING: _S.CANCELING},
     Transition.SUCCEED: dict.fromkeys(ACTIVE, _S.SUCCEEDED),
     Transition.FAIL: dict.fromkeys((_S.STARTING, _S.RUNNING), _S.FAILED),
     Transition.REQUEUE: dict.fromkeys((_S.STARTING, _S.RUNNING), _S.QUEUED),
@@ -110,7 +110,7 @@ def next_status(status: str, transition: Transition) -> JobStatus:
     Raises:
         TransitionError: If the status does not allow the transition.
     """
-    found = TRANSITIONS[transition].get(JobStatus(status))
-    if found is None:
+    target = TRANSITIONS[transition].get(JobStatus(status))
+    if target is None:
         raise TransitionError(f"There is no {transition} for a job with status {status}.")
-    return found
+    return target

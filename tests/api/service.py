@@ -18,6 +18,7 @@ import psutil
 
 from api.http.app import create_app
 from service.settings import ServiceSettings
+from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Seconds that a test waits for anything before it fails. No test measures time.
@@ -52,7 +53,7 @@ class Service:
 
     def start(self) -> Service:
         """Start the service, and wait until it is ready."""
-        self.environment["SGSST_PORT"] = self.environment.get("SGSST_PORT") or str(_free_port())
+        self.environment["SGSST_PORT"] = self.environment.get("SGSST_PORT") or str(free_port())
         self.url = f"http://127.0.0.1:{self.environment['SGSST_PORT']}"
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
@@ -175,11 +176,3 @@ def wait_for(
             return found
         time.sleep(every)
     raise AssertionError(f"waited in vain for {what}\n{said()}")
-
-
-def _free_port() -> int:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

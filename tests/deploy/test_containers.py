@@ -16,9 +16,9 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.api.service import _free_port as free_port
 from tests.api.service import wait_for
 from tests.deploy.containers import COMPOSE, Containers, compose_program, containers
+from tests.ports import free_port
 from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow

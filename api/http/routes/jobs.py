@@ -177,7 +177,7 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
         check_url(webhook, context.settings)
     checked = context.inspector.recall("validate", inputs, parameters) is not None
     if not checked:
-        with context.blobs.lent(rows) as paths:
+        with context.blobs.local_files(rows) as paths:
             for entry in inputs:
                 check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
     return _JobRequest(inputs, rows, parameters, webhook, checked)
@@ -370,7 +370,7 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Respons
 )
 def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
     """Get the loss history of a job from its first step on, while it runs and after its end."""
-    return progress_history(context.store.jobs.course(find(context, caller, job_id), MOST_POINTS))
+    return progress_history(context.store.jobs.loss_history(find(context, caller, job_id), MOST_POINTS))
 
 
 @router.post(

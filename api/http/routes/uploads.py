@@ -170,14 +170,14 @@ def create_upload(
         raise FileTooLargeError(length, limit)
     if not length:
         raise EmptyFileError
-    context.blobs.ensure_room(length)
+    context.blobs.ensure_space(length)
     name = clean_name("photos", _file_name(metadata), 0)[-200:]
     seconds = context.settings.upload_hours * 3600
     row = context.store.inputs.create_upload(
         caller.owner, length, name, metadata, seconds, idempotency_key, caller.quotas
     )
     if row.sha256 is None:  # a repeated request may refer to an upload that is already complete
-        context.blobs.begin_upload(row.id)
+        context.blobs.start_upload(row.id)
     sent = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
     return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")
 
@@ -314,7 +314,7 @@ def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -
     """Cancel an upload, or delete a finished one. Jobs that use it keep their file."""
     _find_upload(context, caller.owner, upload_id)
     unused = context.store.inputs.delete_upload(upload_id, caller.owner)
-    context.blobs.forget_upload(upload_id)
+    context.blobs.discard_upload(upload_id)
     context.blobs.remove(unused)
     return Response(status_code=204, headers=_HEADERS)
 

@@ -80,7 +80,7 @@ class Files:
 
     def input(self, content: bytes) -> str:
         """Store an input, and return its name."""
-        sha256 = self.blobs.keep(self.file(content))
+        sha256 = self.blobs.add(self.file(content))
         return f"blobs/{self.store.inputs.blobs([sha256])[sha256].location}"
 
     def job(self, scene: str) -> Lease:
@@ -98,7 +98,7 @@ class Files:
 
     def upload(self, content: bytes, length: int) -> str:
         row = self.store.inputs.create_upload("me", length, "scene.ply", "", HOUR)
-        self.blobs.begin_upload(row.id)
+        self.blobs.start_upload(row.id)
         writer = self.blobs.append(row, HOUR)
         writer.write(content)
         writer.save()

@@ -196,7 +196,7 @@ def finish(store: Store, service: Service, job_id: str, content: bytes, folder: 
     source = folder / "result"
     source.write_bytes(content)
     file = Artifacts(ServiceSettings(data=service.data).artifacts_url).put(job_id, lease.epoch, "stylized.ply", source)
-    store.leases.begin(lease)
+    store.leases.start(lease)
     store.leases.succeed(lease, [file], {"steps": 1})
     return content
 

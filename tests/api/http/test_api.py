@@ -670,12 +670,12 @@ def test_readiness_tells_whether_somebody_is_there_to_run_jobs(service: Service,
     parts = dict.fromkeys(("database", "artifacts", "disk", "weights"), "ok")
     assert answer.json()["checks"] == {**parts, "dispatchers": "none"}
     store = open_store(ServiceSettings(data=service.data))
-    store.operations.beat("one", 8, 3)
+    store.operations.record_heartbeat("one", 8, 3)
     answer = client.get("/readyz")
     assert (answer.json()["status"], answer.json()["checks"]["dispatchers"]) == ("ok", "1")
     metrics = client.get("/metrics").text.splitlines()
     assert {"sgsst_dispatchers 1.0", "sgsst_places 8.0", "sgsst_places_free 3.0"} <= set(metrics)
-    store.operations.gone("one")
+    store.operations.remove_dispatcher("one")
     assert client.get("/readyz").json()["status"] == "waiting"
     assert "sgsst_dispatchers 0.0" in client.get("/metrics").text
     store.close()
@@ -696,7 +696,7 @@ def test_metrics_tell_what_became_of_attempts(tmp_path: Path, files: dict[str, b
         for step, seconds in ((30, 10.0), (8, 4.0)):
             held = store.leases.take("one")
             assert held is not None
-            store.leases.begin(held)
+            store.leases.start(held)
             store.leases.report_progress(held, {"step": step, "seconds": seconds, "total": 100})
         text = client.get("/metrics").text
         found = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))

@@ -1099,7 +1099,7 @@ def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.
     artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
     published = [artifacts.put(job_id, lease.epoch, path.name, path) for path in sorted(made.iterdir())]
     published.append(artifacts.put(job_id, lease.epoch, ".checkpoint", made / "log.txt"))
-    store.leases.begin(lease)
+    store.leases.start(lease)
     store.leases.publish(lease, published)
     store.leases.succeed(lease, published[:-1], {})
     return job_id

@@ -237,7 +237,7 @@ def test_waiting_for_a_lock_is_bounded_for_all_writers_together(tmp_path: Path) 
 
         def write() -> None:
             try:
-                store.operations.beat("one", 1, 1)
+                store.operations.record_heartbeat("one", 1, 1)
             except Exception as error:
                 refusals.append(error)
 
@@ -249,6 +249,6 @@ def test_waiting_for_a_lock_is_bounded_for_all_writers_together(tmp_path: Path) 
         assert [type(error).__name__ for error in refusals] == ["DatabaseBusyError"] * MANY
         assert store.operations.check() == 0
         other.execute("ROLLBACK")
-    store.operations.beat("one", 1, 1)
-    assert store.operations.alive() == 1
+    store.operations.record_heartbeat("one", 1, 1)
+    assert store.operations.dispatcher_count() == 1
     store.close()

@@ -154,7 +154,7 @@ class Uploaded:
         """Finish all queued jobs with results, in place of a dispatcher (`test_service` runs a real one)."""
         while (lease := self._store.leases.take("test")) is not None:
             result = self._artifacts.put(lease.job_id, lease.epoch, "stylized.ply", self._ply)
-            self._store.leases.begin(lease)
+            self._store.leases.start(lease)
             self._store.leases.publish(lease, [result])
             self._store.leases.succeed(lease, [result], {"steps": 1})
 

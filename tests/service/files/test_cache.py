@@ -153,10 +153,10 @@ def test_old_partial_files_are_removed(cache: FileCache, tmp_path: Path, monkeyp
     half = tmp_path / "cache" / "half" / "0123456789abcdef"
     half.write_bytes(b"whole")
     os.utime(half, (0, 0))
-    cache.evict(wanted=2501)
+    cache.evict(reserve=2501)
     assert half.exists()
-    monkeypatch.setattr(cache_module, "_HALF_SECONDS", -1.0)
-    cache.evict(wanted=2501)
+    monkeypatch.setattr(cache_module, "_PARTIAL_SECONDS", -1.0)
+    cache.evict(reserve=2501)
     assert not half.exists()
 
 

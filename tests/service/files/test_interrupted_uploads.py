@@ -51,7 +51,7 @@ def die_at_the_end(service: Service, path: Path, where: str, *, linked: bool) ->
     part.write_bytes(content)
     store.inputs.advance_upload(upload_id, len(content) - 1, 1, 3600)
     if linked:
-        blobs.keep(part, leave=True)
+        blobs.add(part, link=True)
     store.close()
 
 

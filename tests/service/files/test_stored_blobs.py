@@ -54,10 +54,10 @@ class Fleet:
         receiver = Receiver(host.incoming / os.urandom(4).hex(), len(data), lambda size: None)
         receiver.write(data)
         receiver.close()
-        return host.keep(receiver.path)
+        return host.add(receiver.path)
 
     def read(self, host: StoredBlobs, sha256: str) -> bytes:
-        with host.lent(self.store.inputs.blobs([sha256])) as paths:
+        with host.local_files(self.store.inputs.blobs([sha256])) as paths:
             return paths[sha256].read_bytes()
 
     def upload(self, length: int) -> UploadRow:
@@ -212,14 +212,14 @@ def test_cache_is_evicted_for_incoming_files(fleet: Fleet, monkeypatch: pytest.M
         return SimpleNamespace(free=10_000 - sum(path.stat().st_size for path in folder.glob("*/*")))
 
     monkeypatch.setattr("service.files.blobs.shutil.disk_usage", free)
-    with host.lent(fleet.store.inputs.blobs([used])):
-        host.ensure_room(2000)
+    with host.local_files(fleet.store.inputs.blobs([used])):
+        host.ensure_space(2000)
         assert (folder / kept[:2] / kept).exists()
-        host.ensure_room(7000)
+        host.ensure_space(7000)
         assert {path.name for path in folder.glob("*/*")} == {used}, "it is in use"
         with pytest.raises(NoSpaceError):
-            host.ensure_room(7001)
-    host.ensure_room(10_000)
+            host.ensure_space(7001)
+    host.ensure_space(10_000)
 
 
 def test_disk_without_inodes_rejects_files(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,14 +231,14 @@ def test_disk_without_inodes_rejects_files(fleet: Fleet, monkeypatch: pytest.Mon
         found.f_blocks, found.f_bfree = disk.f_blocks, disk.f_bfree
         monkeypatch.setattr("service.files.blobs.os.statvfs", lambda _: found)
 
-    host.ensure_room(0)
+    host.ensure_space(0)
     inodes(10_000, 999)
     with pytest.raises(NoSpaceError, match="more files"):
-        host.ensure_room(0)
+        host.ensure_space(0)
     with pytest.raises(NoSpaceError):
         host.receive(10)
     inodes(0, 0)  # a file system without a limit of inodes
-    host.ensure_room(0)
+    host.ensure_space(0)
 
 
 def test_unfinished_upload_is_collected(fleet: Fleet) -> None:
@@ -255,7 +255,7 @@ def test_unfinished_upload_is_collected(fleet: Fleet) -> None:
 def test_local_blobs_move_into_the_store(fleet: Fleet) -> None:
     folder = BlobFolder(fleet.folder / "one", fleet.store.inputs, 0)
     data = b"taken in before"
-    sha256 = folder.keep(_file(fleet.folder, data))
+    sha256 = folder.add(_file(fleet.folder, data))
     fleet.host("one").collect()
     assert fleet.read(fleet.host("two"), sha256) == data
     assert not [path for path in (fleet.folder / "one" / "blobs").rglob("*") if path.is_file()]

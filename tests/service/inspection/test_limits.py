@@ -32,7 +32,7 @@ def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, An
     async def ask() -> dict[str, Any]:
         blobs = BlobFolder(settings.folder, store.inputs, 0)
         for path in files.values():
-            blobs.keep(path, leave=True)
+            blobs.add(path, link=True)
         inspector = Inspector(settings, store, blobs)
         try:
             rows = store.inputs.blobs(sorted(digests.values()))

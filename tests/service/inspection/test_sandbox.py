@@ -161,8 +161,8 @@ def test_missing_kernel_features_are_logged(
     finally:
         store.close()
     first, second = (record.getMessage() for record in caplog.records)
-    assert "without Landlock (Linux 5.13)" in first
-    assert "without seccomp" in second
+    assert "missing Landlock (Linux 5.13)" in first
+    assert "missing seccomp" in second
 
 
 def verdict(program: bytes, architecture: int, number: int, argument: int = 0) -> int:

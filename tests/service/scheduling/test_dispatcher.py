@@ -130,7 +130,7 @@ def test_jobs_of_a_dead_dispatcher_are_taken_over_at_once(settings: ServiceSetti
     assert not is_dead(own_name())
     held = leased(store, dead)
     store.jobs.cancel(held.job_id, None)
-    store.operations.beat(dead, 8, 0)
+    store.operations.record_heartbeat(dead, 8, 0)
     with at_work(settings, store) as dispatcher:
         wait_for(lambda: store.jobs.get(held.job_id, None).status == "canceled", "the lost job to be settled")
         wait_for(
@@ -214,7 +214,7 @@ def test_job_with_a_lost_or_damaged_input_fails(tmp_path: Path, damage: str, cod
     store = open_store(settings)
     blobs = BlobFolder(settings.folder, store.inputs, 0)
     (tmp_path / "scene").write_bytes(b"scene")
-    sha256 = blobs.keep(tmp_path / "scene")
+    sha256 = blobs.add(tmp_path / "scene")
     path = settings.folder / "blobs" / store.inputs.blobs([sha256])[sha256].location
     path.unlink()
     if damage == "flipped":

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from service.errors import DatabaseUnavailableError
-from service.health import dispatcher_is_well
+from service.health import dispatcher_is_healthy
 from service.prepare import main as prepare
 from service.scheduling.machine import is_dead, is_of_this_machine, own_name
 from service.settings import ServiceSettings
@@ -20,20 +20,20 @@ from service.store import Store, open_store
 def test_dispatcher_is_healthy_while_it_sends_heartbeats(tmp_path: Path) -> None:
     now = 1000.0
     store = open_store(ServiceSettings(data=tmp_path, lease_seconds=30), lambda: now)
-    assert not dispatcher_is_well(store)
-    store.operations.beat("elsewhere-01234567-1-1", 1, 1)
-    assert not dispatcher_is_well(store), "that is another machine's"
-    store.operations.beat(own_name(), 1, 1)
-    assert dispatcher_is_well(store)
+    assert not dispatcher_is_healthy(store)
+    store.operations.record_heartbeat("elsewhere-01234567-1-1", 1, 1)
+    assert not dispatcher_is_healthy(store), "that is another machine's"
+    store.operations.record_heartbeat(own_name(), 1, 1)
+    assert dispatcher_is_healthy(store)
     now += 31
-    assert not dispatcher_is_well(store)
+    assert not dispatcher_is_healthy(store)
     store.close()
 
 
 def test_dispatcher_is_healthy_during_a_database_outage() -> None:
     url = "postgresql+psycopg://nobody@127.0.0.1:1/none"
     pytest.importorskip("psycopg", reason="psycopg is not installed: see the extra [postgresql]")
-    assert dispatcher_is_well(Store(ServiceSettings(database=url)))
+    assert dispatcher_is_healthy(Store(ServiceSettings(database=url)))
 
 
 def test_dispatcher_names_identify_the_machine() -> None:

@@ -218,7 +218,7 @@ def test_machine_with_the_earliest_capacity_reserves_it(tmp_path: Path) -> None:
     """A machine whose capacity is freed late leaves a large job to others until the job has waited long enough."""
     late, soon = (Queue(tmp_path, gpus=8, name=name) for name in ("late", "soon"))
     for queue in (late, soon):
-        queue.store.operations.beat(queue.selector.dispatcher, 8, 0)
+        queue.store.operations.record_heartbeat(queue.selector.dispatcher, 8, 0)
     running = [late.add("a", workers=1) for _ in range(14)]
     soon.now = late.now
     for queue, some in ((late, running[:7]), (soon, running[7:])):
@@ -235,7 +235,7 @@ def test_machine_with_the_earliest_capacity_reserves_it(tmp_path: Path) -> None:
     assert kept_for(soon) == []
     soon.now = late.now = late.now + 60
     for queue in (late, soon):
-        queue.store.operations.beat(queue.selector.dispatcher, 8, 0)
+        queue.store.operations.record_heartbeat(queue.selector.dispatcher, 8, 0)
     assert late.start() == []
     assert soon.start() == []
     assert kept_for(soon) == [big]
@@ -265,7 +265,7 @@ def test_owners_take_turns_regardless_of_granted_gpus(eight: Queue) -> None:
 
 def test_dispatchers_share_the_queue(eight: Queue) -> None:
     for name in ("here", "there"):
-        eight.store.operations.beat(name, 8, 8)
+        eight.store.operations.record_heartbeat(name, 8, 8)
     first, _ = eight.add(), eight.add()
     found = eight.selector.lease_next_job([])
     assert found is not None

@@ -77,7 +77,7 @@ def healthy(store: Store, held: Lease) -> Iterator[list[object]]:
 
     def work() -> None:
         while not stop.wait(0.2):
-            store.operations.beat(held.dispatcher, 1, 0)
+            store.operations.record_heartbeat(held.dispatcher, 1, 0)
             found.append(store.leases.renew([held])[held.job_id])
 
     thread = threading.Thread(target=work)
@@ -130,7 +130,7 @@ def test_dispatcher_with_a_wrong_clock_deletes_nothing(
     held = leased(store, "healthy-00000000-1-1")
     # the wrong heartbeat precedes the first housekeeping, which the process does in its own thread
     with store_with_clock(settings, seconds) as (wrong, _, _):
-        wrong.operations.beat("wrong-00000000-1-1", 1, 1)
+        wrong.operations.record_heartbeat("wrong-00000000-1-1", 1, 1)
     with healthy(store, held) as statuses, wrong_dispatcher(settings, seconds) as process:
         wait_for(lambda: store.retention.unswept(10) == [] or process.poll(), "the first housekeeping")
         wait_for(
@@ -262,12 +262,13 @@ def test_nothing_is_deleted_while_live_clocks_disagree(
         right_watch = ClockWatch(store, LEASE, monotonic)
         # the first call has nothing to compare with and does not advance the expiry time
         for passing in (True, False, False):
-            store.operations.beat("healthy", 1, 1)
-            wrong.operations.beat("wrong", 1, 1)
+            store.operations.record_heartbeat("healthy", 1, 1)
+            wrong.operations.record_heartbeat("wrong", 1, 1)
             before = wrong.database.expiry()
             assert watch.confirm() == passing
             assert right_watch.confirm() == passing, "nobody knows who is right"
             assert wrong.database.expiry() <= max(before, store.database.clock())
             clock.now, monotonic.now = clock.now + 1.0, monotonic.now + 1.0
-        wrong.operations.beat("wrong", 1, 1)  # it knows of its own heartbeats and receives no others any more
+        # only its own heartbeats are left, which it can compare
+        wrong.operations.record_heartbeat("wrong", 1, 1)
         assert watch.confirm()

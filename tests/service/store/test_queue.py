@@ -66,10 +66,10 @@ def test_job_without_a_reservation_is_skipped(store: Store, clock: Clock) -> Non
     clock.now += 1
     small = queue(store, "b")
     clock.now += 1
-    found = store.leases.take("one", lambda job: job.id == small, keeps=lambda job: False)
+    found = store.leases.take("one", lambda job: job.id == small, should_reserve=lambda job: False)
     assert found is not None
     assert found.job_id == small
-    assert store.leases.take("one", lambda job: False, keeps=lambda job: False) is None
+    assert store.leases.take("one", lambda job: False, should_reserve=lambda job: False) is None
     queue(store, "c")
     assert store.leases.take("one", lambda job: job.id != big) is None, "and now it is kept"
 
@@ -89,13 +89,13 @@ def test_harmless_jobs_run_before_the_reserved_job(store: Store, clock: Clock) -
         told.append(kept.id)
         return lambda job: job.id != others[1]
 
-    taken = [held.job_id for _ in range(4) if (held := store.leases.take("one", full, before=before))]
+    taken = [held.job_id for _ in range(4) if (held := store.leases.take("one", full, backfills=before))]
     assert taken == [others[0], others[3], others[2]], "in turns, but for the one that is in the way"
     assert told == [big] * 4
-    found = store.leases.take("two", full, before=before)
+    found = store.leases.take("two", full, backfills=before)
     assert found is not None
     assert found.job_id == others[1], "which another dispatcher has room for: it is kept by the first alone"
-    assert store.leases.take("two", full, before=before) is None
+    assert store.leases.take("two", full, backfills=before) is None
     assert lease(store, "one").job_id == big
 
 

@@ -33,7 +33,7 @@ settings = ServiceSettings()
 store = open_store(settings)
 source = settings.folder / "incoming.part"
 source.write_bytes(b"scene")
-sha256 = BlobFolder(settings.folder, store.inputs, 0).keep(source)
+sha256 = BlobFolder(settings.folder, store.inputs, 0).add(source)
 entry = {"role": "scene", "name": "scene.ply", "sha256": sha256, "size": 5}
 store.jobs.create(NewJob("me", "", 0, {}, [entry]), limit=10)
 lease = store.leases.take("one")

@@ -23,7 +23,7 @@ from service.store.states import (
 
 #: Rows: initial states; columns: transitions. A dot marks a combination that is not allowed.
 EXPECTED = """
-            take      begin     succeed    fail    requeue  stop      cancel     retry   expire
+            take      start     succeed    fail    requeue  stop      cancel     retry   expire
 queued      starting  .         .          .       .        .         canceled   .       .
 starting    starting  running   succeeded  failed  queued   canceled  canceling  .       .
 running     starting  running   succeeded  failed  queued   canceled  canceling  .       .

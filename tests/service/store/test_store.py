@@ -19,10 +19,10 @@ from sqlalchemy import func, inspect, select
 from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError, ServiceError
 from service.store import Store, open_store
 from service.store.database import MIGRATIONS
-from service.store.history import GROWTH, keep_point
+from service.store.history import GROWTH, add_point
 from service.store.inputs import GRACE_SECONDS
 from service.store.jobs import Idempotency
-from service.store.leases import KEPT_PROGRESS, Lease, Published
+from service.store.leases import MAX_PROGRESS_EVENTS, Lease, Published
 from service.store.states import ACTIVE, FINISHED
 from service.store.tables import Base, ProgressPointRow
 from tests.service.store.helpers import (
@@ -143,7 +143,7 @@ def test_lost_lease_cannot_write(store: Store, clock: Clock) -> None:
     assert new.job_id == late.job_id
     file = Published("stylized.ply", "x/1", 1, SHA)
     for write in (
-        lambda: store.leases.begin(late),
+        lambda: store.leases.start(late),
         lambda: store.leases.report_progress(late, {"step": 1}),
         lambda: store.leases.publish(late, [file]),
         lambda: store.leases.succeed(late, [file], {}),
@@ -293,17 +293,17 @@ def test_ended_jobs_are_swept_once(store: Store, clock: Clock) -> None:
 
 def test_dispatchers_are_alive_while_they_send_heartbeats(store: Store, clock: Clock) -> None:
     operations = store.operations
-    operations.beat("one", 8, 8)
+    operations.record_heartbeat("one", 8, 8)
     clock.now += LEASE / 2
-    operations.beat("two", 4, 0)
-    operations.beat("one", 8, 3)
+    operations.record_heartbeat("two", 4, 0)
+    operations.record_heartbeat("one", 8, 3)
     assert [(row.name, row.places, row.free) for row in operations.dispatchers()] == [("one", 8, 3), ("two", 4, 0)]
-    operations.gone("one")
+    operations.remove_dispatcher("one")
     assert [row.name for row in operations.dispatchers()] == ["two"]
     clock.now += LEASE + 1
     assert operations.dispatchers() == []
     clock.now += 2 * 86_400
-    operations.beat("three", 1, 1)
+    operations.record_heartbeat("three", 1, 1)
     store.retention.expire()
     with store.database.reading() as session:
         assert session.connection().exec_driver_sql("SELECT name FROM dispatchers").scalars().all() == ["three"]
@@ -359,10 +359,12 @@ def test_unfinished_jobs_of_a_key_are_limited(store: Store) -> None:
 def test_old_progress_events_are_deleted_but_not_status_events(store: Store) -> None:
     queue(store)
     held = lease(store)
-    for step in range(KEPT_PROGRESS + 20):
+    for step in range(MAX_PROGRESS_EVENTS + 20):
         store.leases.report_progress(held, {"step": step})
     events = store.jobs.events(held.job_id, 0, limit=1000)
-    assert [event.data["step"] for event in events if event.kind == "progress"] == list(range(20, KEPT_PROGRESS + 20))
+    assert [event.data["step"] for event in events if event.kind == "progress"] == list(
+        range(20, MAX_PROGRESS_EVENTS + 20)
+    )
     assert [event.data["status"] for event in events if event.kind == "status"] == ["queued", "starting"]
 
 
@@ -376,14 +378,14 @@ def test_loss_history_covers_the_whole_job(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     held = lease(store)
     store.leases.report_progress(held, {"stage": "planning", "step": 1, "total": 3, "attempt": 1})
-    assert store.jobs.course(store.jobs.get(job_id, None), 10) == []
+    assert store.jobs.loss_history(store.jobs.get(job_id, None), 10) == []
     with store.database.writing() as session:  # like `report_progress`, without a transaction for each point
         for step in range(1, 5000):
-            keep_point(session, job_id, {**step_of(held, step, 0.9 * step), "updated_at": clock.now + step})
+            add_point(session, job_id, {**step_of(held, step, 0.9 * step), "updated_at": clock.now + step})
     clock.now += 5000
     store.leases.report_progress(held, step_of(held, 5000, 4500.0, stage="measuring"))
     job = store.jobs.get(job_id, None)
-    found = store.jobs.course(job, 10_000)
+    found = store.jobs.loss_history(job, 10_000)
     assert [point.step for point in found[:5]] == [1, 2, 3, 4, 5]
     assert (found[-1].step, found[-1].stage, found[-1].updated_at) == (5000, "measuring", clock.now)
     assert (found[9].loss, found[9].scales, found[9].seconds) == (1e5, [1.0, None], 9.0)
@@ -391,7 +393,7 @@ def test_loss_history_covers_the_whole_job(store: Store, clock: Clock) -> None:
     assert all(ratio >= GROWTH for ratio in ratios)
     assert all(ratio < GROWTH + 0.01 for ratio in ratios[100:]), "no gaps"
     assert len(found) < 550
-    few = store.jobs.course(job, 64)
+    few = store.jobs.loss_history(job, 64)
     assert len(few) == 64
     assert (few[0].step, few[-1].step) == (1, 5000)
     assert [point.step for point in few] == sorted({point.step for point in few})
@@ -406,13 +408,13 @@ def test_loss_history_continues_across_attempts(store: Store, clock: Clock) -> N
     again = lease(store)
     for step, seconds in ((3, 3.0), (3, 3.0), (2, 2.0), (5, 5.0)):  # from a checkpoint of step 2; ranks were lost once
         store.leases.report_progress(again, step_of(again, step, seconds))
-    found = [(point.attempt, point.step) for point in store.jobs.course(store.jobs.get(job_id, None), 100)]
+    found = [(point.attempt, point.step) for point in store.jobs.loss_history(store.jobs.get(job_id, None), 100)]
     assert found == [(1, 1), (1, 2), (1, 3), (1, 4), (2, 3), (2, 5)]
     store.leases.fail(again, {"code": "x", "message": "x"}, permanent=True)
     store.jobs.retry(job_id, None, limit=10)
     job = store.jobs.get(job_id, None)
     assert job.progress is None
-    assert len(store.jobs.course(job, 100)) == 6
+    assert len(store.jobs.loss_history(job, 100)) == 6
     store.jobs.cancel(job_id, None)
     store.jobs.delete(job_id, None)
     with store.database.reading_rows() as connection:
@@ -427,7 +429,7 @@ def test_long_loss_history_is_thinned(store: Store, monkeypatch: pytest.MonkeyPa
         for step in range(1, 21):
             store.leases.report_progress(held, step_of(held, step, float(step)))
         store.leases.release(held)
-    found = store.jobs.course(store.jobs.get(job_id, None), 1000)
+    found = store.jobs.loss_history(store.jobs.get(job_id, None), 1000)
     assert len(found) <= 40 + 20
     assert (found[0].attempt, found[0].step) == (1, 1)
     assert (found[-1].attempt, found[-1].step) == (12, 20)
@@ -580,7 +582,7 @@ class StoreMachine(RuleBasedStateMachine):
         job_id, leases = held.job_id, self.store.leases
         canceling = self.status[job_id] == "canceling"
         if how == "running":
-            leases.begin(held)
+            leases.start(held)
             self.status[job_id] = "canceling" if canceling else "running"
             return
         if how == "succeed":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import functools
 import multiprocessing
-import socket
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import nullcontext
@@ -14,6 +13,7 @@ from typing import Any
 
 import torch
 
+from tests.ports import free_port
 from tests.pretend_cuda.runtime import pretend_cuda
 from worker.ranks.process_group import process_group
 
@@ -67,11 +67,3 @@ def _run(
 
 def _result(future: Future[Any]) -> Any:
     return future.result(timeout=300)
-
-
-def free_port() -> int:
-    """Return an unused port of this machine."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        port: int = listener.getsockname()[1]
-        return port

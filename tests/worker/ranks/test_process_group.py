@@ -20,9 +20,10 @@ from sgsst_core.parallel.division import divide_rows
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights
+from tests.ports import free_port
 from tests.sgsst_core.pictures import relative_error
 from tests.small_scenes import cameras, style, wall
-from tests.worker.ranks.spawn import free_port, on_ranks
+from tests.worker.ranks.spawn import on_ranks
 from worker.ranks.process_group import _backend, _meet
 
 HEIGHT = 70

@@ -17,9 +17,9 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.probe import probe_link
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.ports import free_port
 from tests.sgsst_core.pictures import relative_error
 from tests.small_scenes import ball, cameras, style, wall
-from tests.worker.ranks.spawn import free_port
 from worker.ranks.process_group import process_group
 
 pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("vgg16_weights")]
