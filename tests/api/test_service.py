@@ -145,7 +145,7 @@ def check_course(client: httpx.Client, job_id: str, steps: list[int]) -> None:
         assert np.isclose(np.mean(seen), point["loss"]), "all scales count alike"
 
 
-def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Path], expected: bytes) -> None:
+def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], expected: bytes) -> None:
     with service.client() as client:
         job_id = submit(client, files, name="my wall")
         seen = events(client, job_id)  # returns when the job has ended
@@ -191,7 +191,7 @@ def test_a_job_from_submission_to_the_ply(service: Service, files: dict[str, Pat
     assert not [path for path in service.data.rglob("*") if path.is_file() and path.stat().st_mode & 0o077]
 
 
-def test_the_ply_in_ranges(service: Service, files: dict[str, Path], short_job: str, tmp_path: Path) -> None:
+def test_ply_is_sent_in_ranges(service: Service, files: dict[str, Path], short_job: str, tmp_path: Path) -> None:
     with service.client() as client:
         where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
         whole = client.get(where)
@@ -220,7 +220,9 @@ def test_the_ply_in_ranges(service: Service, files: dict[str, Path], short_job: 
 
 
 @pytest.mark.slow
-def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
+def test_compressed_scene_and_results_in_other_formats(
+    service: Service, files: dict[str, Path], tmp_path: Path
+) -> None:
     scene, gaussians = tmp_path / "wall.ply", wall(sh_degree=1)
     gaussians.means[:, 2] += torch.linspace(0, 0.3, 616)  # at equal depths, the image would depend on their order
     write_scene(scene, gaussians, SPZ)
@@ -267,7 +269,7 @@ def test_a_packed_scene_and_its_result_in_other_forms(service: Service, files: d
         assert not (service.data / "artifacts" / job_id).exists()
 
 
-def test_one_packed_result_for_many_who_ask_at_once(service: Service, short_job: str) -> None:
+def test_concurrent_requests_share_one_compression(service: Service, short_job: str) -> None:
     where = f"{service.url}/v1/jobs/{short_job}/artifacts/stylized.ply?format=spz"
     with ThreadPoolExecutor(6) as pool:
         answers = list(pool.map(lambda _: httpx.get(where, timeout=120), range(6)))
@@ -284,7 +286,7 @@ def read(folder: Path, data: bytes) -> SceneFile:
 
 
 @pytest.mark.slow
-def test_a_canceled_job_goes_on_where_it_was(service: Service, files: dict[str, Path], expected: bytes) -> None:
+def test_retried_job_resumes_from_checkpoint(service: Service, files: dict[str, Path], expected: bytes) -> None:
     with service.client() as client:
         job_id = submit(client, files)
         wait_for_step(service, client, job_id, 10)
@@ -304,7 +306,7 @@ def test_a_canceled_job_goes_on_where_it_was(service: Service, files: dict[str, 
         assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
 
 
-def test_a_queued_job_is_canceled_at_once(service: Service, files: dict[str, Path]) -> None:
+def test_queued_job_is_canceled_immediately(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
         first, second = submit(client, files), submit(client, files)
         assert client.post(f"/v1/jobs/{second}/cancel").json()["status"] == "canceled"
@@ -317,7 +319,7 @@ def test_a_queued_job_is_canceled_at_once(service: Service, files: dict[str, Pat
 
 
 @pytest.mark.slow
-def test_killed_processes_cost_time_and_nothing_else(service: Service, files: dict[str, Path], expected: bytes) -> None:
+def test_jobs_survive_killed_processes(service: Service, files: dict[str, Path], expected: bytes) -> None:
     with service.client() as client:
         job_id = submit(client, files)
         wait_for_step(service, client, job_id, 5)
@@ -340,9 +342,7 @@ def test_killed_processes_cost_time_and_nothing_else(service: Service, files: di
 
 
 @pytest.mark.slow
-def test_stopping_saves_running_jobs_and_starting_goes_on(
-    files: dict[str, Path], expected: bytes, tmp_path: Path
-) -> None:
+def test_restart_resumes_running_jobs(files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
     with Service(tmp_path / "data") as service, service.client() as client:
         job_id = submit(client, files)
         wait_for_step(service, client, job_id, 10)
@@ -356,7 +356,7 @@ def test_stopping_saves_running_jobs_and_starting_goes_on(
 
 
 @pytest.mark.slow
-def test_a_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
+def test_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
         job_id = submit(client, files, workers=2, steps_sos=4)
         found = wait_until(service, client, job_id, "succeeded", "failed")
@@ -366,7 +366,7 @@ def test_a_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
 
 
 @pytest.mark.slow
-def test_jobs_side_by_side_share_cores_and_memory(files: dict[str, Path], tmp_path: Path) -> None:
+def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path: Path) -> None:
     with Service(tmp_path / "data", SGSST_PARALLEL_JOBS="2") as service, service.client() as client:
         jobs = [submit(client, files, name=name) for name in ("one", "two", "three")]
         for job_id in jobs[:2]:
@@ -389,7 +389,7 @@ def test_jobs_side_by_side_share_cores_and_memory(files: dict[str, Path], tmp_pa
             wait_until(service, client, job_id, "canceled")
 
 
-def test_a_dry_run_plans_and_queues_nothing(service: Service, files: dict[str, Path]) -> None:
+def test_dry_run_plans_without_queueing(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
         before = len(client.get("/v1/jobs").json()["jobs"])
         body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
@@ -406,7 +406,7 @@ def test_a_dry_run_plans_and_queues_nothing(service: Service, files: dict[str, P
 
 
 @pytest.mark.usefixtures("short_job")
-def test_the_api_never_loads_pytorch_or_ray(service: Service) -> None:
+def test_api_process_loads_no_pytorch_or_ray(service: Service) -> None:
     process = service.process("api.http.server")
     assert process is not None
     mapped = Path(f"/proc/{process.pid}/maps").read_text()
@@ -415,7 +415,7 @@ def test_the_api_never_loads_pytorch_or_ray(service: Service) -> None:
 
 
 @pytest.mark.slow
-def test_the_client_and_its_commands(service: Service, files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
+def test_client_commands(service: Service, files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
     def sgsst(*arguments: str) -> subprocess.CompletedProcess[str]:
         environment = {**service.environment, "SGSST_URL": service.url}
         command = [sys.executable, "-m", "api.cli", *arguments]
@@ -451,7 +451,7 @@ def test_the_client_and_its_commands(service: Service, files: dict[str, Path], e
         assert (tmp_path / "result.ply").read_bytes()[:3] == b"ply"
 
 
-def test_a_deleted_job_takes_its_files_along(service: Service, short_job: str) -> None:
+def test_deleting_job_removes_its_files(service: Service, short_job: str) -> None:
     """This test runs after all other tests that use the same job."""
     with service.client() as client:
         where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
@@ -461,7 +461,7 @@ def test_a_deleted_job_takes_its_files_along(service: Service, short_job: str) -
         assert not (service.data / "artifacts" / short_job).exists()
 
 
-def test_nothing_went_wrong_unnoticed(service: Service) -> None:
+def test_logs_contain_no_errors(service: Service) -> None:
     """This test runs last, and checks that the log of the shared service contains no traceback."""
     assert "Traceback" not in service.said()
     assert os.listdir(service.data / "incoming") == []

@@ -42,7 +42,7 @@ def flip_a_bit(path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_no_job_is_accepted_or_started_on_damaged_weights(cache: Path, tmp_path: Path) -> None:
+def test_damaged_weights_block_jobs(cache: Path, tmp_path: Path) -> None:
     """A job waits if the service starts with damaged weights. Once they are repaired, it runs without a restart."""
     scene, cameras, style = write_files(tmp_path, wall())
     paths = {"scene": scene, "cameras": cameras, "style": style}

@@ -65,7 +65,7 @@ def second_reader(path: Path) -> dict[str, np.ndarray]:
     return {name: values[:, i] for i, name in enumerate(names)}
 
 
-def test_several_styles(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     other = files.style.with_name("other:2.png")
     Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
     told = [
@@ -94,7 +94,7 @@ def test_several_styles(files: Files, capsys: pytest.CaptureFixture[str]) -> Non
     assert "the weight 0 is not a finite number greater than 0" in capsys.readouterr().err
 
 
-def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     other = files.style.with_name("other.png")
     Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
     told = ["--region", "right:half-space=1,0,0,0.5", "--region-style", f"right={other}", "--region-weight", "right=2"]
@@ -147,7 +147,7 @@ def test_regions(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
         (["--region", "a:half-space=0,0,1,0", "--region-style", "a=nowhere.png"], "nowhere.png"),
     ],
 )
-def test_regions_that_cannot_be_used(
+def test_invalid_regions_are_rejected(
     files: Files, capsys: pytest.CaptureFixture[str], options: list[str], message: str
 ) -> None:
     assert main(files.stylize(*options)) == 2
@@ -156,7 +156,9 @@ def test_regions_that_cannot_be_used(
 
 
 @pytest.mark.parametrize("form", [pytest.param("compressed.ply", marks=pytest.mark.slow), "spz"])
-def test_stylize_reads_and_writes_packed_scenes(files: Files, capsys: pytest.CaptureFixture[str], form: str) -> None:
+def test_stylize_reads_and_writes_compressed_scenes(
+    files: Files, capsys: pytest.CaptureFixture[str], form: str
+) -> None:
     write_scene(files.ply, read_scene(files.ply).scene, by_name(form))
     source = read_scene(files.ply).scene
     files.out = files.out.with_name(f"wall.{form}")
@@ -178,7 +180,7 @@ def test_stylize_reads_and_writes_packed_scenes(files: Files, capsys: pytest.Cap
         assert main([command, str(files.out), "--cameras", str(files.cameras), *options]) == 0
 
 
-def test_a_packed_result_never_takes_the_scenes_place(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compressed_result_never_overwrites_scene(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     before = files.ply.read_bytes()
     files.out = files.ply.with_suffix(".spz")
     assert main(files.stylize()) == 2
@@ -189,7 +191,7 @@ def test_a_packed_result_never_takes_the_scenes_place(files: Files, capsys: pyte
     assert files.ply.read_bytes() == before
 
 
-def test_stylize_writes_a_scene_that_differs_in_f_dc_only(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stylize_changes_only_f_dc(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(files.stylize("--steps-sos", "3")) == 0
     shown = capsys.readouterr().out
     for expected in ("616 Gaussians, SH degree 1", "3 of 64x48, 1 scale", "VGG16", "3 steps", "before", str(files.out)):
@@ -216,21 +218,21 @@ def test_stylize_writes_a_scene_that_differs_in_f_dc_only(files: Files, capsys: 
     assert len(report["history"]) == 3
 
 
-def test_same_command_gives_the_same_file(files: Files) -> None:
+def test_same_command_writes_same_bytes(files: Files) -> None:
     main(files.stylize("--steps-sos", "3", "--seed", "5"))
     first = files.out.read_bytes()
     main(files.stylize("--steps-sos", "3", "--seed", "5"))
     assert files.out.read_bytes() == first
 
 
-def test_resolution_and_views_are_what_was_asked_for(files: Files) -> None:
+def test_resolution_and_views_follow_options(files: Files) -> None:
     main(files.stylize("--steps-sos", "1", "--resolution", "80", "--views", "2", "--preset", "preview"))
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     assert report["cameras"]["sizes"] == [[80, 60]]
     assert report["cameras"]["names"] == ["view_0", "view_2"]
 
 
-def test_plan_tells_what_would_be_left_out(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_lists_skipped_work(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     write_scene(files.ply, ball())
     out = files.out.with_name("plan.json")
     command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--backbone", "vgg16", "--out", str(out)]
@@ -261,7 +263,7 @@ def test_plan_and_check_report_lenses(files: Files, capsys: pytest.CaptureFixtur
     assert ("photos", "3 are resized to their views") in items
 
 
-def test_plan_replaces_none_of_its_inputs(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_never_overwrites_inputs(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
     for out in (files.ply, files.cameras, files.ply.parent):
         before = files.ply.read_bytes(), files.cameras.read_bytes()
@@ -271,7 +273,7 @@ def test_plan_replaces_none_of_its_inputs(files: Files, capsys: pytest.CaptureFi
 
 
 @pytest.mark.slow
-def test_keep_everything_gives_the_same_scene(files: Files) -> None:
+def test_compute_everything_gives_same_scene(files: Files) -> None:
     results = []
     for options in ([], ["--compute-everything"]):
         assert main(files.stylize("--steps-sos", "2", *options)) == 0
@@ -281,7 +283,7 @@ def test_keep_everything_gives_the_same_scene(files: Files) -> None:
     torch.testing.assert_close(results[0], results[1], rtol=0, atol=1e-3)
 
 
-def test_photos_are_used_as_content(files: Files, tmp_path: Path) -> None:
+def test_photos_are_content_images(files: Files, tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     for i in range(3):
@@ -306,7 +308,7 @@ def test_orbit_needs_no_camera_file(files: Files) -> None:
     assert report["position_weights"]["used"] is True
 
 
-def test_a_plan_shows_the_views_of_an_orbit_before_the_start(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_sheet_shows_orbit_views(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     write_scene(files.ply, ball())
     sheet, out = files.ply.with_name("views.jpg"), files.ply.with_name("plan.json")
     command = ["plan", str(files.ply), "--style", str(files.style), "--backbone", "vgg16", "--out", str(out)]
@@ -322,7 +324,7 @@ def test_a_plan_shows_the_views_of_an_orbit_before_the_start(files: Files, capsy
     assert "views.jpg" in capsys.readouterr().err
 
 
-def test_an_orbit_may_choose_its_number_of_views(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_orbit_auto_chooses_number_of_views(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     write_scene(files.ply, ball())
     out = files.ply.with_name("renders")
     assert main(["render", str(files.ply), "--orbit", "auto", "--resolution", "32", "--out", str(out)]) == 0
@@ -332,7 +334,7 @@ def test_an_orbit_may_choose_its_number_of_views(files: Files, capsys: pytest.Ca
     assert "--radius" in capsys.readouterr().err
 
 
-def test_invalid_gaussians_are_dropped_on_demand(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_drop_invalid_drops_invalid_gaussians(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     scene = wall()
     scene.opacities[7] = float("nan")
     write_scene(files.ply, scene)
@@ -344,9 +346,7 @@ def test_invalid_gaussians_are_dropped_on_demand(files: Files, capsys: pytest.Ca
     assert report["scene"]["dropped"] == 1
 
 
-def test_a_target_ends_the_run_and_the_report_says_what_the_time_bought(
-    files: Files, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_target_loss_stops_run_and_report_has_loss_over_time(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(files.stylize("--steps-sos", "60", "--target-loss", "0.8", "--learning-rate", "0.1")) == 0
     shown = capsys.readouterr().out
     assert "reached --target-loss" in shown
@@ -357,7 +357,7 @@ def test_a_target_ends_the_run_and_the_report_says_what_the_time_bought(
     assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
 
 
-def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_converged_run_stops_early(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     """With almost no learning rate the loss does not fall, so the run ends after two windows of 24 steps."""
     options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9", "--no-bounded"]
     assert main(files.stylize(*options)) == 0
@@ -367,7 +367,7 @@ def test_a_run_that_has_stopped_falling_ends(files: Files, capsys: pytest.Captur
 
 
 @pytest.mark.slow
-def test_held_out_views_approximations_and_findings_are_reported(files: Files) -> None:
+def test_report_has_novel_views_approximations_and_findings(files: Files) -> None:
     assert main(files.stylize("--steps-sos", "16", "--cached-weights", "half")) == 0
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     moments = report["novel_views"]["moments"]
@@ -416,7 +416,7 @@ def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pyt
     assert len(read_scene(folder / "standard.ply").scene) == len(wall())
 
 
-def test_bench_quality_writes_table_plot_pictures_and_scenes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_quality_writes_table_plot_images_and_scenes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     folder = files.out.with_name("bench")
     command = ["bench", "quality", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
     command += ["--backbone", "vgg16", "--out", str(folder), "--coarsest-side", "24", "--resolution", "96"]
@@ -442,9 +442,7 @@ def test_bench_quality_writes_table_plot_pictures_and_scenes(files: Files, capsy
     assert len(read_scene(folder / "transfer.ply").scene) == len(wall())
 
 
-def test_bench_stability_measures_the_cases_asked_for(
-    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bench_stability_runs_selected_cases(files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "found.json"
     assert main(["bench", "stability", "--quick", "--only", "nan in", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
@@ -456,7 +454,7 @@ def test_bench_stability_measures_the_cases_asked_for(
     assert "no such case" in capsys.readouterr().err
 
 
-def test_a_report_that_fails_does_not_lose_the_scene(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_failed_report_preserves_scene(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     files.out.with_name("stylized.report.json").mkdir(parents=True)
     assert main(files.stylize("--steps-sos", "1")) == 1
     error = capsys.readouterr().err
@@ -469,7 +467,7 @@ def test_a_report_that_fails_does_not_lose_the_scene(files: Files, capsys: pytes
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
+def test_resume_after_ctrl_c_is_bit_identical(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
     options = files.stylize("--steps-sos", "150", "--learning-rate", "0.1")  # a second: a signal arrives during it
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "api.cli", *options]
@@ -502,7 +500,7 @@ def test_ctrl_c_saves_and_resume_ends_with_the_same_bits(files: Files, capfd: py
 
 
 @pytest.mark.parametrize("command", ["plan", pytest.param("stylize", marks=pytest.mark.slow)])
-def test_ctrl_c_ends_the_look_at_the_views_and_leaves_nothing(files: Files, command: str) -> None:
+def test_ctrl_c_during_survey_leaves_no_files(files: Files, command: str) -> None:
     """The progress bar shows when the survey runs; there are enough views for the signal to arrive meanwhile."""
     views, out = 2000, files.out if command == "stylize" else files.out.with_name("plan.json")
     inputs = [str(files.ply), "--style", str(files.style), "--orbit", str(views), "--backbone", "vgg16"]
@@ -537,9 +535,7 @@ def _shown_until(terminal: int, pattern: str | None) -> str:
     return shown
 
 
-def test_time_budget_writes_the_result_and_keeps_the_checkpoint(
-    files: Files, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_time_budget_writes_result_and_checkpoint(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     options = files.stylize("--steps-sos", "5")
     assert main([*options, "--max-seconds", "0.000001"]) == 0
     shown = capsys.readouterr().out
@@ -562,9 +558,7 @@ def test_time_budget_writes_the_result_and_keeps_the_checkpoint(
     assert "this job is finished" in capsys.readouterr().err
 
 
-def test_an_old_checkpoint_is_mentioned_when_a_job_starts_anew(
-    files: Files, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_new_job_mentions_old_checkpoint(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     main(files.stylize("--steps-sos", "3", "--max-seconds", "0.000001"))
     capsys.readouterr()
     assert main(files.stylize("--steps-sos", "2")) == 0
@@ -736,7 +730,7 @@ def _damaged_checkpoint(files: Files) -> list[str]:
         (_damaged_checkpoint, ["not a readable checkpoint"]),
     ],
 )
-def test_bad_input_gives_one_message_and_leaves_nothing(
+def test_bad_input_prints_one_message_and_leaves_no_files(
     files: Files,
     tmp_path: Path,
     spoil: Callable[[Files], list[str]],
@@ -759,9 +753,7 @@ def _everything(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
 
 
-def test_neither_cameras_nor_orbit_is_an_error_that_names_both(
-    files: Files, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_cameras_error_names_cameras_and_orbit(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     command = files.stylize()
     at = command.index("--cameras")
     assert main(command[:at] + command[at + 2 :]) == 2
@@ -770,14 +762,14 @@ def test_neither_cameras_nor_orbit_is_an_error_that_names_both(
     assert "--orbit" in error
 
 
-def test_photos_of_an_orbit_are_an_error(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_with_orbit_are_rejected(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     command = files.stylize("--orbit", "3", "--images", str(files.ply.parent))
     at = command.index("--cameras")
     assert main(command[:at] + command[at + 2 :]) == 2
     assert "--images" in capsys.readouterr().err
 
 
-def test_a_folder_without_write_permission_is_refused_before_any_work(
+def test_unwritable_folder_is_rejected_before_work_starts(
     files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if os.geteuid() == 0:  # root may write anywhere except where the kernel itself refuses
@@ -792,7 +784,7 @@ def test_a_folder_without_write_permission_is_refused_before_any_work(
     assert "not writable" in capsys.readouterr().err
 
 
-def test_without_weights_the_message_says_how_to_get_them(
+def test_missing_weights_error_names_fetch_command(
     files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "empty"))
@@ -802,7 +794,7 @@ def test_without_weights_the_message_says_how_to_get_them(
     assert not files.out.parent.exists()
 
 
-def test_damaged_weights_are_refused(
+def test_damaged_weights_are_rejected(
     files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = bytearray((cache_folder() / "vgg16.safetensors").read_bytes())
@@ -833,14 +825,14 @@ def test_damaged_weights_are_refused(
         ["--unheard-of"],
     ],
 )
-def test_wrong_options_end_with_code_2(files: Files, options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_options_exit_with_code_2(files: Files, options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(files.stylize(*options)) == 2
     error = capsys.readouterr().err
     assert options[0].strip("-").replace("-", "_") in error.replace("-", "_")
     assert not files.out.parent.exists()
 
 
-def test_a_backbone_chosen_by_default_is_named_with_its_reason(
+def test_default_backbone_is_named_with_reason(
     files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copy(cache_folder() / "vgg16.safetensors", tmp_path)
@@ -852,7 +844,7 @@ def test_a_backbone_chosen_by_default_is_named_with_its_reason(
 # --- render, weights, program --------------------------------------------------------------------------------------
 
 
-def test_render_writes_one_picture_a_view_in_the_cameras_order(
+def test_render_writes_one_image_per_view_in_camera_order(
     files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = ["b/left.png", "a/left.png", "a/left.png"]
@@ -876,7 +868,9 @@ def test_render_writes_one_picture_a_view_in_the_cameras_order(
     assert picture[0, 0].tolist() == [10, 20, 30]
 
 
-def test_render_refuses_what_stylize_refuses(files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_render_rejects_same_inputs_as_stylize(
+    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _blind_cameras(files)
     command = ["render", str(files.ply), "--cameras", str(files.cameras), "--out", str(tmp_path / "renders")]
     assert main(command) == 2
@@ -929,7 +923,7 @@ def test_convert_refuses_what_it_cannot_write(files: Files, capsys: pytest.Captu
     assert not files.out.parent.exists()
 
 
-def test_file_names_of_views_are_plain_and_sort_in_order() -> None:
+def test_view_file_names_are_safe_and_sorted() -> None:
     names = ["../up.JPG", "a:b*?.png", "", "x" * 300, "frame.0001", "Ünï.png", "."]
     views = [replace(camera, name=name) for camera, name in zip(cameras(7), names, strict=True)]
     files = view_file_names(views)
@@ -941,7 +935,7 @@ def test_file_names_of_views_are_plain_and_sort_in_order() -> None:
     assert many == sorted(many)
 
 
-def test_weights_are_listed_and_fetched(
+def test_weights_list_and_fetch(
     tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state = {
@@ -965,13 +959,13 @@ def test_weights_are_listed_and_fetched(
     assert "missing.pth" in capsys.readouterr().err
 
 
-def test_help_and_version_need_no_heavy_import() -> None:
+def test_help_and_version_import_no_pytorch() -> None:
     check = "import sys, api.cli.main; sys.exit(any(name in sys.modules for name in ('torch', 'numba', 'matplotlib')))"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     assert subprocess.run([sys.executable, "-c", check], env=environment).returncode == 0
 
 
-def test_an_error_in_a_process_of_its_own_is_one_line_on_stderr(tmp_path: Path) -> None:
+def test_error_is_one_line_on_stderr(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "api.cli", "render", "missing.ply", "--orbit", "2", "--out", "renders"]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
@@ -985,9 +979,7 @@ def test_an_error_in_a_process_of_its_own_is_one_line_on_stderr(tmp_path: Path) 
 # --- check ---------------------------------------------------------------------------------------------------------
 
 
-def test_check_tells_what_is_extreme_and_what_is_done_about_it(
-    files: Files, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_reports_extremes_and_consequences(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     scene = wall()
     scene.means[3, 0] = float("nan")
     scene.quats[5] = 0

@@ -33,7 +33,7 @@ def command(name: str, folder: Path, *options: str) -> list[str]:
 
 
 @pytest.mark.parametrize("form", ["compressed.ply", "spz"])
-def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
+def test_controls_take_effect_and_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
     out = tmp_path / "new" / f"out.{form}"
     steps = ["--steps-coarse", "1", "--steps-sos", "3"]
     assert main(command("stylize", tmp_path, "--out", str(out), *steps, *CONTROLS)) == 0
@@ -62,7 +62,7 @@ def test_stylize_does_and_reports_what_was_asked(tmp_path: Path, capsys: pytest.
     assert float(held(packed.sh_rest).abs().max()) < 0.8 * float(held(before.sh_rest).abs().max())
 
 
-def test_a_plan_tells_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_lists_controls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command("plan", tmp_path, "--out", str(tmp_path / "plan.json"), *CONTROLS)) == 0
     items = [entry["item"] for entry in json.loads((tmp_path / "plan.json").read_text())["decisions"]]
     assert {"colors", "spherical harmonics", "weights of scales"} <= set(items)
@@ -81,7 +81,7 @@ def test_a_plan_tells_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ],
     ids=str,
 )
-def test_what_makes_no_sense_is_refused_before_the_work(
+def test_contradictory_controls_are_rejected_before_work_starts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], problem: str
 ) -> None:
     for name in ("stylize", "plan"):

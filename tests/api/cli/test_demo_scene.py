@@ -51,7 +51,7 @@ def render(scene: Scene, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     return rasterizer.render(colors, camera), rasterizer.coverage(camera)
 
 
-def test_scene_is_of_a_size_to_work_with(scene: Scene) -> None:
+def test_demo_scene_has_moderate_size(scene: Scene) -> None:
     assert 100_000 <= len(scene) <= 300_000
     assert scene.sh_degree == 0
     assert 1.9 < float(scene.means[:, 2].min()) < 2.3  # the floor in front
@@ -63,7 +63,7 @@ def test_scene_is_of_a_size_to_work_with(scene: Scene) -> None:
     [(0, photo_camera(0.0, CENTER_X)), (1, photo_camera(BASELINE, CENTER_X + DISPARITY_OFFSET))],
     ids=["left", "right"],
 )
-def test_both_photos_come_back_from_their_cameras(scene: Scene, photo: int, camera: Camera) -> None:
+def test_both_cameras_render_their_photos(scene: Scene, photo: int, camera: Camera) -> None:
     """The right photo tests the calibration: its pixels are those of the left one, moved by depth, unless occluded."""
     image, coverage = render(scene, camera)
     expected = torch.from_numpy(data.stereo_motorcycle()[photo] / 255.0).float()
@@ -72,7 +72,7 @@ def test_both_photos_come_back_from_their_cameras(scene: Scene, photo: int, came
     assert float((coverage < 0.5).float().mean()) < 1e-3
 
 
-def test_views_have_hardly_a_hole(demo: DemoScene, scene: Scene) -> None:
+def test_views_have_few_holes(demo: DemoScene, scene: Scene) -> None:
     cameras = read_cameras(demo.cameras)
     assert len(cameras) == demo_scene.VIEWS
     xs = [float(camera.center[0]) for camera in cameras]
@@ -84,7 +84,7 @@ def test_views_have_hardly_a_hole(demo: DemoScene, scene: Scene) -> None:
         assert float(image.mean()) > 0.2
 
 
-def test_no_gaussian_is_stretched_over_an_edge(scene: Scene) -> None:
+def test_gaussians_do_not_span_depth_edges(scene: Scene) -> None:
     """No Gaussian is longer than a merged pixel at the steepest allowed slope (in both directions, seen obliquely)."""
     radii = scene.scales.exp()
     footprint = scene.means[:, 2] / FOCAL
@@ -96,7 +96,7 @@ def test_no_gaussian_is_stretched_over_an_edge(scene: Scene) -> None:
     torch.testing.assert_close(flatness, torch.full_like(flatness, FLATNESS), rtol=1e-3, atol=0)
 
 
-def test_discs_lie_in_their_surface() -> None:
+def test_discs_lie_in_surface() -> None:
     """Discs on a slanted plane have centers on it, thin axes along its normal, and round projections 1 pixel wide."""
     slope_x, slope_y, constant = 0.03, -0.05, 40.0
     generator = np.random.default_rng(0)
@@ -125,7 +125,7 @@ def test_discs_lie_in_their_surface() -> None:
     assert (sh_dc == 0).all()
 
 
-def test_slope_takes_the_pixel_s_own_side_of_an_edge() -> None:
+def test_slope_uses_pixels_own_side_of_edge() -> None:
     disparity = np.tile(np.concatenate([10 + 0.1 * np.arange(20), 40 + 0.2 * np.arange(20)]), (8, 1))
     slope = demo_scene._slope(disparity, 1)
     np.testing.assert_allclose(slope[:, 2:20], 0.1)
@@ -133,14 +133,14 @@ def test_slope_takes_the_pixel_s_own_side_of_an_edge() -> None:
     assert (demo_scene._slope(disparity, 0) == 0).all()
 
 
-def test_style_is_the_painting_that_comes_with_the_program(demo: DemoScene) -> None:
+def test_style_is_bundled_painting(demo: DemoScene) -> None:
     with Image.open(demo.style) as image:
         assert image.size == (800, 633)
         assert image.mode == "RGB"
         assert float(np.asarray(image).std(axis=(0, 1)).min()) > 20
 
 
-def test_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+def test_unwritable_demo_folder_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError):
         build_demo(tmp_path / "file" / "demo")

@@ -141,7 +141,7 @@ def kinds(found: dict[str, dict[str, str]]) -> dict[str, str]:
     return {name: finding["kind"] for name, finding in found.items()}
 
 
-def test_all_of_a_thousand_losses_and_flips_are_found(
+def test_fsck_finds_a_thousand_lost_and_damaged_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "data"))
@@ -161,7 +161,7 @@ def test_all_of_a_thousand_losses_and_flips_are_found(
     files.store.close()
 
 
-def test_what_is_found_is_mended(
+def test_mend_repairs_all_findings(
     service: Files, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     order = random.Random(1)
@@ -203,7 +203,7 @@ def test_what_is_found_is_mended(
         assert service.place(name).size(name) > 0
 
 
-def test_a_service_at_work_is_no_finding(service: Files, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fsck_of_running_service_finds_nothing(service: Files, capsys: pytest.CaptureFixture[str]) -> None:
     """Files that are added, replaced or deleted during the check are not reported as missing or orphaned."""
     stop = threading.Event()
 
@@ -234,7 +234,7 @@ def test_a_service_at_work_is_no_finding(service: Files, capsys: pytest.CaptureF
         working.result()
 
 
-def test_a_lost_file_is_known_by_its_code(service: Files) -> None:
+def test_lost_file_sets_its_exit_code(service: Files) -> None:
     name = service.input(b"content")
     service.lose(name)
     sha256 = name.split("/")[2].partition("-")[0]
@@ -242,7 +242,7 @@ def test_a_lost_file_is_known_by_its_code(service: Files) -> None:
         service.blobs.objects.check(name, sha256)
 
 
-def test_a_folder_without_a_service_is_refused_and_left_alone(
+def test_folder_without_database_is_rejected_unchanged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("SGSST_DATABASE", raising=False)

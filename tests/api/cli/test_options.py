@@ -37,7 +37,7 @@ def shown(command: str) -> dict[str, str]:
     return {"/".join(each.opts + each.secondary_opts): each.help for each in group.commands[command].params}
 
 
-def test_every_setting_is_an_option_or_names_the_one_that_stands_for_it() -> None:
+def test_every_setting_has_an_option() -> None:
     options = declared(Settings)
     standing = {
         info.metadata[-1].instead for name, info in Settings.model_fields.items() if name not in fields(options)
@@ -51,14 +51,14 @@ def fields(options: dict[str, Declared]) -> set[str]:
 
 
 @pytest.mark.parametrize("model", [Settings, StylizeOptions, RunOptions, JobParameters])
-def test_every_field_is_described_and_every_quantity_has_a_unit(model: Any) -> None:
+def test_every_option_has_description_and_unit(model: Any) -> None:
     for name, option in declared(model).items():
         assert option.help.endswith("."), name
         number = kind_of(option) in (int, float) or get_origin(kind_of(option)) is tuple
         assert bool(option.option.unit) == (number and name not in NO_QUANTITY), name
 
 
-def test_commands_and_parameters_have_every_option() -> None:
+def test_commands_and_parameters_offer_every_option() -> None:
     assert declared(JobParameters).keys() - OPTIONS.keys() == SERVICES
     assert declared(RunOptions).keys() == OPERATORS
     texts = {flags(option): help_text(option) for option in OPTIONS.values()}
@@ -88,7 +88,7 @@ BEYOND = [(name, value) for name, option in OPTIONS.items() for value in outside
 
 
 @pytest.mark.parametrize(("name", "value"), BEYOND)
-def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bounds_match_across_interfaces(name: str, value: float, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValidationError) as refused:
         JobParameters.model_validate({name: value})
     error = refused.value.errors()[0]  # a second one lists the words that may replace a number
@@ -107,7 +107,7 @@ def test_bounds_are_the_same_everywhere(name: str, value: float, capsys: pytest.
         assert error["msg"] in said
 
 
-def test_bounds_have_settings_numbers_and_no_other(capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_numbers_have_bounds(capsys: pytest.CaptureFixture[str]) -> None:
     """Whether the bound itself is valid is as the help text says."""
     assert {name for name, option in OPTIONS.items() if option.bounds} == {name for name, _ in BEYOND}
     assert OPTIONS["measure"].bounds == "0<=x<=1"
@@ -119,13 +119,13 @@ def test_bounds_have_settings_numbers_and_no_other(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "many", ""])
-def test_what_is_no_number_is_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_non_finite_numbers_are_rejected(value: str, capsys: pytest.CaptureFixture[str]) -> None:
     for flag in ("--near", "--max-seconds", "--workers"):
         assert main(["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", flag, value]) == 2
         assert flag in capsys.readouterr().err
 
 
-def test_the_help_says_what_holds_for_an_option_that_is_not_given() -> None:
+def test_help_shows_defaults() -> None:
     texts = shown("stylize")
     assert "[by preset: preview 50, standard 100, paper 10000]" in texts["--steps-coarse"]
     assert "[by preset: preview off, standard on, paper off]" in texts["--early-stop/--no-early-stop"]
@@ -135,7 +135,7 @@ def test_the_help_says_what_holds_for_an_option_that_is_not_given() -> None:
     assert "default" not in texts["--drop-invalid"]
 
 
-def test_the_reference_is_up_to_date() -> None:
+def test_options_reference_is_up_to_date() -> None:
     page = (ROOT / "docs" / "options.md").read_text()
     assert page == reference(), "run: python -m api.cli.options_table > docs/options.md"
     for option in [*declared(JobParameters).values(), *declared(RunOptions).values()]:
@@ -156,17 +156,17 @@ def test_options_become_settings() -> None:
 
 
 @pytest.mark.parametrize(("text", "weight"), [("light", 3e4), ("Balanced", 1e4), ("strong", 1.0), ("2.5", 2.5)])
-def test_a_content_weight_is_a_number_or_a_strength(text: str, weight: float) -> None:
+def test_content_weight_accepts_numbers_and_strengths(text: str, weight: float) -> None:
     assert parse_strength(text) == weight
 
 
-def test_another_word_than_a_strength_is_refused() -> None:
+def test_unknown_strength_is_rejected() -> None:
     with pytest.raises(ValueError, match="light, balanced, strong"):
         parse_strength("weak")
 
 
 @pytest.mark.parametrize(("old", "new"), RENAMED.items())
-def test_former_names_are_refused_with_the_present_one(old: str, new: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_former_names_are_rejected_with_new_name(old: str, new: str, capsys: pytest.CaptureFixture[str]) -> None:
     flag = "--" + old.replace("_", "-")
     assert main(["stylize", "scene.ply", flag, "x"]) == 2
     assert f"{flag}: it is called --{new.replace('_', '-')} now" in capsys.readouterr().err
@@ -177,7 +177,7 @@ def test_former_names_are_refused_with_the_present_one(old: str, new: str, capsy
 
 
 @pytest.mark.parametrize(("name", "advice"), REMOVED.items())
-def test_removed_options_are_refused_with_advice(name: str, advice: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_removed_options_are_rejected_with_advice(name: str, advice: str, capsys: pytest.CaptureFixture[str]) -> None:
     flag = "--" + name.replace("_", "-")
     assert main(["stylize", "scene.ply", flag, "1"]) == 2
     assert f"{flag}: it was removed: {advice}" in capsys.readouterr().err
@@ -187,7 +187,7 @@ def test_removed_options_are_refused_with_advice(name: str, advice: str, capsys:
         stored_parameters({name: 1.0})
 
 
-def test_a_stored_job_is_read_under_former_names() -> None:
+def test_stored_jobs_accept_former_names() -> None:
     stored = {"sh_fade": 0.5, "unseen": "neighbours", "regions": [{"name": "rest", "keep": True}]}
     found = stored_parameters(stored).model_dump()
     assert (found["sh_attenuation"], found["unseen"], found["regions"][0]["freeze"]) == (0.5, "neighbors", True)

@@ -29,13 +29,13 @@ def shown(*, terminal: bool) -> str:
     return console.file.getvalue()
 
 
-def test_a_terminal_shows_views_and_then_steps() -> None:
+def test_terminal_shows_views_then_steps() -> None:
     found = shown(terminal=True)
     for text in ("Surveying the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123 1:01 left"):
         assert text in found
 
 
-def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_prints_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown(terminal=False).strip() == ""
     monkeypatch.setattr(progress_bars, "LOG_SECONDS", 0.0)
     assert shown(terminal=False).strip().splitlines() == [
@@ -48,5 +48,5 @@ def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0:00"), (59.6, "1:00"), (3599.0, "59:59"), (36610.0, "10:10:10")])
-def test_durations(seconds: float, text: str) -> None:
+def test_clock_formats_durations(seconds: float, text: str) -> None:
     assert clock(seconds) == text

@@ -92,7 +92,7 @@ def public(kind: type) -> dict[str, Any]:
     return {name: getattr(kind, name) for name in names if callable(getattr(kind, name))}
 
 
-def test_both_have_the_same_methods() -> None:
+def test_clients_have_same_methods() -> None:
     blocking, awaiting = public(Client), public(AsyncClient)
     assert blocking.keys() == awaiting.keys()
     for name, method in blocking.items():
@@ -126,7 +126,7 @@ def test_interrupted_call_is_canceled(service: Service, files: dict[str, Path]) 
 # --- the same scenario through both --------------------------------------------------------------------------------
 
 
-def test_close_cancels_what_an_interrupt_left_running() -> None:
+def test_close_cancels_interrupted_calls() -> None:
     client = Client("http://127.0.0.1:9")
     left = client._portal.start_task_soon(asyncio.sleep, 1000)
     client.close()
@@ -134,7 +134,7 @@ def test_close_cancels_what_an_interrupt_left_running() -> None:
 
 
 @both
-def test_a_job_from_its_upload_to_its_removal(
+def test_job_from_upload_to_removal(
     connect: Any,
     service: Service,
     store: Store,
@@ -202,7 +202,7 @@ def finish(store: Store, service: Service, job_id: str, content: bytes, folder: 
 
 
 @both
-def test_all_jobs_are_listed_page_by_page(
+def test_jobs_are_listed_page_by_page(
     connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("api.client.async_client._PAGE", 2)
@@ -216,7 +216,7 @@ def test_all_jobs_are_listed_page_by_page(
 
 
 @both
-def test_a_plan_queues_nothing_and_bad_files_are_refused(
+def test_plan_queues_nothing_and_rejects_bad_files(
     connect: Any, service: Service, files: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
@@ -252,7 +252,7 @@ def test_plan_reports_progress(connect: Any, service: Service, files: dict[str, 
 
 
 @both
-def test_one_upload_serves_many_jobs(connect: Any, service: Service, files: dict[str, Path]) -> None:
+def test_several_jobs_use_one_upload(connect: Any, service: Service, files: dict[str, Path]) -> None:
     with connect(service.url) as client:
         uploaded = client.upload(files["scene"], "other.ply")
     with service.client() as plain:
@@ -312,7 +312,7 @@ class Relay:
 
 
 @both
-def test_a_download_resumes_after_a_lost_connection(
+def test_download_resumes_after_lost_connection(
     connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
@@ -357,7 +357,7 @@ def test_foreign_partial_file_is_discarded(
 
 
 @both
-def test_events_resume_after_a_lost_connection(
+def test_events_resume_after_lost_connection(
     connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
@@ -373,7 +373,7 @@ def test_events_resume_after_a_lost_connection(
 
 
 @both
-def test_uploads_resume_after_a_lost_connection(
+def test_upload_resumes_after_lost_connection(
     connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The response to a part is lost. The client sends the part again; the service refuses it as already received."""

@@ -145,7 +145,7 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize(("role", "make", "code"), [case[1:] for case in HOSTILE], ids=[case[0] for case in HOSTILE])
-def test_what_cannot_be_used_is_never_accepted(
+def test_unusable_files_are_rejected(
     client: httpx.Client, files: dict[str, bytes], role: str, make: Any, code: str
 ) -> None:
     before = jobs_of(client)
@@ -180,18 +180,18 @@ PARAMETERS = [
 
 
 @pytest.mark.parametrize(("text", "code"), PARAMETERS, ids=[text[:30] for text, _ in PARAMETERS])
-def test_parameters_that_make_no_sense(client: httpx.Client, files: dict[str, bytes], text: str, code: str) -> None:
+def test_invalid_parameters_are_rejected(client: httpx.Client, files: dict[str, bytes], text: str, code: str) -> None:
     refused(client.post("/v1/jobs", files=form(files), data={"parameters": text}), 422, code)
 
 
-def test_strokes_larger_than_any_picture_may_be(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_style_scale_beyond_image_limit_is_rejected(client: httpx.Client, files: dict[str, bytes]) -> None:
     line = form(files, style=png(5000, 1, zlib.compress(bytes(1 + 3 * 5000))))
     for where in ("/v1/jobs", "/v1/jobs?dry_run=true"):
         answer = client.post(where, files=line, data={"parameters": '{"style_scale": 4}'})
         assert refused(answer, 422, "invalid-settings")["input"] == "style"
 
 
-def test_controls_are_told_in_a_plan(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_plan_lists_controls(client: httpx.Client, files: dict[str, bytes]) -> None:
     asked = {"preserve_colors": "luminance", "sh_attenuation": 0.5, "scales": [1, 0.5], "coarsest_side": 16}
     answer = client.post("/v1/jobs?dry_run=true", files=form(files), data={"parameters": json.dumps(asked)})
     assert answer.status_code == 200, answer.text
@@ -199,7 +199,7 @@ def test_controls_are_told_in_a_plan(client: httpx.Client, files: dict[str, byte
     assert {"colors", "weights of scales"} <= items
 
 
-def test_missing_and_surplus_files(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_missing_and_surplus_files_are_rejected(client: httpx.Client, files: dict[str, bytes]) -> None:
     assert refused(client.post("/v1/jobs", files=form(files, style=None)), 422, "invalid-request")["input"] == "style"
     refused(client.post("/v1/jobs", files=form(files, cameras=None)), 422, "invalid-cameras")
     refused(client.post("/v1/jobs", files=[*form(files), ("scene", ("b.ply", files["scene"]))]), 422, "invalid-request")
@@ -234,7 +234,7 @@ def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes])
         assert bad.status_code == 422
 
 
-def test_regions_have_styles_by_their_files_names(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_regions_name_style_files(client: httpx.Client, files: dict[str, bytes]) -> None:
     other = png(40, 30, zlib.compress(bytes(30 * (1 + 3 * 40))))
     parts = [*form(files), ("style", ("night sky.png", other))]
 
@@ -266,7 +266,7 @@ def test_regions_have_styles_by_their_files_names(client: httpx.Client, files: d
         assert answer(bad).status_code == 422
 
 
-def test_names_lead_nowhere(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_file_names_cannot_escape_folder(client: httpx.Client, files: dict[str, bytes]) -> None:
     for name in (
         "../../../../etc/passwd",
         "/etc/passwd",
@@ -319,7 +319,7 @@ def value_of(option: Declared) -> object:
     return kind(bounds[0] + (1 if kind is int else 0.5))
 
 
-def test_the_command_line_sends_every_parameter(
+def test_submit_sends_every_parameter(
     service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0], "style_weights": [1.0, 2.5]}
@@ -362,7 +362,7 @@ def raw(service: Service, head: str, body: bytes, *, close: bool = True) -> byte
         return answer
 
 
-def test_a_body_that_is_cut_off(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_truncated_body_is_rejected(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
     request = client.build_request("POST", "/v1/jobs", files=form(files))
     body = request.read()
     before = jobs_of(client)
@@ -377,7 +377,7 @@ def test_a_body_that_is_cut_off(service: Service, client: httpx.Client, files: d
     wait_for(lambda: not list((service.data / "incoming").iterdir()), "half files to be removed")
 
 
-def test_a_connection_may_rest_between_requests(service: Service) -> None:
+def test_idle_connection_stays_open_between_requests(service: Service) -> None:
     host, port = service.url.removeprefix("http://").split(":")
     post = "POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{}"
     with socket.create_connection((host, int(port)), timeout=30) as connection:
@@ -389,7 +389,7 @@ def test_a_connection_may_rest_between_requests(service: Service) -> None:
         assert b"HTTP/1.1 200 OK" in answer
 
 
-def test_a_body_that_comes_too_slowly(service: Service) -> None:
+def test_slow_body_is_rejected(service: Service) -> None:
     head = (
         "POST /v1/jobs HTTP/1.1\nHost: 127.0.0.1\nContent-Length: 1000\nContent-Type: multipart/form-data; boundary=x"
     )
@@ -397,18 +397,20 @@ def test_a_body_that_comes_too_slowly(service: Service) -> None:
 
 
 @pytest.mark.parametrize("kind", ["text/plain", ""])
-def test_other_media_types(client: httpx.Client, kind: str) -> None:
+def test_other_media_types_are_rejected(client: httpx.Client, kind: str) -> None:
     refused(client.post("/v1/jobs", content=b"x", headers={"content-type": kind}), 415, "unsupported-media-type")
 
 
-def test_a_request_that_is_too_long(service: Service, client: httpx.Client) -> None:
+def test_too_long_request_is_rejected(service: Service, client: httpx.Client) -> None:
     head = "POST /v1/jobs HTTP/1.1\nHost: 127.0.0.1\nContent-Length: 600000000\n"
     head += "Content-Type: multipart/form-data; boundary=x"
     assert b" 413 " in raw(service, head, b"--x\r\n", close=False).splitlines()[0]
     refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(401 * MB)}), 413, "too-large")
 
 
-def test_memory_stays_flat_while_files_come_in(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_memory_is_constant_while_receiving_files(
+    service: Service, client: httpx.Client, files: dict[str, bytes]
+) -> None:
     client.get("/readyz")
     api = service.process("api.http.server")
     assert api is not None
@@ -454,7 +456,7 @@ def upload(client: httpx.Client, data: bytes, name: str) -> str:
     return where.rsplit("/", 1)[1]
 
 
-def test_an_upload_in_parts_becomes_a_job(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_upload_in_parts_becomes_job(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
     scene = files["scene"]
     where = begin(client, len(scene))
     assert client.head(where, headers=TUS).headers["upload-offset"] == "0"
@@ -482,7 +484,7 @@ def test_an_upload_in_parts_becomes_a_job(service: Service, client: httpx.Client
     assert mixed.status_code == 202, mixed.text
 
 
-def test_a_broken_connection_keeps_what_has_come(service: Service, client: httpx.Client) -> None:
+def test_broken_connection_preserves_received_bytes(service: Service, client: httpx.Client) -> None:
     where = begin(client, 5 * MB)
     head = f"PATCH {where} HTTP/1.1\nHost: 127.0.0.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\n"
     head += f"Content-Type: {OFFSET_STREAM}\nContent-Length: {5 * MB}"
@@ -495,7 +497,7 @@ def test_a_broken_connection_keeps_what_has_come(service: Service, client: httpx
     assert client.get(where).json()["sha256"] == hashlib.sha256(bytes(5 * MB)).hexdigest()
 
 
-def test_one_scene_of_many_jobs_is_stored_once(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_jobs_share_stored_scene(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
     for _ in range(3):
         upload(client, files["scene"], "again.ply")
         assert client.post("/v1/jobs", files=form(files)).status_code == 202
@@ -503,7 +505,7 @@ def test_one_scene_of_many_jobs_is_stored_once(service: Service, client: httpx.C
     assert len(list((service.data / "blobs").glob(f"*/{digest}*"))) == 1
 
 
-def test_the_protocol_of_uploads(client: httpx.Client) -> None:
+def test_uploads_follow_tus_protocol(client: httpx.Client) -> None:
     options = client.options("/v1/uploads")
     assert options.status_code == 204
     assert set(options.headers["tus-extension"].split(",")) == {"creation", "expiration", "checksum", "termination"}
@@ -517,7 +519,7 @@ def test_the_protocol_of_uploads(client: httpx.Client) -> None:
     refused(client.get(where), 404, "not-found")
 
 
-def test_idempotency_keys(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_idempotency_keys_prevent_duplicates(client: httpx.Client, files: dict[str, bytes]) -> None:
     headers = {"Idempotency-Key": "the-same"}
     first = client.post("/v1/jobs", files=form(files), headers=headers)
     again = client.post("/v1/jobs", files=form(files), headers=headers)
@@ -532,7 +534,7 @@ def test_idempotency_keys(client: httpx.Client, files: dict[str, bytes]) -> None
 # --- who is asking -------------------------------------------------------------------------------------------------
 
 
-def test_keys_separate_their_holders(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_keys_cannot_access_each_others_jobs(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
     store = open_store(ServiceSettings(data=service.data))
     (mine, text), (_, other) = store.keys.create("mine"), store.keys.create("other")
     with service.client(text) as me, service.client(other) as you:
@@ -569,18 +571,18 @@ def test_web_pages_cannot_use_a_service_without_keys(client: httpx.Client) -> No
     assert client.get("/v1/jobs", headers={"Origin": str(client.base_url).rstrip("/")}).status_code == 200
 
 
-def test_keys_are_needed_where_others_can_reach_the_service(tmp_path: Path) -> None:
+def test_reachable_service_requires_keys(tmp_path: Path) -> None:
     with Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service, service.client() as client:
         refused(client.get("/v1/jobs"), 401, "unauthorized")
         assert client.get("/livez").status_code == 200
 
 
-def test_nobody_else_is_let_in_before_there_is_a_key(tmp_path: Path) -> None:
+def test_reachable_service_without_keys_does_not_start(tmp_path: Path) -> None:
     with pytest.raises(ServeError, match="there is no API key"):
         serve(ServiceSettings(data=tmp_path / "data", host="0.0.0.0"), print)
 
 
-def test_half_files_of_a_dead_process_are_collected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partial_files_of_dead_process_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = open_store(ServiceSettings(data=tmp_path))
     blobs = BlobFolder(tmp_path, store.inputs, 0)
     half = blobs.incoming / "half.part"
@@ -595,7 +597,7 @@ def test_half_files_of_a_dead_process_are_collected(tmp_path: Path, monkeypatch:
     store.close()
 
 
-def test_limits_of_a_key_and_of_the_disk(tmp_path: Path, files: dict[str, bytes]) -> None:
+def test_job_limit_and_full_disk_reject_requests(tmp_path: Path, files: dict[str, bytes]) -> None:
     with Service(tmp_path / "data", alone=True, SGSST_MAX_JOBS_PER_KEY="1") as service, service.client() as client:
         assert client.post("/v1/jobs", files=form(files)).status_code == 202
         answer = client.post("/v1/jobs", files=form(files))
@@ -640,7 +642,7 @@ def test_job_is_named_by_its_files_and_renamed(client: httpx.Client, files: dict
     refused(client.patch("/v1/jobs/job_1", json={"name": "a"}), 404, "not-found")
 
 
-def test_a_stream_with_nothing_left_to_tell(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_stream_after_last_event_is_empty(client: httpx.Client, files: dict[str, bytes]) -> None:
     """A stream would never end after the last event of an ended job, or after an event that does not exist."""
     job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
     client.post(f"/v1/jobs/{job_id}/cancel")
@@ -664,7 +666,7 @@ def test_unknown_paths_and_methods(client: httpx.Client) -> None:
     refused(client.get("/v1/jobs", params={"status": "x"}), 422, "invalid-request")
 
 
-def test_readiness_tells_whether_somebody_is_there_to_run_jobs(service: Service, client: httpx.Client) -> None:
+def test_readiness_reports_dispatchers(service: Service, client: httpx.Client) -> None:
     answer = client.get("/readyz")
     assert (answer.status_code, answer.json()["status"]) == (200, "waiting")
     parts = dict.fromkeys(("database", "artifacts", "disk", "weights"), "ok")
@@ -681,7 +683,7 @@ def test_readiness_tells_whether_somebody_is_there_to_run_jobs(service: Service,
     store.close()
 
 
-def test_metrics_tell_what_became_of_attempts(tmp_path: Path, files: dict[str, bytes]) -> None:
+def test_metrics_count_attempts_by_outcome(tmp_path: Path, files: dict[str, bytes]) -> None:
     with Service(tmp_path / "data", alone=True) as service, service.client() as client:
         for _ in range(3):
             client.post("/v1/jobs", files=form(files))
@@ -731,7 +733,7 @@ def test_metrics_and_documentation(client: httpx.Client) -> None:
     assert "JobParameters" in document["components"]["schemas"]
 
 
-def test_a_flood_of_broken_requests_leaves_nothing(service: Service, client: httpx.Client) -> None:
+def test_broken_requests_leave_no_files(service: Service, client: httpx.Client) -> None:
     rubbish = b"\x00\xff" * 1000
     for boundary in ("x", "--", "a b"):
         client.post(

@@ -19,7 +19,7 @@ SECRET = "what nobody may see"
 
 
 @pytest.mark.skipif(bool(sandbox.missing()), reason=f"the kernel lacks {sandbox.missing()}")
-def test_the_service_goes_on_when_a_reader_is_taken_over(tmp_path: Path) -> None:
+def test_compromised_reader_does_not_affect_service(tmp_path: Path) -> None:
     ply, cameras, style = write_files(tmp_path, wall())
     (tmp_path / "there").write_text("there")
     service = Service(tmp_path / "data", alone=True, AWS_SECRET_ACCESS_KEY=SECRET)

@@ -94,7 +94,7 @@ def blob_of(service: Service, store: Store, job_id: str, role: str) -> Path:
     return service.data / "blobs" / store.inputs.blobs([sha256])[sha256].location
 
 
-def test_a_damaged_result_is_not_sent(
+def test_damaged_result_is_not_sent(
     service: Service, store: Store, client: httpx.Client, files: dict[str, Any], tmp_path: Path
 ) -> None:
     job_id = submit(client, files)
@@ -111,7 +111,7 @@ def test_a_damaged_result_is_not_sent(
     refused(client.get(where), "file-lost")
 
 
-def test_a_result_that_was_replaced_meanwhile_is_not_taken_for_lost(
+def test_replaced_result_is_not_reported_lost(
     service: Service, store: Store, client: httpx.Client, files: dict[str, Any], tmp_path: Path
 ) -> None:
     job_id = submit(client, files)
@@ -130,7 +130,7 @@ def test_a_result_that_was_replaced_meanwhile_is_not_taken_for_lost(
 
 
 @pytest.mark.parametrize("lost", [True, False])
-def test_a_file_that_is_sent_again_comes_back(
+def test_uploading_again_restores_lost_file(
     service: Service, store: Store, client: httpx.Client, files: dict[str, Any], lost: bool
 ) -> None:
     job_id = submit(client, files)
@@ -146,7 +146,7 @@ def test_a_file_that_is_sent_again_comes_back(
     assert blob_of(service, store, again, "scene") == path
 
 
-def test_nobody_else_can_read_the_data(service: Service, client: httpx.Client, files: dict[str, Any]) -> None:
+def test_data_folder_is_private(service: Service, client: httpx.Client, files: dict[str, Any]) -> None:
     submit(client, files)
     assert stat.S_IMODE(service.data.stat().st_mode) == 0o700
     # Folders below that of the results belong to the process of this test.

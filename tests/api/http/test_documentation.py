@@ -56,7 +56,7 @@ def bodies(operation: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
             yield f"{status} {kind}", body
 
 
-def test_the_document_is_openapi() -> None:
+def test_document_is_valid_openapi() -> None:
     validate(DOCUMENT)  # type: ignore[arg-type]
 
 

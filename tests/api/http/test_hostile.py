@@ -377,7 +377,9 @@ def text_scene(scene: bytes, first: str) -> bytes:
 
 
 @pytest.mark.parametrize("make", [case[1] for case in SCENES], ids=[case[0] for case in SCENES])
-def test_scenes_that_lie(client: httpx.Client, store: Store, files: Files, packed: Files, make: Make) -> None:
+def test_false_scene_headers_are_rejected(
+    client: httpx.Client, store: Store, files: Files, packed: Files, make: Make
+) -> None:
     before = count_jobs(store)
     answer = client.post("/v1/jobs", files=form(files, scene=make({**files, **packed})))
     problem = refused(answer, 422, "invalid-scene", "too-many-gaussians", "inspection-limit")
@@ -492,7 +494,7 @@ IMAGES: list[tuple[str, Make]] = [
 
 
 @pytest.mark.parametrize("make", [case[1] for case in IMAGES], ids=[case[0] for case in IMAGES])
-def test_images_that_lie(client: httpx.Client, store: Store, files: Files, make: Make) -> None:
+def test_false_image_headers_are_rejected(client: httpx.Client, store: Store, files: Files, make: Make) -> None:
     before = count_jobs(store)
     answer = client.post("/v1/jobs", files=form(files, style=make(files)))
     problem = refused(answer, 422, "invalid-image", "image-too-large", "inspection-limit")
@@ -500,7 +502,7 @@ def test_images_that_lie(client: httpx.Client, store: Store, files: Files, make:
     assert count_jobs(store) == before
 
 
-def test_a_profile_of_many_steps_costs_no_time(client: httpx.Client, files: Files) -> None:
+def test_long_color_profile_is_fast(client: httpx.Client, files: Files) -> None:
     file = io.BytesIO()
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     Image.open(io.BytesIO(files["style"])).save(file, "PNG", icc_profile=with_float_steps(srgb, 50_000))
@@ -561,7 +563,9 @@ CAMERAS: list[tuple[str, str, Make]] = [
 
 
 @pytest.mark.parametrize(("name", "make"), [case[1:] for case in CAMERAS], ids=[case[0] for case in CAMERAS])
-def test_cameras_that_lie(client: httpx.Client, store: Store, files: Files, name: str, make: Make) -> None:
+def test_false_camera_files_are_rejected(
+    client: httpx.Client, store: Store, files: Files, name: str, make: Make
+) -> None:
     before = count_jobs(store)
     answer = client.post("/v1/jobs", files=form(files, cameras=(name, make(files))))
     problem = refused(answer, 422, "invalid-cameras", "too-many-views", "too-many-pixels", "inspection-limit")
@@ -576,7 +580,7 @@ MODEL: list[tuple[str, bytes]] = [
 
 
 @pytest.mark.parametrize("name", ["points3D.bin", "rigs.bin", "frames.bin"])
-def test_models_whose_other_files_lie(client: httpx.Client, files: Files, name: str) -> None:
+def test_false_colmap_models_are_rejected(client: httpx.Client, files: Files, name: str) -> None:
     """Eight bytes declare 2^60 entries; nothing reads these files."""
     model = [*MODEL, (name, struct.pack("<Q", 2**60))]
     answer = client.post("/v1/jobs", files=[*form(files, cameras=None), *(("cameras", file) for file in model)])
@@ -584,7 +588,7 @@ def test_models_whose_other_files_lie(client: httpx.Client, files: Files, name: 
 
 
 @pytest.mark.parametrize("photos", [[], [("photos", ("other.png", picture("PNG", 64, 48)))]], ids=["none", "others"])
-def test_camera_files_cannot_ask_for_files_of_the_machine(
+def test_camera_files_cannot_read_server_files(
     client: httpx.Client, files: Files, tmp_path: Path, photos: list[tuple[str, tuple[str, bytes]]]
 ) -> None:
     """If a transforms.json lacks image sizes, the reader opens the image at any path that the file contains."""
@@ -639,7 +643,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize("role", ["scene", "style", "photos"])
-def test_names_lead_nowhere(client: httpx.Client, service: Service, files: Files, role: str) -> None:
+def test_file_names_cannot_escape_folder(client: httpx.Client, service: Service, files: Files, role: str) -> None:
     before = {path for path in service.data.parent.rglob("*") if "blobs" not in path.parts}
     photos = [("photos", (f"view_{i}.png", picture("PNG", 64, 48))) for i in range(3)] if role == "photos" else []
     for name in NAMES:
@@ -712,7 +716,7 @@ BODIES: list[tuple[str, bytes, int]] = [
 
 
 @pytest.mark.parametrize(("body", "status"), [case[1:] for case in BODIES], ids=[case[0] for case in BODIES])
-def test_bodies_that_make_no_sense(client: httpx.Client, store: Store, body: bytes, status: int) -> None:
+def test_malformed_bodies_are_rejected(client: httpx.Client, store: Store, body: bytes, status: int) -> None:
     before = count_jobs(store)
     codes = ("malformed-body",) if status == 400 else ("invalid-request", "unknown-upload", "invalid-scene")
     refused(post(client, body), status, *codes)
@@ -734,12 +738,12 @@ def test_bodies_that_make_no_sense(client: httpx.Client, store: Store, body: byt
         ("multipart/form-data; boundary*=none''%ff", 400),
     ],
 )
-def test_content_types(client: httpx.Client, kind: str, status: int) -> None:
+def test_malformed_content_types_are_rejected(client: httpx.Client, kind: str, status: int) -> None:
     answer = client.post("/v1/jobs", content=b"x=y", headers=[(b"content-type", kind.encode("latin-1"))])
     refused(answer, status, "unsupported-media-type" if status == 415 else "malformed-body")
 
 
-def test_a_body_that_is_compressed(client: httpx.Client, files: Files) -> None:
+def test_encoded_body_is_rejected(client: httpx.Client, files: Files) -> None:
     """Nothing decompresses bodies, so a body cannot be a decompression bomb."""
     request = client.build_request("POST", "/v1/jobs", files=form(files))
     answer = post(
@@ -750,7 +754,7 @@ def test_a_body_that_is_compressed(client: httpx.Client, files: Files) -> None:
     refused(answer, 415, "unsupported-media-type")
 
 
-def test_more_parts_than_any_job_has(client: httpx.Client, files: Files) -> None:
+def test_too_many_parts_are_rejected(client: httpx.Client, files: Files) -> None:
     small = part(FILE.format("photos"), b"x")
     refused(post(client, small * 1000 + END), 422, "too-many-files")
     named = part('Content-Disposition: form-data; name="photos"', b"upl_00000000000")
@@ -759,7 +763,7 @@ def test_more_parts_than_any_job_has(client: httpx.Client, files: Files) -> None
     refused(post(client, empty * 20_000 + END), 422, "too-many-files")
 
 
-def test_a_part_whose_head_never_ends(client: httpx.Client) -> None:
+def test_endless_part_header_is_rejected(client: httpx.Client) -> None:
     def body() -> Iterator[bytes]:
         yield f"--{BOUNDARY}\r\nContent-Disposition: ".encode()
         for _ in range(90):
@@ -768,7 +772,7 @@ def test_a_part_whose_head_never_ends(client: httpx.Client) -> None:
     refused(post(client, body()), 400, "malformed-body")
 
 
-def test_too_long(client: httpx.Client, files: Files) -> None:
+def test_too_long_bodies_are_rejected(client: httpx.Client, files: Files) -> None:
     def chunked(size: int) -> Iterator[bytes]:
         yield part(FILE.format("style"))[:-3]
         for _ in range(size):
@@ -797,7 +801,7 @@ def told(client: httpx.Client, parameters: str) -> httpx.Response:
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_numbers_that_are_none(client: httpx.Client, field: str) -> None:
+def test_malformed_numbers_are_rejected(client: httpx.Client, field: str) -> None:
     refused(told(client, "{}"), 422, "unknown-upload")
     for number in NUMBERS:
         if field in MAY_BE_0 | MAY_BE_NEGATIVE and number == "1.5e-400":
@@ -838,7 +842,7 @@ TEXTS = [
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=[text[:25] for text in TEXTS])
-def test_parameters_that_are_none(client: httpx.Client, files: Files, text: str) -> None:
+def test_malformed_parameters_are_rejected(client: httpx.Client, files: Files, text: str) -> None:
     refused(told(client, text), 422, "invalid-request", "invalid-settings")
     answer = post(client, part('Content-Disposition: form-data; name="parameters"', text.encode()) + END)
     refused(answer, 422, "invalid-request", "invalid-settings")
@@ -866,12 +870,12 @@ JSON_BODIES = [
 
 
 @pytest.mark.parametrize("body", JSON_BODIES, ids=[body[:30].decode("latin-1") for body in JSON_BODIES])
-def test_json_that_names_nothing(client: httpx.Client, body: bytes) -> None:
+def test_json_with_unknown_uploads_is_rejected(client: httpx.Client, body: bytes) -> None:
     answer = post(client, body, "application/json")
     refused(answer, 400 if body == b"\xff" else 422, "malformed-body", "invalid-request", "unknown-upload")
 
 
-def test_webhooks_are_refused_while_they_are_off(client: httpx.Client, files: Files) -> None:
+def test_webhooks_are_rejected_while_switched_off(client: httpx.Client, files: Files) -> None:
     for url in ("http://169.254.169.254/latest", "file:///etc/passwd", "http://[::1", "x" * 60_000):
         refused(client.post("/v1/jobs", files=form(files), data={"webhook": url}), 422, "webhooks-off")
 
@@ -894,7 +898,7 @@ def send(client: httpx.Client, where: str, offset: object, data: Any, **headers:
 NO_DIGITS: list[Any] = ["1_0", "+10", "10.0", "1 0", "\u0661\u0660".encode(), "\uff11\uff10".encode()]
 
 
-def test_numbers_are_digits_alone(client: httpx.Client, service: Service, done: str) -> None:
+def test_numbers_must_be_digits(client: httpx.Client, service: Service, done: str) -> None:
     """Queries and headers accept digits only; malformed body lengths are refused below the app."""
     for number in ("1_0", "+10", " 10", "10 ", "\u0661\u0660", "10.0"):
         refused(client.get("/v1/jobs", params={"limit": number}), 422, "invalid-request")
@@ -907,7 +911,7 @@ def test_numbers_are_digits_alone(client: httpx.Client, service: Service, done: 
         assert json.loads(body)["code"] == "malformed-request"
 
 
-def test_uploads_state_their_version(client: httpx.Client) -> None:
+def test_uploads_require_protocol_version(client: httpx.Client) -> None:
     """tus 1.0 requires the version in all requests except OPTIONS. `GET` is not part of tus."""
     where = begin(client, 5)
     data = {"Upload-Length": "5", "Upload-Offset": "0", "Content-Type": OFFSET_STREAM}
@@ -922,7 +926,7 @@ def test_uploads_state_their_version(client: httpx.Client) -> None:
     assert client.delete(where, headers=TUS).status_code == 204
 
 
-def test_uploads_that_begin_wrong(client: httpx.Client) -> None:
+def test_malformed_upload_creation_is_rejected(client: httpx.Client) -> None:
     for length in ("-1", "x", "1.5", "1e3", "0x10", "", str(2**60), "9" * 5000, "NaN", *NO_DIGITS):
         refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": length}), 422, "invalid-request")
     refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": "0"}), 400, "malformed-body")
@@ -946,7 +950,7 @@ def test_uploads_that_begin_wrong(client: httpx.Client) -> None:
     )
 
 
-def test_names_of_uploads_lead_nowhere(client: httpx.Client, service: Service) -> None:
+def test_upload_names_cannot_escape_folder(client: httpx.Client, service: Service) -> None:
     for name in NAMES:
         metadata = f"filename {base64.b64encode(name.encode()[:2900]).decode()}".strip()
         answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": "5", "Upload-Metadata": metadata})
@@ -960,7 +964,7 @@ def test_names_of_uploads_lead_nowhere(client: httpx.Client, service: Service) -
     assert not list((service.data / "uploads").iterdir())
 
 
-def test_uploads_that_go_on_wrong(client: httpx.Client, service: Service) -> None:
+def test_malformed_upload_parts_are_rejected(client: httpx.Client, service: Service) -> None:
     where = begin(client, 1000)
     file = service.data / "uploads" / (where.rsplit("/", 1)[1] + ".part")
     assert send(client, where, 0, bytes(100)).status_code == 204
@@ -997,7 +1001,7 @@ def test_uploads_that_go_on_wrong(client: httpx.Client, service: Service) -> Non
     assert client.delete(where, headers=TUS).status_code == 204
 
 
-def test_uploads_that_are_over(client: httpx.Client, store: Store, files: Files) -> None:
+def test_ended_uploads_reject_parts(client: httpx.Client, store: Store, files: Files) -> None:
     where = begin(client, 1000)
     upload_id = where.rsplit("/", 1)[1]
     with store.database.writing() as session:
@@ -1018,7 +1022,7 @@ def test_uploads_that_are_over(client: httpx.Client, store: Store, files: Files)
         assert client.get(f"/v1/uploads/{name}").status_code in (404, 405)
 
 
-def test_two_writers_of_one_upload(client: httpx.Client, service: Service) -> None:
+def test_second_writer_of_upload_is_locked_out(client: httpx.Client, service: Service) -> None:
     where = begin(client, 1000)
     head = f"PATCH {where} HTTP/1.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\n"
     head += f"Content-Type: {OFFSET_STREAM}\nContent-Length: 1000"
@@ -1034,7 +1038,7 @@ def test_two_writers_of_one_upload(client: httpx.Client, service: Service) -> No
 # --- other people's things -----------------------------------------------------------------------------------------
 
 
-def test_ids_of_other_keys(client: httpx.Client, service: Service, store: Store, files: Files) -> None:
+def test_other_keys_ids_are_not_found(client: httpx.Client, service: Service, store: Store, files: Files) -> None:
     _, mine = store.keys.create("hostile-mine")
     _, other = store.keys.create("hostile-other")
     with service.client(mine) as me, service.client(other) as you:
@@ -1068,7 +1072,7 @@ def test_ids_of_other_keys(client: httpx.Client, service: Service, store: Store,
         b"Bearer ' OR 1=1 --",
     ],
 )
-def test_keys_that_are_none(client: httpx.Client, header: bytes) -> None:
+def test_malformed_keys_are_rejected(client: httpx.Client, header: bytes) -> None:
     answer = client.get("/v1/jobs", headers=[(b"authorization", header)])
     refused(answer, 401, "unauthorized")
     assert answer.headers["www-authenticate"] == "Bearer"
@@ -1132,7 +1136,7 @@ RANGES: list[tuple[str, int]] = [
 
 
 @pytest.mark.parametrize(("text", "status"), RANGES, ids=[text[:25] or "empty" for text, _ in RANGES])
-def test_ranges(client: httpx.Client, files: Files, done: str, text: str, status: int) -> None:
+def test_ranges_follow_rfc_9110(client: httpx.Client, files: Files, done: str, text: str, status: int) -> None:
     where = f"/v1/jobs/{done}/artifacts/stylized.ply"
     answer = client.get(where, headers=[(b"range", text.encode("latin-1"))])
     if status == 416:
@@ -1148,7 +1152,7 @@ def test_ranges(client: httpx.Client, files: Files, done: str, text: str, status
     )
 
 
-def test_headers_of_results(client: httpx.Client, done: str) -> None:
+def test_results_have_safe_headers(client: httpx.Client, done: str) -> None:
     answer = client.get(f"/v1/jobs/{done}/artifacts/report.html")
     assert re.fullmatch(r'inline; filename="[A-Za-z0-9._-]+"', answer.headers["content-disposition"])
     assert "set-cookie" not in answer.headers
@@ -1185,7 +1189,7 @@ PATHS = [
 ]
 
 
-def test_paths_of_results(service: Service, done: str) -> None:
+def test_result_paths_cannot_escape_job(service: Service, done: str) -> None:
     for path in PATHS:
         head, _ = exchange(
             service, f"GET /v1/jobs/{done}/artifacts/{path} HTTP/1.1\nHost: 127.0.0.1\nConnection: close"
@@ -1245,7 +1249,9 @@ def closed(connection: socket.socket) -> bytes:
     return answer
 
 
-def test_slow_clients_are_cut_off_and_block_nobody(service: Service, client: httpx.Client, files: Files) -> None:
+def test_slow_clients_are_disconnected_without_blocking_others(
+    service: Service, client: httpx.Client, files: Files
+) -> None:
     """Connections that send nothing, half a head or half a body all end, and others are served meanwhile."""
     body = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
     starts = [b"", b"GET /v1/jobs HTTP/1.1\r\nHost: 127.0", lines(body), lines(body) + part(FILE.format("scene"))[:60]]
@@ -1262,7 +1268,7 @@ def test_slow_clients_are_cut_off_and_block_nobody(service: Service, client: htt
             assert b'"code":"too-slow"' in answer
 
 
-def test_clients_that_drip_are_cut_off(service: Service) -> None:
+def test_dripping_clients_are_disconnected(service: Service) -> None:
     """A client that sends single bytes at intervals does not stall, but is far below the minimum rate."""
     head = lines(
         f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
@@ -1285,7 +1291,7 @@ def test_clients_that_drip_are_cut_off(service: Service) -> None:
                     ended = True
 
 
-def test_a_head_that_never_ends(service: Service) -> None:
+def test_endless_head_is_disconnected(service: Service) -> None:
     for start, more in ((b"GET /", b"x"), (b"GET / HTTP/1.1\r\nX: ", b"x"), (b"GET / HTTP/1.1\r\n", b"X: y\r\n")):
         with connect(service) as connection:
             sent = 0
@@ -1327,7 +1333,7 @@ HEADS: list[tuple[str, bytes]] = [
 
 
 @pytest.mark.parametrize("data", [case[1] for case in HEADS], ids=[case[0] for case in HEADS])
-def test_heads_that_make_no_sense(service: Service, client: httpx.Client, data: bytes) -> None:
+def test_malformed_heads_are_rejected(service: Service, client: httpx.Client, data: bytes) -> None:
     """Malformed heads are refused below the app. The connection is closed, so no remainder is read as a request."""
     with connect(service) as connection:
         connection.sendall(data)
@@ -1346,7 +1352,7 @@ def test_heads_that_make_no_sense(service: Service, client: httpx.Client, data: 
     assert client.get("/livez").status_code == 200
 
 
-def test_a_chunk_that_makes_no_sense(service: Service) -> None:
+def test_malformed_chunk_is_rejected(service: Service) -> None:
     """A malformed chunk gets one response, and subsequent bytes are not interpreted as a request."""
     start = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}"
     with connect(service) as connection:
@@ -1359,7 +1365,7 @@ def test_a_chunk_that_makes_no_sense(service: Service) -> None:
     assert json.loads(answer.partition(b"\r\n\r\n")[2])["code"] == "malformed-request"
 
 
-def test_a_head_that_is_too_large(service: Service) -> None:
+def test_too_large_head_is_rejected(service: Service) -> None:
     # Not a byte more than the service reads: a reset would discard its answer.
     for headers in (b"X: " + b"y" * MAX_HEAD_BYTES, b"X: y\r\n" * (MAX_HEADERS + 1)):
         with connect(service) as connection:
@@ -1388,14 +1394,14 @@ TRAILERS = {
 
 @pytest.mark.parametrize(("start", "more"), TRAILERS.values(), ids=TRAILERS)
 @pytest.mark.parametrize("path", ["/livez", "/v1/session"])
-def test_trailers_that_never_end(service: Service, path: str, start: bytes, more: bytes) -> None:
+def test_endless_trailers_are_rejected(service: Service, path: str, start: bytes, more: bytes) -> None:
     head = lines(f"POST {path} HTTP/1.1\nContent-Type: application/json\nTransfer-Encoding: chunked")
     with connect(service) as connection:
         connection.sendall(head + start)
         assert send_on(connection, more) < 60 * MB, "it was all taken in"
 
 
-def test_trailers_are_no_headers(service: Service, client: httpx.Client) -> None:
+def test_trailers_are_not_headers(service: Service, client: httpx.Client) -> None:
     """Trailers do not become headers, not even of the next request on the connection."""
     where = begin(client, 5)
     head = f"PATCH {where} HTTP/1.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\nContent-Type: {OFFSET_STREAM}"
@@ -1408,7 +1414,7 @@ def test_trailers_are_no_headers(service: Service, client: httpx.Client) -> None
     assert client.get(where).json()["complete"]
 
 
-def test_requests_that_wait_for_no_answer(service: Service) -> None:
+def test_pipelined_requests_are_bounded(service: Service) -> None:
     with connect(service) as connection:
         assert send_on(connection, lines("GET /livez HTTP/1.1") * 10_000) < 60 * MB, "it was all taken in"
     with connect(service) as connection:
@@ -1416,7 +1422,7 @@ def test_requests_that_wait_for_no_answer(service: Service) -> None:
         assert closed(connection).count(b"HTTP/1.1 200 OK") == 3
 
 
-def test_a_body_that_nobody_reads_has_to_end(service: Service) -> None:
+def test_unread_body_must_end(service: Service) -> None:
     """The response is sent before the body arrives. Single bytes at intervals do not keep the connection open."""
     for rest in (b"", b"x"):
         with connect(service) as connection:
@@ -1439,7 +1445,7 @@ def test_a_body_that_nobody_reads_has_to_end(service: Service) -> None:
             assert answered.count(b"HTTP/1.1") == 1, "it is answered twice"
 
 
-def test_a_body_that_ends_late_keeps_its_connection(service: Service) -> None:
+def test_late_end_of_body_preserves_connection(service: Service) -> None:
     with connect(service) as connection:
         connection.sendall(lines("POST /livez HTTP/1.1\nContent-Length: 5"))
         head, _ = answer_on(connection)
@@ -1448,7 +1454,7 @@ def test_a_body_that_ends_late_keeps_its_connection(service: Service) -> None:
         assert closed(connection).startswith(b"HTTP/1.1 200 OK")
 
 
-def test_json_that_is_too_long_is_not_waited_for(service: Service) -> None:
+def test_too_long_json_is_rejected_immediately(service: Service) -> None:
     """A JSON body with too large a declared length is not read at all; an undeclared one is read up to the limit."""
     kind = "Content-Type: application/json"
     for path, size in (("/v1/session", 256_000), ("/v1/session", 4097), ("/v1/jobs", 2 * MB)):
@@ -1462,7 +1468,7 @@ def test_json_that_is_too_long_is_not_waited_for(service: Service) -> None:
         assert connection.recv(65536).startswith(b"HTTP/1.1 413 ")
 
 
-def test_bodies_that_arrive_together(service: Service, client: httpx.Client) -> None:
+def test_concurrent_bodies_share_memory_budget(service: Service, client: httpx.Client) -> None:
     """Large bodies are refused while too many are arriving; small ones are accepted."""
     large = json.dumps({"scene": "x" * (MB - 1000), "style": "x"}).encode()
     head = lines(f"POST /v1/jobs HTTP/1.1\nContent-Type: application/json\nContent-Length: {len(large)}")
@@ -1492,7 +1498,7 @@ def test_bodies_that_arrive_together(service: Service, client: httpx.Client) -> 
     wait_for(lambda: post(client, large, "application/json").status_code == 422, "room for a large body")
 
 
-def test_connections_beyond_the_systems_limit(tmp_path: Path) -> None:
+def test_connections_beyond_system_limit_are_rejected(tmp_path: Path) -> None:
     """Connections beyond the limit are answered with 503 or closed, and existing ones keep working."""
     running = Service(tmp_path / "data", alone=True)
     running._command = ["sh", "-c", 'ulimit -n 200 && exec "$@"', "sh", *running._command]
@@ -1512,7 +1518,7 @@ def test_connections_beyond_the_systems_limit(tmp_path: Path) -> None:
         assert "Traceback" not in running.log.read_text()
 
 
-def test_files_beyond_the_systems_limit(tmp_path: Path) -> None:
+def test_open_files_beyond_system_limit_are_reported(tmp_path: Path) -> None:
     """Concurrent uploads for which no file descriptor is left get 503 with Retry-After."""
     running = Service(tmp_path / "data", alone=True)
     running._command = ["sh", "-c", 'ulimit -n 200 && exec "$@"', "sh", *running._command]
@@ -1533,7 +1539,7 @@ def test_files_beyond_the_systems_limit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("second", ["127.0.0.1", "evil.example"])
-def test_two_hosts(service: Service, second: str) -> None:
+def test_two_host_headers_are_rejected(service: Service, second: str) -> None:
     for hosts in (f"Host: 127.0.0.1\nHost: {second}", f"Host: {second}\nhost: 127.0.0.1"):
         head, body = exchange(service, f"GET /v1/jobs HTTP/1.1\n{hosts}\nConnection: close")
         assert head.startswith(b"HTTP/1.1 400 ")
@@ -1578,21 +1584,21 @@ OWN = [
 ]
 
 
-def test_hosts_of_other_sites(client: httpx.Client) -> None:
+def test_foreign_host_headers_are_rejected(client: httpx.Client) -> None:
     for host in [*FOREIGN, ""]:
         refused(client.get("/v1/jobs", headers={"Host": host}), 403, "foreign-site")
     for host in OWN:
         assert client.get("/v1/jobs", headers={"Host": host}).status_code == 200, host
 
 
-def test_a_name_that_looks_like_an_address_needs_keys() -> None:
+def test_service_on_address_like_name_requires_keys() -> None:
     for host in ("127.evil.example", "127.0.0.1.evil.example", "0.0.0.0", "::", "localhost.evil.example"):
         assert ServiceSettings(host=host).keys_required
     for host in ("127.0.0.1", "127.8.9.10", "::1", "localhost"):
         assert not ServiceSettings(host=host).keys_required
 
 
-def test_paths_write_no_lines_of_the_log(service: Service, client: httpx.Client) -> None:
+def test_paths_cannot_inject_log_lines(service: Service, client: httpx.Client) -> None:
     before = service.log.stat().st_size
     for text in ("\n12:00:00 error   forged", "\r\nforged", "\u2028forged", "\x1b[2Jforged", "a status=200 forged"):
         assert client.get(f"/v1/{quote(text, safe='')}").status_code == 404
@@ -1606,7 +1612,7 @@ def test_paths_write_no_lines_of_the_log(service: Service, client: httpx.Client)
         assert re.fullmatch(r'\S+ info {4}request  method=GET path="/v1/[^"]*forged" status=404 seconds=\S+', line)
 
 
-def test_nothing_of_all_that_is_left(service: Service, client: httpx.Client, store: Store) -> None:
+def test_hostile_requests_leave_no_files(service: Service, client: httpx.Client, store: Store) -> None:
     """This test runs last: the service is still ready, and a database row refers to each stored file."""
     assert client.get("/readyz").status_code == 200
     metrics = client.get("/metrics").text

@@ -88,7 +88,7 @@ def refused(answer: httpx.Response, status: int, code: str) -> None:
     check_documented(answer)
 
 
-def test_inputs_come_back_as_they_were_sent(client: httpx.Client, files: dict[str, Path], job_id: str) -> None:
+def test_inputs_are_returned_unchanged(client: httpx.Client, files: dict[str, Path], job_id: str) -> None:
     listed = client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]
     style = files["style"].read_bytes()
     sent = [
@@ -112,7 +112,7 @@ def test_inputs_come_back_as_they_were_sent(client: httpx.Client, files: dict[st
     assert client.get(f"/v1/jobs/{job_id}/inputs/style:0").content == style
 
 
-def test_parts_of_inputs(client: httpx.Client, files: dict[str, Path], job_id: str) -> None:
+def test_inputs_are_sent_in_ranges(client: httpx.Client, files: dict[str, Path], job_id: str) -> None:
     url, whole = f"/v1/jobs/{job_id}/inputs/scene", files["scene"].read_bytes()
     size = len(whole)
     for asked, start, stop in (("0-99", 0, 100), ("100-", 100, size), ("-7", size - 7, size), ("5-999999999", 5, size)):
@@ -142,11 +142,11 @@ def test_parts_of_inputs(client: httpx.Client, files: dict[str, Path], job_id: s
         "style:\u0661",
     ],
 )
-def test_inputs_that_are_not_there(client: httpx.Client, job_id: str, role: str) -> None:
+def test_missing_inputs_are_not_found(client: httpx.Client, job_id: str, role: str) -> None:
     refused(client.get(f"/v1/jobs/{job_id}/inputs/{role}"), 404, "not-found")
 
 
-def test_inputs_of_a_job_that_is_gone(client: httpx.Client, files: dict[str, Path], store: Store) -> None:
+def test_inputs_of_deleted_job_are_not_found(client: httpx.Client, files: dict[str, Path], store: Store) -> None:
     job_id = submit(client, files, ["style.png"])
     client.post(f"/v1/jobs/{job_id}/cancel")
     assert client.get(f"/v1/jobs/{job_id}/inputs/scene").status_code == 200
@@ -161,7 +161,7 @@ def test_inputs_of_a_job_that_is_gone(client: httpx.Client, files: dict[str, Pat
 
 
 @pytest.mark.parametrize("name", HOSTILE, ids=ascii)
-def test_suggested_names_need_no_care(name: str) -> None:
+def test_suggested_file_names_are_safe(name: str) -> None:
     for inline in (True, False):
         header = disposition(name, inline=inline)
         assert header.isascii()
@@ -181,12 +181,12 @@ def test_suggested_names_need_no_care(name: str) -> None:
         assert message.get_content_disposition() == match[1]
 
 
-def test_names_that_need_no_care_stay() -> None:
+def test_safe_file_names_are_unchanged() -> None:
     assert disposition("a/b/scene 1.ply", inline=False) == 'attachment; filename="scene_1.ply"'
     assert disposition("caf\u00e9.png", inline=True) == "inline; filename=\"caf_.png\"; filename*=UTF-8''caf%C3%A9.png"
 
 
-def test_hostile_names_on_their_way_through_the_service(client: httpx.Client, files: dict[str, Path]) -> None:
+def test_hostile_file_names_are_sanitized(client: httpx.Client, files: dict[str, Path]) -> None:
     names = [name for name in HOSTILE if name.strip() and "\ud800" not in name][:14]
     job_id = submit(client, files, names)
     for entry in client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]:
@@ -202,9 +202,7 @@ def test_hostile_names_on_their_way_through_the_service(client: httpx.Client, fi
         )
 
 
-def test_pictures_and_the_course_of_the_loss(
-    client: httpx.Client, files: dict[str, Path], store: Store, tmp_path: Path
-) -> None:
+def test_previews_and_loss_history(client: httpx.Client, files: dict[str, Path], store: Store, tmp_path: Path) -> None:
     job_id = submit(client, files, ["style.png"])
     assert client.get(f"/v1/jobs/{job_id}/progress").json() == {"points": []}
     picture = tmp_path / "p.jpg"

@@ -159,7 +159,7 @@ def at_once(send: Callable[[], httpx.Response]) -> contextlib.ExitStack:
 
 
 @pytest.mark.parametrize("kind", ["killed", pytest.param("stopped", marks=pytest.mark.slow)])
-def test_every_operation_says_that_the_database_is_away(outage: Outage, files: dict[str, bytes], kind: str) -> None:
+def test_every_operation_reports_unavailable_database(outage: Outage, files: dict[str, bytes], kind: str) -> None:
     with outage.client() as client, outage.kind(kind), ThreadPoolExecutor(len(operations())) as pool:
         for answer in pool.map(lambda each: request(client, each[0], each[1], outage, files), operations()):
             check_away(answer)
@@ -169,13 +169,13 @@ def test_every_operation_says_that_the_database_is_away(outage: Outage, files: d
 
 
 @pytest.mark.slow
-def test_health_checks_answer_beside_requests_that_wait(outage: Outage) -> None:
+def test_health_checks_answer_while_requests_wait(outage: Outage) -> None:
     with outage.client() as client, outage.kind("stopped"), at_once(lambda: client.get("/v1/jobs")):
         for _ in range(3):
             check_health(outage.service, 503)
 
 
-def test_a_stream_goes_on_when_the_database_is_back(outage: Outage, files: dict[str, bytes]) -> None:
+def test_stream_resumes_when_database_returns(outage: Outage, files: dict[str, bytes]) -> None:
     with outage.client() as client, outage.client() as other:
         job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
         with client.stream("GET", f"/v1/jobs/{job_id}/events") as stream:
@@ -191,7 +191,7 @@ def test_a_stream_goes_on_when_the_database_is_back(outage: Outage, files: dict[
 
 
 @pytest.mark.parametrize("kind", ["killed", pytest.param("stopped", marks=pytest.mark.slow)])
-def test_an_upload_in_the_middle_can_be_resumed(outage: Outage, kind: str) -> None:
+def test_interrupted_upload_can_be_resumed(outage: Outage, kind: str) -> None:
     with outage.client() as client, contextlib.ExitStack() as away:
         place = create_upload(client).headers["location"]
 
@@ -210,7 +210,7 @@ def test_an_upload_in_the_middle_can_be_resumed(outage: Outage, kind: str) -> No
 
 
 @pytest.mark.slow
-def test_a_locked_database_is_busy_and_can_be_read(tmp_path: Path, files: dict[str, bytes]) -> None:
+def test_locked_database_is_busy_but_readable(tmp_path: Path, files: dict[str, bytes]) -> None:
     for service, key, job_id, _ in open_service(tmp_path / "data", None, files):
         with service.client(key) as client, contextlib.closing(sqlite3.connect(service.data / "sgsst.db")) as other:
             other.isolation_level = None
@@ -227,7 +227,7 @@ def test_a_locked_database_is_busy_and_can_be_read(tmp_path: Path, files: dict[s
             assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
 
 
-def test_waiting_for_a_lock_is_bounded_for_all_writers_together(tmp_path: Path) -> None:
+def test_lock_wait_is_bounded_across_writers(tmp_path: Path) -> None:
     """Only one writer at a time waits for a locked database; timeouts of other writers do not add up."""
     store: Store = open_store(ServiceSettings(data=tmp_path), answer_seconds=0.5)
     with contextlib.closing(sqlite3.connect(tmp_path / "sgsst.db")) as other:

@@ -50,7 +50,7 @@ def events(client: httpx.Client, files: dict[str, bytes], **parameters: Any) -> 
         return [sent for sent in source.iter_sse() if sent.data]
 
 
-def test_views_are_told_and_the_plan_is_the_one_without_events(service: Service, files: dict[str, bytes]) -> None:
+def test_events_report_views_and_same_plan(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         *planning, last = events(client, files)
         assert {sent.event for sent in planning} == {"planning"}
@@ -65,14 +65,14 @@ def test_views_are_told_and_the_plan_is_the_one_without_events(service: Service,
         assert client.get("/v1/jobs").json()["jobs"] == []
 
 
-def test_what_cannot_be_used_is_refused_before_the_first_event(service: Service, files: dict[str, bytes]) -> None:
+def test_unusable_files_are_rejected_before_first_event(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         headers = {"Accept": "text/event-stream"}
         answer = client.post("/v1/jobs", headers=headers, **request({**files, "scene": b"none"}))
         assert (answer.status_code, answer.json()["code"]) == (422, "invalid-scene")
 
 
-def test_what_only_the_plan_finds_is_an_event(service: Service, files: dict[str, bytes]) -> None:
+def test_planning_errors_are_events(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         last = events(client, files, regions=[IN_VIEW])[-1]
         assert (last.event, last.json()["status"], last.json()["code"]) == ("problem", 422, "invalid-settings")
@@ -100,7 +100,7 @@ def photo(name: str) -> tuple[str, tuple[str, bytes]]:
     return "photos", (name, file.getvalue())
 
 
-def test_plans_tell_what_was_done_to_cameras_and_photos(service: Service, files: dict[str, bytes]) -> None:
+def test_plan_lists_camera_and_photo_decisions(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         asked = request({**files, "cameras": blender(k1=0.1)})
         refused = client.post("/v1/jobs", **asked)
@@ -115,7 +115,7 @@ def test_plans_tell_what_was_done_to_cameras_and_photos(service: Service, files:
         assert answer.json()["views"] == 2
 
 
-def test_cameras_that_do_not_fit_are_refused_at_once(service: Service, files: dict[str, bytes]) -> None:
+def test_mismatched_cameras_are_rejected_immediately(service: Service, files: dict[str, bytes]) -> None:
     panorama = blender(camera_model="EQUIRECTANGULAR", w=64, h=32)
     with service.client() as client:
         for name, content, detail in (
@@ -130,7 +130,7 @@ def test_cameras_that_do_not_fit_are_refused_at_once(service: Service, files: di
             assert detail in answer.json()["detail"]
 
 
-def test_nobody_plans_for_who_has_left(service: Service, files: dict[str, bytes]) -> None:
+def test_disconnect_cancels_planning_with_events(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         events(client, files)
         both = len(service.processes("service.inspection.process"))
@@ -138,7 +138,7 @@ def test_nobody_plans_for_who_has_left(service: Service, files: dict[str, bytes]
         assert events(client, files, resolution=96)[-1].event == "plan"
 
 
-def test_nor_for_who_has_left_without_events(service: Service, files: dict[str, bytes]) -> None:
+def test_disconnect_cancels_planning_without_events(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         events(client, files)
         both = len(service.processes("service.inspection.process"))

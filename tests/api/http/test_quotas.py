@@ -31,7 +31,7 @@ class Clock:
         return self.now
 
 
-def test_a_rate_is_kept_on_average() -> None:
+def test_average_rate_is_limited() -> None:
     clock = Clock()
     rates = Rates(clock)
     for _ in range(20):
@@ -50,7 +50,7 @@ def test_a_rate_is_kept_on_average() -> None:
 
 
 @pytest.mark.parametrize("a_second", [0.01, 0.5, 3.0])
-def test_who_comes_back_when_told_is_let_in(a_second: float) -> None:
+def test_request_after_retry_after_is_allowed(a_second: float) -> None:
     clock = Clock()
     rates = Rates(clock)
     for _ in range(200):
@@ -61,7 +61,7 @@ def test_who_comes_back_when_told_is_let_in(a_second: float) -> None:
             rates.take("alice", a_second)
 
 
-def test_measures_of_those_who_are_gone_are_forgotten() -> None:
+def test_inactive_owners_are_forgotten() -> None:
     rates = Rates(Clock())
     for number in range(20_000):
         rates.take(f"key_{number}", 1.0)
@@ -108,7 +108,7 @@ def on_disk(service: Service) -> int:
     return sum(found.values())
 
 
-def test_jobs_bytes_and_requests(service: Service, files: dict[str, bytes]) -> None:
+def test_quotas_of_jobs_bytes_and_requests(service: Service, files: dict[str, bytes]) -> None:
     with service.client(key(service, Quotas(stored_bytes=1_000_000))) as client:
         assert client.post("/v1/jobs", files=form(files)).status_code == 202
         answer = client.post("/v1/jobs", files=form(files))
@@ -125,7 +125,7 @@ def test_jobs_bytes_and_requests(service: Service, files: dict[str, bytes]) -> N
         assert 1 <= int(answer.headers["retry-after"]) <= 10
 
 
-def test_connections_are_bounded(service: Service) -> None:
+def test_connections_are_limited(service: Service) -> None:
     host, port = service.url.removeprefix("http://").split(":")
     held = [socket.create_connection((host, int(port))) for _ in range(6)]
     try:
@@ -152,7 +152,7 @@ def body_of(scene: int) -> tuple[bytes, dict[str, str]]:
     return request.read(), {"Content-Type": request.headers["content-type"]}
 
 
-def test_refused_requests_leave_nothing(service: Service, files: dict[str, bytes]) -> None:
+def test_rejected_requests_release_quota(service: Service, files: dict[str, bytes]) -> None:
     """Each request fits into the quota, but their sum is ten times as large."""
     before = on_disk(service)
     with service.client(key(service, Quotas(stored_bytes=5 * MB))) as client:
@@ -163,7 +163,7 @@ def test_refused_requests_leave_nothing(service: Service, files: dict[str, bytes
             assert on_disk(service) <= before, f"request {number} has left its files"
 
 
-def test_dry_runs_and_full_queues_leave_nothing(tmp_path: Path, files: dict[str, bytes]) -> None:
+def test_dry_runs_and_full_queues_release_quota(tmp_path: Path, files: dict[str, bytes]) -> None:
     quick = {"parameters": json.dumps({"preset": "preview", "backbone": "vgg16", "resolution": 128})}
     with (
         Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true", SGSST_MAX_JOBS_PER_KEY="1") as service,
@@ -190,7 +190,7 @@ def test_dry_runs_and_full_queues_leave_nothing(tmp_path: Path, files: dict[str,
         assert on_disk(service) == 0
 
 
-def test_too_many_bytes_are_refused_before_they_come(service: Service) -> None:
+def test_declared_bytes_over_quota_are_rejected_early(service: Service) -> None:
     before = on_disk(service)
     host, port = service.url.removeprefix("http://").split(":")
     owner, text = owner_and_key(service, Quotas(stored_bytes=5 * MB))
@@ -205,7 +205,7 @@ def test_too_many_bytes_are_refused_before_they_come(service: Service) -> None:
     assert stored_bytes(service, owner) == 0
 
 
-def test_bytes_that_were_not_declared_are_charged_as_they_come(service: Service) -> None:
+def test_undeclared_bytes_are_charged_on_arrival(service: Service) -> None:
     before, most = on_disk(service), 0
     body, headers = body_of(20 * MB)
 
@@ -221,7 +221,7 @@ def test_bytes_that_were_not_declared_are_charged_as_they_come(service: Service)
     assert on_disk(service) == before
 
 
-def test_deleted_uploads_leave_nothing(service: Service) -> None:
+def test_deleted_uploads_release_quota(service: Service) -> None:
     before = on_disk(service)
     with service.client(key(service, Quotas(stored_bytes=5 * MB))) as client:
         for _ in range(3):
@@ -275,7 +275,7 @@ def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: d
 
 @pytest.mark.skipif(not is_installed(), reason="PostgreSQL's server is not installed")
 @pytest.mark.slow
-def test_of_a_hundred_requests_at_once_none_passes_a_limit(tmp_path: Path, files: dict[str, bytes]) -> None:
+def test_concurrent_requests_stay_within_limits(tmp_path: Path, files: dict[str, bytes]) -> None:
     """The test uses PostgreSQL, where concurrent transactions do not see each other's rows."""
     limits = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_JOBS_PER_KEY": "7"}
     with (

@@ -87,7 +87,7 @@ def key(store: Store) -> str:
 
 @schemathesis.openapi.from_dict(DOCUMENT).parametrize()
 @settings(max_examples=20, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
-def test_every_operation(case: schemathesis.Case, service: Service, key: str) -> None:
+def test_every_operation_follows_schema(case: schemathesis.Case, service: Service, key: str) -> None:
     """Requests include the examples, limits of every parameter, unsupported methods and random input."""
     case.call_and_validate(
         base_url=service.url, checks=checks(), timeout=60, headers={"Authorization": f"Bearer {key}"}
@@ -182,7 +182,9 @@ def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.
         ("/v1/uploads", UPLOADS),
     ],
 )
-def test_chains_of_requests(service: Service, key: str, uploaded: Uploaded, path: str, behind: tuple[str, ...]) -> None:
+def test_request_chains_follow_schema(
+    service: Service, key: str, uploaded: Uploaded, path: str, behind: tuple[str, ...]
+) -> None:
     """Stateful test: ids from responses are used in the requests that the document links to them."""
     followed: Counter[str] = Counter()
     loaded = schemathesis.openapi.from_dict(uploaded.document()).include(path_regex=f"^{path}")

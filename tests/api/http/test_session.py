@@ -73,7 +73,7 @@ def job_of(store: Store, owner: str) -> str:
     return store.jobs.create(NewJob(owner, "job", 0, {}, inputs), limit=1000)[0].id
 
 
-def test_a_key_is_shown_once(browser: httpx.Client, store: Store) -> None:
+def test_key_is_exchanged_for_cookie(browser: httpx.Client, store: Store) -> None:
     row, key = store.keys.create("alice")
     job_id = job_of(store, row.id)
     refused(browser.get("/v1/jobs"), 401, "unauthorized")
@@ -92,14 +92,14 @@ def test_a_key_is_shown_once(browser: httpx.Client, store: Store) -> None:
     assert [job["id"] for job in browser.get("/v1/jobs").json()["jobs"]] == [job_id]
 
 
-def test_the_cookie_is_for_https_where_the_page_came_by_it(service: Service, key: str) -> None:
+def test_cookie_is_secure_on_https_pages(service: Service, key: str) -> None:
     # Behind a proxy that terminates TLS, the request itself arrives by HTTP.
     with service.client() as browser:
         host = service.url.removeprefix("http://")
         assert cookie_of(sign_in(browser, key, Origin=f"https://{host}"))["secure"]
 
 
-def test_what_is_stored_opens_nothing(browser: httpx.Client, service: Service, data: Path, key: str) -> None:
+def test_stored_session_digest_is_no_cookie(browser: httpx.Client, service: Service, data: Path, key: str) -> None:
     text = cookie_of(sign_in(browser, key)).value
     with sqlite3.connect(data / "sgsst.db") as connection:
         (stored,) = connection.execute("SELECT group_concat(sha256) FROM sessions").fetchone()
@@ -112,7 +112,7 @@ def test_what_is_stored_opens_nothing(browser: httpx.Client, service: Service, d
         assert thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={text}"}).status_code == 200
 
 
-def test_signing_out_ends_the_session_itself(browser: httpx.Client, service: Service, key: str) -> None:
+def test_signing_out_ends_session(browser: httpx.Client, service: Service, key: str) -> None:
     text = cookie_of(sign_in(browser, key)).value
     answer = browser.delete("/v1/session")
     assert answer.status_code == 204
@@ -123,7 +123,7 @@ def test_signing_out_ends_the_session_itself(browser: httpx.Client, service: Ser
     assert browser.delete("/v1/session").status_code == 204, "again"
 
 
-def test_signing_in_again_ends_the_session_before(browser: httpx.Client, service: Service, key: str) -> None:
+def test_signing_in_again_ends_previous_session(browser: httpx.Client, service: Service, key: str) -> None:
     first = cookie_of(sign_in(browser, key)).value
     second = cookie_of(sign_in(browser, key)).value
     assert first != second
@@ -132,7 +132,7 @@ def test_signing_in_again_ends_the_session_before(browser: httpx.Client, service
         assert thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={second}"}).status_code == 200
 
 
-def test_a_revoked_key_ends_its_sessions(browser: httpx.Client, store: Store) -> None:
+def test_revoking_key_ends_its_sessions(browser: httpx.Client, store: Store) -> None:
     row, key = store.keys.create("bob")
     sign_in(browser, key)
     assert browser.get("/v1/jobs").status_code == 200
@@ -141,14 +141,14 @@ def test_a_revoked_key_ends_its_sessions(browser: httpx.Client, store: Store) ->
     assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False}
 
 
-def test_every_api_process_knows_a_session(browser: httpx.Client, data: Path, key: str) -> None:
+def test_api_processes_share_sessions(browser: httpx.Client, data: Path, key: str) -> None:
     text = cookie_of(sign_in(browser, key)).value
     with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as other, other.client() as client:
         assert client.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={text}"}).status_code == 200
     assert browser.get("/v1/jobs").status_code == 200
 
 
-def test_a_key_in_the_request_wins(browser: httpx.Client, store: Store, key: str) -> None:
+def test_request_key_overrides_session(browser: httpx.Client, store: Store, key: str) -> None:
     other, text = store.keys.create("carol")
     job_id = job_of(store, other.id)
     sign_in(browser, key)
@@ -161,7 +161,7 @@ def test_a_key_in_the_request_wins(browser: httpx.Client, store: Store, key: str
     assert canceled.status_code == 200
 
 
-def test_two_sessions_do_not_see_each_others_jobs(service: Service, store: Store) -> None:
+def test_sessions_cannot_access_each_others_jobs(service: Service, store: Store) -> None:
     rows = [store.keys.create(name) for name in ("dora", "emil")]
     jobs = [job_of(store, row.id) for row, _ in rows]
     for (_, key), own, other in zip(rows, jobs, jobs[::-1], strict=True):
@@ -196,7 +196,7 @@ ELSEWHERE: list[dict[str, str]] = [
 
 
 @pytest.mark.parametrize("headers", ELSEWHERE, ids=str)
-def test_pages_of_other_sites_change_nothing(
+def test_cross_origin_changes_are_rejected(
     service: Service, store: Store, headers: dict[str, str], browser: httpx.Client
 ) -> None:
     row, key = store.keys.create("fred")
@@ -223,7 +223,7 @@ def test_pages_of_other_sites_change_nothing(
 
 
 @pytest.mark.parametrize("headers", [{"Origin": "SELF"}, {"Sec-Fetch-Site": "same-origin"}], ids=str)
-def test_the_services_own_pages_change_something(
+def test_same_origin_changes_are_accepted(
     service: Service, store: Store, headers: dict[str, str], browser: httpx.Client
 ) -> None:
     row, key = store.keys.create("gina")
@@ -234,7 +234,7 @@ def test_the_services_own_pages_change_something(
     assert browser.post(f"/v1/jobs/{job_id}/cancel", headers=sent).json()["status"] == "canceled"
 
 
-def test_reading_changes_nothing_wherever_it_comes_from(browser: httpx.Client, store: Store) -> None:
+def test_reads_are_accepted_from_any_origin(browser: httpx.Client, store: Store) -> None:
     """A link or an image of another site can make a browser GET anything (without the cookie, by SameSite)."""
     row, key = store.keys.create("hans")
     job_id = job_of(store, row.id)
@@ -252,7 +252,7 @@ def test_reading_changes_nothing_wherever_it_comes_from(browser: httpx.Client, s
     assert "set-cookie" not in browser.get("/v1/session?key=" + key).headers
 
 
-def test_other_sites_sign_nobody_in(service: Service, key: str) -> None:
+def test_cross_origin_sign_in_is_rejected(service: Service, key: str) -> None:
     """Otherwise, another site could sign users in with the attacker's key."""
     with service.client() as browser:
         for headers in ELSEWHERE[:-1]:
@@ -279,13 +279,13 @@ def test_other_sites_sign_nobody_in(service: Service, key: str) -> None:
         (b'{"key": "' + b"x" * 5000 + b'"}', "application/json", 413, "too-large"),
     ],
 )
-def test_what_is_no_sign_in(browser: httpx.Client, body: bytes, kind: str, status: int, code: str) -> None:
+def test_malformed_sign_ins_are_rejected(browser: httpx.Client, body: bytes, kind: str, status: int, code: str) -> None:
     answer = browser.post("/v1/session", content=body, headers={"Content-Type": kind})
     refused(answer, status, code)
     assert "set-cookie" not in answer.headers
 
 
-def test_wrong_keys_are_refused_and_not_for_ever(tmp_path: Path) -> None:
+def test_failed_sign_ins_are_limited_temporarily(tmp_path: Path) -> None:
     with Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service, service.client() as browser:
         store = open_store(ServiceSettings(data=service.data))
         key = store.keys.create("ida")[1]
@@ -300,7 +300,7 @@ def test_wrong_keys_are_refused_and_not_for_ever(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("trusted", ["", "10.0.0.0/8", "127.0.0.1"])
-def test_only_a_trusted_proxy_names_the_client(tmp_path: Path, trusted: str) -> None:
+def test_only_trusted_proxy_sets_client_address(tmp_path: Path, trusted: str) -> None:
     """If any local client were trusted, it could invent an address for each attempt."""
     proxies = {"SGSST_REQUIRE_KEYS": "true", "SGSST_TRUSTED_PROXIES": trusted}
     with Service(tmp_path / "data", alone=True, **proxies) as service, service.client() as browser:
@@ -312,7 +312,7 @@ def test_only_a_trusted_proxy_names_the_client(tmp_path: Path, trusted: str) -> 
             refused(answer, 429, "too-many-tries")
 
 
-def test_failures_are_forgotten_with_time_and_by_success() -> None:
+def test_sign_in_failures_expire() -> None:
     now = 0.0
     tries = SignIns(lambda: now)
     for _ in range(MOST_FAILURES):
@@ -329,7 +329,7 @@ def test_failures_are_forgotten_with_time_and_by_success() -> None:
         tries.failed("a")
 
 
-def test_a_session_ends_with_its_time(tmp_path: Path) -> None:
+def test_session_expires(tmp_path: Path) -> None:
     now = 1000.0
     store = open_store(ServiceSettings(data=tmp_path, session_days=1), lambda: now)
     row, _ = store.keys.create("jan")
@@ -346,7 +346,7 @@ def test_a_session_ends_with_its_time(tmp_path: Path) -> None:
     store.close()
 
 
-def test_sessions_of_a_key_are_bounded(tmp_path: Path) -> None:
+def test_sessions_per_key_are_limited(tmp_path: Path) -> None:
     now = 1000.0
     store = open_store(ServiceSettings(data=tmp_path), lambda: now)
     row, _ = store.keys.create("kim")
@@ -359,7 +359,7 @@ def test_sessions_of_a_key_are_bounded(tmp_path: Path) -> None:
     store.close()
 
 
-def test_where_no_key_is_needed_a_cookie_that_is_no_good_does_no_harm(tmp_path: Path) -> None:
+def test_invalid_cookie_is_ignored_without_keys(tmp_path: Path) -> None:
     with Service(tmp_path / "data", alone=True) as service, service.client() as browser:
         browser.cookies.set(COOKIE, "old")
         assert browser.get("/v1/session").json() == {"keys_needed": False, "signed_in": False}
@@ -367,7 +367,7 @@ def test_where_no_key_is_needed_a_cookie_that_is_no_good_does_no_harm(tmp_path: 
         refused(browser.get("/v1/jobs", headers={"Origin": "https://evil.example"}), 403, "foreign-site")
 
 
-def test_streams_and_files_come_with_the_cookie(browser: httpx.Client, store: Store) -> None:
+def test_cookie_authorizes_streams_and_files(browser: httpx.Client, store: Store) -> None:
     """`EventSource`, images and downloads cannot send a key."""
     row, key = store.keys.create("lea")
     job_id = job_of(store, row.id)

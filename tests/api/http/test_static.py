@@ -33,7 +33,7 @@ def files() -> StaticFiles:
 
 
 @pytest.mark.parametrize(("path", "policy"), [("/", POLICY), ("/docs", DOCS_POLICY)])
-def test_pages_name_only_files_that_are_there(client: httpx.Client, path: str, policy: str) -> None:
+def test_pages_reference_existing_files(client: httpx.Client, path: str, policy: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "text/html; charset=utf-8"
@@ -48,14 +48,14 @@ def test_pages_name_only_files_that_are_there(client: httpx.Client, path: str, p
             assert client.get(name).status_code == 200, name
 
 
-def test_policies_let_no_text_of_a_page_run() -> None:
+def test_policies_forbid_inline_scripts() -> None:
     for policy in (POLICY, DOCS_POLICY):
         assert "unsafe" not in policy
         assert "http" not in policy
         assert policy.startswith("default-src 'none'; script-src 'self';")
 
 
-def test_files_are_kept_for_ever_under_their_digest(client: httpx.Client, files: StaticFiles) -> None:
+def test_files_are_cached_by_digest(client: httpx.Client, files: StaticFiles) -> None:
     for name in files.files:
         path = f"/static/{files.digest}/{name}"
         plain = client.get(path, headers={"Accept-Encoding": "identity"})
@@ -92,20 +92,20 @@ def test_page_knows_the_states_of_jobs(client: httpx.Client, files: StaticFiles)
     ("header", "status"),
     [("{}", 304), ("W/{}", 304), ('"a,b", {}', 304), ("*", 304), ('"x' + "{}", 200), ("", 200)],
 )
-def test_if_none_match_is_a_list_of_tags(client: httpx.Client, files: StaticFiles, header: str, status: int) -> None:
+def test_if_none_match_accepts_several_tags(client: httpx.Client, files: StaticFiles, header: str, status: int) -> None:
     path = f"/static/{files.digest}/api.js"
     tag = client.get(path, headers={"Accept-Encoding": "identity"}).headers["etag"]
     sent = {"Accept-Encoding": "identity", "If-None-Match": header.format(tag)}
     assert client.get(path, headers=sent).status_code == status
 
 
-def test_modules_have_the_type_that_browsers_ask_for(client: httpx.Client, files: StaticFiles) -> None:
+def test_modules_have_javascript_type(client: httpx.Client, files: StaticFiles) -> None:
     for name, file in files.files.items():
         if name.endswith(".js"):
             assert file.kind.startswith("text/javascript"), name
 
 
-def test_what_is_worth_it_is_compressed_once(client: httpx.Client, files: StaticFiles) -> None:
+def test_large_files_are_compressed_once(client: httpx.Client, files: StaticFiles) -> None:
     path = f"/static/{files.digest}/{BUNDLE}"
     with client.stream("GET", path, headers={"Accept-Encoding": "br, gzip;q=0.5"}) as answer:
         assert answer.headers["content-encoding"] == "gzip"
@@ -121,14 +121,14 @@ def test_what_is_worth_it_is_compressed_once(client: httpx.Client, files: Static
 @pytest.mark.parametrize(
     "name", ["0123456789abcdef/index.html", "{digest}/nothing.js", "{digest}/%2e%2e/%2e%2e/http/app.py", "{digest}/"]
 )
-def test_nothing_else_is_there(client: httpx.Client, files: StaticFiles, name: str) -> None:
+def test_other_static_paths_are_not_found(client: httpx.Client, files: StaticFiles, name: str) -> None:
     answer = client.get(f"/static/{name.replace('{digest}', files.digest)}")
     assert answer.status_code == 404
     assert answer.headers["content-type"] == "application/problem+json"
     assert "immutable" not in answer.headers.get("cache-control", "")
 
 
-def test_another_byte_is_another_address(tmp_path: Path) -> None:
+def test_changed_file_changes_digest(tmp_path: Path) -> None:
     for version, text in enumerate(("let a = 1;", "let a = 2;")):
         folder = tmp_path / str(version)
         folder.mkdir()
@@ -140,7 +140,7 @@ def test_another_byte_is_another_address(tmp_path: Path) -> None:
     assert first.pages["index.html"].digest != second.pages["index.html"].digest
 
 
-def test_methods_that_change_something_are_refused(client: httpx.Client) -> None:
+def test_static_files_reject_other_methods(client: httpx.Client) -> None:
     for path in ("/", "/docs", "/static/x/y"):
         answer = client.post(path)
         assert (answer.status_code, answer.headers["allow"]) == (405, "GET, HEAD")
@@ -148,7 +148,7 @@ def test_methods_that_change_something_are_refused(client: httpx.Client) -> None
 
 
 @pytest.mark.parametrize("library", ["swagger-ui", "fzstd"])
-def test_library_is_what_its_makers_published(library: str) -> None:
+def test_vendored_libraries_match_published_digests(library: str) -> None:
     folder = FOLDER / "vendor" / library
     lines = (folder / "SHA256SUMS").read_text().splitlines()
     sums = {name: digest for digest, name in (line.split() for line in lines)}

@@ -156,7 +156,7 @@ def run(pair: Pair, count: int, seed: int) -> None:
         assert path.name.partition("-")[0] == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_a_file_is_not_written_to_by_two_processes(pair: Pair) -> None:
+def test_upload_is_locked_across_processes(pair: Pair) -> None:
     """The second of two writers is refused. Otherwise, a file could be named by the digest of other content."""
     with pair.services[0].client() as client:
         where = begin(client, 1000)
@@ -173,10 +173,10 @@ def test_a_file_is_not_written_to_by_two_processes(pair: Pair) -> None:
     assert len(statuses & {409, 423}) == 1, statuses
 
 
-def test_interleaved_patches_of_two_processes(pair: Pair) -> None:
+def test_interleaved_patches_from_two_processes(pair: Pair) -> None:
     run(pair, 300, seed=1)
 
 
 @pytest.mark.slow
-def test_ten_thousand_interleaved_patches_of_two_processes(pair: Pair) -> None:
+def test_ten_thousand_interleaved_patches_from_two_processes(pair: Pair) -> None:
     run(pair, 10_000, seed=2)

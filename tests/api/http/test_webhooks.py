@@ -21,7 +21,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         yield running
 
 
-def test_urls_that_cannot_be_called_are_refused(service: Service, tmp_path: Path) -> None:
+def test_uncallable_webhook_urls_are_rejected(service: Service, tmp_path: Path) -> None:
     scene, cameras, style = write_files(tmp_path, wall())
     files = [
         (role, (path.name, path.read_bytes()))
