@@ -75,12 +75,12 @@ $(VENV)/created:
 
 $(VENV)/installed: $(VENV)/created pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time"
-	$(PIP_INSTALL) --editable .
+	$(PIP_INSTALL) --editable ".[service]"
 	@touch $@
 
 $(VENV)/installed-dev: $(VENV)/created pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time"
-	$(PIP_INSTALL) --editable ".[dev]"
+	$(PIP_INSTALL) --editable ".[dev,service]"
 	@touch $@ $(VENV)/installed
 
 $(VENV)/installed-docs: $(VENV)/created pyproject.toml constraints.txt

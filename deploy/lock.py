@@ -34,7 +34,7 @@ def main(wheels: list[Path]) -> None:
     Args:
         wheels: Wheels of PyTorch without CUDA, one per CPU architecture of the images.
     """
-    pinned = _compile(str(ROOT / "pyproject.toml"), "--extra", "postgresql", "--extra", "s3")
+    pinned = _compile(str(ROOT / "pyproject.toml"), "--extra", "service", "--extra", "postgresql", "--extra", "s3")
     cuda = {name for name in pinned if name in cuda_packages() or name == "torch"}
     _write("common", {name: text for name, text in pinned.items() if name not in cuda})
     _write("cuda", {name: pinned[name] for name in cuda})

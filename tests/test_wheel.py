@@ -1,7 +1,8 @@
 """Tests of the wheel, which is installed into a new environment and used from another folder.
 
 The new environment can import third-party packages of the current one, so nothing is downloaded. It cannot import this
-project's source, so files that the wheel lacks are missing there.
+project's source, so files that the wheel lacks are missing there. The core environment has only the packages that an
+installation without extras has.
 """
 
 from __future__ import annotations
@@ -14,9 +15,13 @@ import sys
 import sysconfig
 import venv
 import zipfile
+from importlib.metadata import Distribution, distribution
 from pathlib import Path
 
+import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from api.http.static import static_files
 from sgsst_core.features.network_weights import BackboneWeights
@@ -41,18 +46,51 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-@pytest.fixture(scope="module")
-def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Install the wheel into a new environment, and return the folder of its commands."""
-    folder = tmp_path_factory.mktemp("environment")
+def install(wheel: Path, folder: Path) -> tuple[Path, Path]:
+    """Install the wheel into a new environment, and return the folders of its commands and packages."""
     venv.create(folder, with_pip=False)
     commands = folder / "bin"
     pip = [sys.executable, "-m", "pip", "--python", str(commands / "python"), "--disable-pip-version-check"]
     subprocess.run([*pip, "install", "--quiet", "--no-deps", "--no-index", str(wheel)], check=True)
-    packages = sysconfig.get_path("purelib", vars={"base": str(folder), "platbase": str(folder)})
+    return commands, Path(sysconfig.get_path("purelib", vars={"base": str(folder), "platbase": str(folder)}))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the commands of an environment with all packages of the current one."""
+    commands, packages = install(wheel, tmp_path_factory.mktemp("environment"))
     # A .pth file adds a folder to the search path, but .pth files in that folder are not read, so no editable
     # installation is visible.
-    Path(packages, "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    Path(packages, "others.pth").write_text(Path(np.__file__).parents[1].as_posix() + "\n")
+    return commands
+
+
+def required(requirements: list[str]) -> dict[str, Distribution]:
+    """Return the installed distributions that requirements without extras need, directly or not."""
+    found: dict[str, Distribution] = {}
+    waiting = [(Requirement(line), "") for line in requirements]
+    while waiting:
+        requirement, extra = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        if requirement.marker and not requirement.marker.evaluate({"extra": extra}):
+            continue
+        if name not in found:
+            found[name] = distribution(name)
+            waiting += [(Requirement(line), "") for line in found[name].requires or ()]
+        for wanted in requirement.extras:
+            waiting += [(Requirement(line), wanted) for line in found[name].requires or () if "extra ==" in line]
+    return found
+
+
+@pytest.fixture(scope="module")
+def core(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the commands of an environment that has no extra of the wheel."""
+    commands, packages = install(wheel, tmp_path_factory.mktemp("core"))
+    (own,) = (Distribution.at(path) for path in packages.glob("sgsst_service-*.dist-info"))
+    for each in required(own.requires or []).values():
+        for name in {file.parts[0] for file in each.files or () if file.parts[0] not in ("..", "__pycache__")}:
+            if not (packages / name).exists():
+                (packages / name).symlink_to(Path(str(each.locate_file(name))))
     return commands
 
 
@@ -93,6 +131,49 @@ def test_a_scene_is_stylized_and_reported(installed: Path, vgg16_weights: Backbo
     run([installed / "sgsst", "stylize", ply, *options, "--steps-sos", "2"], tmp_path, OMP_NUM_THREADS="1")
     assert out.stat().st_size == ply.stat().st_size
     assert "</html>" in out.with_name("stylized.report.html").read_text()
+
+
+SERVICE = ("ray", "fastapi", "sqlalchemy", "alembic", "uvicorn", "prometheus_client", "pydantic_settings")
+
+
+def test_core_has_no_packages_of_the_service(core: Path, tmp_path: Path) -> None:
+    code = f"from importlib.util import find_spec; print(*(name for name in {SERVICE} if find_spec(name)))"
+    assert run([core / "python", "-c", code], tmp_path).split() == []
+
+
+def test_core_stylizes_by_command_and_library(core: Path, vgg16_weights: BackboneWeights, tmp_path: Path) -> None:
+    ply, cameras, style = write_files(tmp_path, wall())
+    command: list[str | Path] = [core / "sgsst", "stylize", ply, "--style", style, "--cameras", cameras]
+    command += ["--backbone", "vgg16", "--steps-sos", "2", "--out", tmp_path / "command.ply"]
+    run(command, tmp_path, OMP_NUM_THREADS="1")
+    code = """
+from sgsst_core import load_cameras, load_image, load_scene, save, stylize
+from sgsst_core.features.network_weights import load_network_weights
+style, weights = load_image("style.png"), load_network_weights("vgg16")
+result = stylize(load_scene("scene.ply"), load_cameras("cameras.json"), style, weights=weights, steps_sos=2)
+save("library.ply", result)
+"""
+    run([core / "python", "-c", code], tmp_path, OMP_NUM_THREADS="1")
+    assert (tmp_path / "library.ply").read_bytes() == (tmp_path / "command.ply").read_bytes()
+    assert (tmp_path / "library.ply").read_bytes() != ply.read_bytes()
+
+
+@pytest.mark.parametrize("arguments", ["serve", "fsck", "keys list", "stylize --workers 2"])
+def test_core_names_the_extra_that_a_command_needs(core: Path, tmp_path: Path, arguments: str) -> None:
+    command: list[str | Path] = [core / "sgsst", *arguments.split()]
+    if "stylize" in arguments:
+        ply, cameras, style = write_files(tmp_path, wall())
+        command += [ply, "--cameras", cameras, "--style", style, "--out", tmp_path / "out" / "stylized.ply"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "extra `service` installs. Run `pip install 'sgsst-service[service]'`" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_core_has_the_client(core: Path, tmp_path: Path) -> None:
+    done = subprocess.run([core / "sgsst", "submit", "missing.ply", "--style", "a.jpg"], capture_output=True, text=True)
+    assert "missing.ply: is not a file" in done.stderr
 
 
 def test_a_database_is_made_by_the_migrations(installed: Path, tmp_path: Path) -> None:

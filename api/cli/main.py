@@ -11,6 +11,7 @@ import typer
 from api.cli import client_commands, operator_commands
 from api.cli.bench_commands import bench_app
 from api.cli.console import BAD_INPUT, FAILURE, error_console, out_console
+from api.cli.extras import missing_extra
 from api.cli.scene_commands import check, convert, plan, render
 from api.cli.study_commands import study_app
 from api.cli.stylize_commands import demo, stylize
@@ -54,6 +55,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SgsstError as error:
         error_console.print(f"error: {error}")
         return BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE
+    except ModuleNotFoundError as error:
+        problem = missing_extra(error)
+        if problem is None:
+            raise
+        error_console.print(f"error: {problem}")
+        return BAD_INPUT
     except KeyboardInterrupt:
         error_console.print("Aborted.")
         return 130

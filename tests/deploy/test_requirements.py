@@ -58,7 +58,7 @@ def test_requirements_are_complete(kind: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [
         *project["dependencies"],
-        *(one for extra in ("postgresql", "s3") for one in project["optional-dependencies"][extra]),
+        *(one for extra in ("service", "postgresql", "s3") for one in project["optional-dependencies"][extra]),
     ]
     there = {**packages("common"), **packages(kind)}
     waiting, seen = [Requirement(line) for line in asked], set()
