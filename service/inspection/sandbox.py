@@ -77,13 +77,16 @@ _OWN_ONLY: dict[str, tuple[int, int, bool]] = {
 }  # fmt: skip
 _CLONE, _CLONE3 = (56, 220), 435
 _CLONE_THREAD = 0x10000
+#: `fcntl`, and its commands that name the process to which the kernel sends a descriptor's signals; any signal can be
+#: chosen, such as SIGKILL.
+_FCNTL, _SET_OWNER, _SET_OWNER_EXTENDED = (72, 25), 8, 15
 #: Newest system call considered here; newer ones fail with ENOSYS.
 _NEWEST = 462
 _ARCHITECTURES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
 
 _LOAD, _EQUAL, _GREATER, _ANY_BIT, _RETURN = 0x20, 0x15, 0x25, 0x45, 0x06
 _ALLOW, _ERRNO = 0x7FFF0000, 0x00050000
-_NUMBER_AT, _ARCHITECTURE_AT, _FIRST_ARGUMENT_AT = 0, 4, 16
+_NUMBER_AT, _ARCHITECTURE_AT, _FIRST_ARGUMENT_AT, _SECOND_ARGUMENT_AT = 0, 4, 16, 24
 
 
 def missing() -> list[str]:
@@ -212,6 +215,12 @@ def seccomp_program(machine: str, process: int) -> bytes:
         (_ANY_BIT, 1, 0, _CLONE_THREAD),
         (_RETURN, 0, 0, refuse),
         (_RETURN, 0, 0, _ALLOW),
+        (_EQUAL, 0, 5, _FCNTL[column]),
+        (_LOAD, 0, 0, _SECOND_ARGUMENT_AT),
+        (_EQUAL, 2, 0, _SET_OWNER),
+        (_EQUAL, 1, 0, _SET_OWNER_EXTENDED),
+        (_RETURN, 0, 0, _ALLOW),
+        (_RETURN, 0, 0, refuse),
     ]
     for *numbers, zero_is_own in _OWN_ONLY.values():
         code += [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import fcntl
 import os
 import resource
 import signal
@@ -12,7 +13,7 @@ import subprocess
 from collections.abc import Callable
 from typing import Any
 
-ATTACH, IO_URING_SETUP = 16, 425
+ATTACH, IO_URING_SETUP, SET_SIGNAL = 16, 425, 10
 
 
 def outcome(attempt: Callable[[], Any]) -> str:
@@ -51,6 +52,15 @@ def fork() -> None:
 def connect(port: int) -> None:
     with socket.socket() as made:
         made.connect(("127.0.0.1", port))
+
+
+def signal_by_pipe(process: int) -> None:
+    """Make a process the owner of a pipe, whose input the kernel then reports by a signal of choice."""
+    reading, writing = os.pipe()
+    fcntl.fcntl(reading, fcntl.F_SETOWN, process)
+    fcntl.fcntl(reading, SET_SIGNAL, signal.SIGCONT)
+    fcntl.fcntl(reading, fcntl.F_SETFL, os.O_ASYNC)
+    os.write(writing, b"x")
 
 
 def fill(descriptor: int) -> None:
@@ -100,6 +110,7 @@ def attack(target: dict[str, Any]) -> dict[str, Any]:
         "trace the API": lambda: library("ptrace", ATTACH, api, None, None),
         "signal the parent": lambda: os.kill(parent, signal.SIGCONT),
         "signal the API": lambda: os.kill(api, signal.SIGCONT),
+        "signal the API by a pipe": lambda: signal_by_pipe(api),
         "signal the group": lambda: os.kill(0, signal.SIGCONT),
         "limit the API": lambda: resource.prlimit(api, resource.RLIMIT_CORE, (0, 0)),
         "memory that is a file": lambda: fill(os.memfd_create("x")),

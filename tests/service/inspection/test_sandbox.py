@@ -26,9 +26,9 @@ from tests.service.inspection.test_limits import inspect
 from tests.small_scenes import wall, write_files
 
 COMPROMISED = Path(__file__).with_name("compromised.py")
-#: Variables set for the libraries; Python itself adds LC_CTYPE if there is no locale.
+#: Variables set for the libraries and by `sgsst_core`; Python itself adds LC_CTYPE if there is no locale.
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-ADDED = {*THREADS, "CUDA_VISIBLE_DEVICES", "LC_CTYPE"}
+ADDED = {*THREADS, "CUDA_VISIBLE_DEVICES", "LC_CTYPE", "PYTORCH_ALLOC_CONF"}
 pytestmark = pytest.mark.skipif(bool(sandbox.missing()), reason=f"the kernel lacks {sandbox.missing()}")
 
 
@@ -165,9 +165,9 @@ def test_missing_kernel_features_are_logged(
     assert "missing seccomp" in second
 
 
-def verdict(program: bytes, architecture: int, number: int, argument: int = 0) -> int:
+def verdict(program: bytes, architecture: int, number: int, argument: int = 0, second: int = 0) -> int:
     """Interpret a classic BPF filter as the kernel does, and return its verdict on a system call."""
-    call = {0: number, 4: architecture, 16: argument}
+    call = {0: number, 4: architecture, 16: argument, 24: second}
     code = list(struct.iter_unpack("=HBBI", program))
     at = value = 0
     while True:
@@ -189,11 +189,15 @@ def verdict(program: bytes, architecture: int, number: int, argument: int = 0) -
 @pytest.mark.parametrize(
     ("machine", "architecture", "numbers"),
     [
-        ("x86_64", 0xC000003E, {"read": 0, "socket": 41, "execve": 59, "clone": 56, "kill": 62, "prlimit64": 302}),
+        (
+            "x86_64",
+            0xC000003E,
+            {"read": 0, "socket": 41, "execve": 59, "clone": 56, "kill": 62, "prlimit64": 302, "fcntl": 72},
+        ),
         (
             "aarch64",
             0xC00000B7,
-            {"read": 63, "socket": 198, "execve": 221, "clone": 220, "kill": 129, "prlimit64": 261},
+            {"read": 63, "socket": 198, "execve": 221, "clone": 220, "kill": 129, "prlimit64": 261, "fcntl": 25},
         ),
     ],
 )
@@ -201,13 +205,15 @@ def test_filter_of_each_architecture(machine: str, architecture: int, numbers: d
     program, own, other = sandbox.seccomp_program(machine, 4711), 4711, 4712
     allow, refuse, absent = 0x7FFF0000, 0x50000 | errno.EPERM, 0x50000 | errno.ENOSYS
 
-    def ask(name: str, argument: int = 0) -> int:
-        return verdict(program, architecture, numbers[name], argument)
+    def ask(name: str, argument: int = 0, second: int = 0) -> int:
+        return verdict(program, architecture, numbers[name], argument, second)
 
     assert (
         ask("read") == ask("clone", 0x10F00) == ask("kill", own) == ask("prlimit64", own) == ask("prlimit64") == allow
     )
     assert ask("socket") == ask("execve") == ask("clone", 17) == ask("kill", other) == ask("kill") == refuse
+    assert {ask("fcntl", 3, second) for second in range(20) if second not in (8, 15)} == {allow}
+    assert ask("fcntl", 3, 8) == ask("fcntl", 3, 15) == refuse
     assert ask("kill", 2**32 - 1) == ask("prlimit64", other) == refuse
     assert verdict(program, architecture, 435) == verdict(program, architecture, 463) == absent
     assert verdict(program, architecture, 0x40000000 + numbers["socket"]) == absent
