@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sgsst_core.decision import Decision
 from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.formats.sog import META_NAME
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
@@ -187,13 +188,13 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
 
     Args:
         source: Scene, and cameras for the comparison; without cameras, views are those of an orbit.
-        out: File to write.
+        out: File to write; meta.json for an unpacked SOG.
         compare: Whether to read the file back and compare renders.
 
     Raises:
         InvalidInputError: If scene, cameras or output cannot be used.
     """
-    format = result_format(out)
+    format = None if out.name == META_NAME else result_format(out)
     check_is_not_scene(out, source.scene)
     check_folder(out.parent)
     if compare and source.cameras is None:
@@ -206,6 +207,10 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
         capture = read_capture(source, scene).checked(scene, source.near)
         cameras, decisions = capture.cameras, [*decisions, *capture.decisions]
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_scene(out, scene, format)
-    loss = measure_compression(out, scene, cameras, near=source.near) if compare else None
+    if format is not None:
+        write_scene(out, scene, format)
+        size = out.stat().st_size
+    else:
+        size = write_sog_folder(out.parent, scene)
+    loss = replace(measure_compression(out, scene, cameras, near=source.near), size=size) if compare else None
     return Converted(len(scene), file.notes, tuple(decisions), loss)

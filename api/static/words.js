@@ -51,6 +51,7 @@ export const words = {
     notPly: "Not a PLY file.",
     notBinary: "Only binary little-endian PLY can be previewed. The service may still accept this file.",
     notGaussians: "This PLY contains no 3D Gaussians that can be previewed.",
+    noSplats: "This GLB contains no 3D Gaussians.",
     newSpz: "This SPZ version can't be previewed. You can still upload it; the result will be shown.",
     cut: "The file is incomplete.",
     unreadable: "Couldn't read the scene.",

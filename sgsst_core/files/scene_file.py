@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
 from sgsst_core.files.formats.scene_format import SceneFormat, SceneHeader
+from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.scene_columns import SceneColumns
 from sgsst_core.refine.split import Refinement, piece_counts
@@ -216,6 +218,21 @@ def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY) -> None:
     """
     with atomic_path(path) as temporary, temporary.open("wb") as output:
         encode_scene(output, scene, format, path)
+
+
+def write_sog_folder(folder: Path, scene: Scene) -> int:
+    """Write a scene as an unpacked SOG, whose meta.json comes last. Return the bytes of its files.
+
+    Raises:
+        OutputError: If a file cannot be written, or SOG cannot represent the scene.
+    """
+    stream = io.BytesIO()
+    encode_scene(stream, scene, SOG, folder / META_NAME)
+    with zipfile.ZipFile(stream) as archive:
+        for entry in archive.infolist():
+            with atomic_path(folder / entry.filename) as temporary:
+                temporary.write_bytes(archive.read(entry))
+        return sum(entry.file_size for entry in archive.infolist())
 
 
 def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Path) -> None:

@@ -16,7 +16,7 @@ import { words } from "../words.js";
 
 const SH_C0 = 0.28209479177387814;
 const NAMES = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
-const OPACITY = 3, SCALES = 4, ROTATION = 7, COLOR = 11, HARMONICS = NAMES.length;
+export const OPACITY = 3, SCALES = 4, ROTATION = 7, COLOR = 11, HARMONICS = NAMES.length;
 /**
  * Logits of opacities in steps of 1/255. Opacities of exactly 0 and 1 have no finite logit; they are read as 0.25/255
  * and 1 - 0.25/255.
@@ -35,7 +35,7 @@ const OTHERS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];
  * @param {(begin: number, rows: Float32Array, width: number, count: number) => void | Promise<void>} unpack fills `count` rows
  * @returns {SceneFile}
  */
-function unpacked(count, degree, unpack) {
+export function unpacked(count, degree, unpack) {
   const rest = ((degree + 1) ** 2 - 1) * 3, width = HARMONICS + rest;
   const at = Object.fromEntries([...NAMES, ...Array.from({ length: rest }, (_, i) => `f_rest_${i}`)].map((name, place) => [name, place]));
   async function* batches() {

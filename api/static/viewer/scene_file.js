@@ -3,6 +3,7 @@
  * Scenes of any format, detected from the file's content: batches of float32 rows, with the names of PLY properties.
  */
 import { ByteReader, SceneError } from "./byte_reader.js";
+import { glb } from "./glb.js";
 import { compressedPly, isSplat, splat, spz, spz4 } from "./packed.js";
 import { notShown } from "../scene_formats.js";
 import { plainPly, readHeader } from "./ply.js";
@@ -31,6 +32,7 @@ export async function openScene(reader, size) {
   }
   if (start[0] === 0x1f && start[1] === 0x8b) return spz(reader);
   if (magic === "NGSP") return spz4(reader);
+  if (magic === "glTF") return glb(reader);
   const other = notShown(start);
   if (other) throw new SceneError(words.scene.notShown(other.title));
   if (isSplat(start, size)) return splat(reader, size);

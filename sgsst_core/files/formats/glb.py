@@ -376,6 +376,6 @@ GLB = SceneFormat(
     bytes_per_gaussian=240,
     read=_read,
     write=_write,
-    magic=_MAGIC,
+    shown=True,
     media_type="model/gltf-binary",
 )

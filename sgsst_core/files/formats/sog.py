@@ -39,6 +39,8 @@ from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStar
 from sgsst_core.files.formats.unsupported import advice, is_checkpoint
 from sgsst_core.files.json_files import json_numbers
 
+#: Name of the file that describes a scene, in an archive or a folder.
+META_NAME = "meta.json"
 _ZIP_MAGIC = b"PK\x03\x04"
 #: Record at the end of a ZIP archive, and its signature; archives above 4 GB have a locator of another record before.
 _END = struct.Struct("<4s4H2LH")
@@ -107,7 +109,7 @@ class _Files:
         with path.open("rb") as file:
             self._archived = file.read(4) == _ZIP_MAGIC
         self._path = path
-        self.meta = "meta.json" if self._archived else path.name
+        self.meta = META_NAME if self._archived else path.name
         if self._archived:
             _check_end(path)
 
@@ -373,7 +375,7 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
         for name, pixels in images.items():
             width = _PALETTE_COLUMNS * coefficients if name == "shN_centroids.webp" else side
             archive.writestr(zipfile.ZipInfo(name), _webp(pixels, width))
-        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
+        archive.writestr(zipfile.ZipInfo(META_NAME), json.dumps(meta))
 
 
 def _encoded_positions(means: NDArray[np.float32]) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:

@@ -12,6 +12,7 @@ import signal
 import struct
 import subprocess
 import sys
+import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -899,6 +900,18 @@ def test_convert_writes_what_it_reads(files: Files, capsys: pytest.CaptureFixtur
     assert (one.format, other.format) == (name, "ply")
     for field in fields(one.scene):
         assert torch.equal(getattr(one.scene, field.name), getattr(other.scene, field.name)), field.name
+
+
+def test_convert_writes_an_unpacked_sog(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    archive, meta = files.out.with_name("scene.sog"), files.out.parent / "unpacked" / "meta.json"
+    for out in (archive, meta):
+        assert main(["convert", str(files.ply), str(out), "--compare", "--cameras", str(files.cameras)]) == 0
+    packed, unpacked = (line for line in capsys.readouterr().out.splitlines() if line.startswith("compared:"))
+    assert packed == unpacked
+    with zipfile.ZipFile(archive) as found:
+        assert {name: found.read(name) for name in found.namelist()} == {
+            path.name: path.read_bytes() for path in meta.parent.iterdir()
+        }
 
 
 def test_convert_compares_in_an_orbit(files: Files, capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,6 +69,7 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
         ("compressed.ply", "playbot_synthetic_sh2"),
         ("spz", "snowmiku_plush"),
         ("v4.spz", "snowmiku_plush"),
+        ("glb", "snowmiku_plush"),
         ("splat", "biker"),
     ],
 )
