@@ -140,7 +140,7 @@ _ADDED = {"BLOCK": kernels.ADDED.value, "SLOTS": kernels.SLOTS.value}
 KERNELS: dict[str, Target] = {
     "project": Target(
         kernels.project,
-        {"EPS2D": EPS2D, "MARGIN": FRUSTUM_MARGIN, "SUPPORT": 8.0, "POWER": 0.85, "BLOCK": _BLOCK},
+        {"EPS2D": EPS2D, "ANTIALIASED": True, "MARGIN": FRUSTUM_MARGIN, "SUPPORT": 8.0, "POWER": 0.85, "BLOCK": _BLOCK},
         4,
     ),
     "list_tiles": Target(kernels.list_tiles, {"SUPPORT": 8.0, "BLOCK": _BLOCK}, 4),

@@ -9,7 +9,7 @@ import json
 import shutil
 import struct
 import subprocess
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import gaussforge
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from sgsst_core.files.formats import RESULT_FORMATS, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.splat_scenes import cloud
 
@@ -91,15 +91,15 @@ def assert_same(found: Scene, expected: Scene, tolerance: float = 1e-4, opacitie
     """Assert that every value of every Gaussian is the same, up to the sign of quaternions."""
     found = matched(found, expected)
     assert found.sh_degree == expected.sh_degree
-    for field in fields(Scene):
-        one, other = (held(getattr(each, field.name)).double() for each in (found, expected))
-        if field.name == "opacities":
+    for name in TENSORS:
+        one, other = (held(getattr(each, name)).double() for each in (found, expected))
+        if name == "opacities":
             one, other = one.sigmoid(), other.sigmoid()
-        if field.name == "quats":
+        if name == "quats":
             one, other = (torch.nn.functional.normalize(each, dim=1) for each in (one, other))
             other = other * (one * other).sum(dim=1, keepdim=True).sign()
         error = float((one - other).abs().max()) if one.numel() else 0.0
-        assert error <= (opacities if field.name == "opacities" else tolerance), (field.name, error)
+        assert error <= (opacities if name == "opacities" else tolerance), (name, error)
 
 
 @pytest.mark.parametrize("name", READ_BY_SPLAT_TRANSFORM)

@@ -12,12 +12,13 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.photos import Photo, check_photos, photo_size, some_names
-from sgsst_core.files.scene_file import read_scene
+from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
 from sgsst_core.planning.fit import compare_photos, frame_warnings, shown_by
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.lens import undistorted
+from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.settings import Settings
 from worker.request import SceneRequest
 
@@ -134,6 +135,18 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
         return asked, []
     reason = f"a typical view has {rub:.1%} of the Gaussians in its frame so, and {rdf:.1%} with rdf; see --spz-axes"
     return "rub", [Decision("axes", "the scene is rotated by 180 degrees about x (rub: y up, z backward)", reason)]
+
+
+def about_rendering(file: SceneFile) -> list[Decision]:
+    """Return the lines about a render mode that is not the usual one, and about doubts in what the file states."""
+    tag, rendering = file.tag, file.scene.rendering
+    lines = []
+    if rendering != tag.rendering:
+        states = f"the file states {tag.rendering.text}" if tag.reason else "the file states nothing"
+        lines.append(Decision("rendering", rendering.text, f"as requested; {states}"))
+    elif tag.reason and rendering != CLASSIC:
+        lines.append(Decision("rendering", rendering.text, f"{tag.reason} says so; see --render-mode and --eps2d"))
+    return [*lines, *(Decision("rendering", f"warning: drawn {drawn}", reason) for drawn, reason in tag.warnings)]
 
 
 def _orbit_request(source: SceneRequest) -> OrbitRequest:

@@ -32,7 +32,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job_styles import check_style_size
-from worker.capture import Capture, choose_axes, read_capture
+from worker.capture import Capture, about_rendering, choose_axes, read_capture
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 from worker.selecting import select_regions
@@ -92,6 +92,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
         growth=settings.refine,
         spz_axes=axes,
     )
+    scene_file = scene_file.rendered(source.render_mode, source.eps2d)
     together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
     capture = _capture_on_all_ranks(source, scene_file.scene, images, collectives).fitted(settings)
     together(collectives, lambda: check_scales(settings.scales, capture.cameras, settings.coarsest_side))
@@ -104,7 +105,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     own = None
     if reader:
         own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps, regions)
-    decisions = (*about_axes, *capture.decisions)
+    decisions = (*about_axes, *about_rendering(scene_file), *capture.decisions)
     same = _same_fingerprint(own, collectives)
     return Inputs(weights, style, scene_file, cameras, capture.orbit, photos, decisions, regions, same)
 
@@ -170,8 +171,9 @@ def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> 
     """
     axes, about_axes = choose_axes(source, images)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+    file = file.rendered(source.render_mode, source.eps2d)
     capture = read_capture(source, file.scene, images).with_photos(images).checked(file.scene, source.near)
-    return file, replace(capture, decisions=(*about_axes, *capture.decisions))
+    return file, replace(capture, decisions=(*about_axes, *about_rendering(file), *capture.decisions))
 
 
 def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:

@@ -16,6 +16,7 @@ from sgsst_core.constants import NEAR
 from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.option_parsers import COLOR_SYNTAX, parse_color
 from sgsst_core.options import Option, declared
+from sgsst_core.scene.rendering import MAX_EPS2D, RenderMode
 from sgsst_core.settings import (
     BY_PRESET,
     EVERYTHING,
@@ -64,6 +65,14 @@ class ViewOptions(BaseModel):
         description="Axes of an SPZ scene: rub (y up, z backward) or rdf (y down, z forward, as in a PLY); auto: as "
         "the file states, else rdf.",
     )
+    render_mode: RenderMode = Field(
+        "auto",
+        description="Rendering of Gaussians smaller than a pixel, which must be that of the scene's training; "
+        "antialiased: as by Mip-Splatting, gsplat or Brush with antialiasing; auto: as the file states, else classic.",
+    )
+    eps2d: Annotated[
+        float | None, Option(unit="square pixels", metavar="E", default="by the scene's file, else 0.3")
+    ] = Field(None, gt=0, le=MAX_EPS2D, description="Blur of projected Gaussians: variance added along both axes.")
 
 
 def _settings_to_choose() -> dict[str, Any]:

@@ -59,7 +59,7 @@ from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job_styles import check_style_size
 from sgsst_core.stylizing.refining import refine, refined
-from worker.capture import Capture, choose_axes, read_capture
+from worker.capture import Capture, about_rendering, choose_axes, read_capture
 from worker.inputs import check_something_in_view, load_styles, read_regions
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
@@ -115,6 +115,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     with _errors_of("scene"):
         axes, about_axes = choose_axes(source, staged.photos)
         file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+        file = file.rendered(source.render_mode, source.eps2d)
         check_sh_attenuation(file, settings.sh_attenuation)
         findings |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
     with _errors_of("style"):
@@ -147,7 +148,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         findings |= {"views": len(capture.cameras), "pixels": _pixels(capture.cameras)}
     with _errors_of("regions"):
         regions = read_regions(job, file, capture.cameras)
-    capture = replace(capture, decisions=(*about_axes, *capture.decisions))
+    capture = replace(capture, decisions=(*about_axes, *about_rendering(file), *capture.decisions))
     return findings, _Inputs(file.scene, capture, style, regions)
 
 
@@ -401,7 +402,7 @@ def _compile_kernels() -> None:
             os.chdir(folder)
             count, scene = 64, Path("scene.ply")
             shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh_dc": (3,), "sh_rest": (15, 3)}
-            write_scene(scene, Scene(**{name: torch.rand(count, *shape) for name, shape in shapes.items()}))
+            write_scene(scene, Scene(*(torch.rand(count, *shape) for shape in shapes.values())))
             limits = dict.fromkeys(("gaussians", "views", "pixels", "image_pixels"), 1 << 40)
             parameters = JobParameters(orbit="3", resolution=96)
             plan(Staged(scene, (STARRY_NIGHT,), None, None), parameters, limits, lambda now: None)

@@ -10,7 +10,7 @@ import re
 import warnings
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,12 +25,14 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
+from sgsst_core.files.formats.render_tag import UNTAGGED, RenderTag
 from sgsst_core.files.formats.scene_format import SceneFormat, SceneHeader
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.scene_columns import SceneColumns
 from sgsst_core.refine.split import Refinement, piece_counts
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
 #: Number of rows per block. 64k rows of 62 floats take only 16 MB. The columns of a block are copied from the CPU
@@ -69,6 +71,7 @@ class SceneFile:
         format: Name of the file's format.
         clamped: Number of infinite opacities that were replaced by finite ones. The stylized PLY keeps them.
         notes: Notes on what of the file is not read, or read in another way than stored.
+        tag: Render mode that the file states. `scene.rendering` is another one if it was requested.
         copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
         sh_attenuation: SH attenuation that the scene has, but not the file.
     """
@@ -81,6 +84,7 @@ class SceneFile:
     format: str = PLY.name
     clamped: int = 0
     notes: tuple[str, ...] = ()
+    tag: RenderTag = UNTAGGED
     copies: NDArray[np.int64] | None = None
     sh_attenuation: float = 0.0
 
@@ -114,6 +118,11 @@ class SceneFile:
         """
         attenuation = 1 - (1 - self.sh_attenuation) * (1 - sh_attenuation)
         return replace(self.refined(refinement), scene=scene, sh_attenuation=attenuation)
+
+    def rendered(self, mode: RenderMode, eps2d: float | None) -> SceneFile:
+        """Return the file with a requested render mode and blur; "auto" and None keep what the file states."""
+        rendering = self.scene.rendering.requested(mode, eps2d)
+        return replace(self, scene=replace(self.scene, rendering=rendering))
 
     @property
     def dropped(self) -> int:
@@ -163,12 +172,13 @@ def read_scene(
     arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in columns.arrays.items()}
     if stored:
         arrays["sh_rest"] = StoredHarmonics(stored, coefficients=header.coefficients, file=file)
-    scene = Scene(**arrays)
+    scene = Scene(**arrays, rendering=header.tag.rendering)
     if retained is not None:
         scene = scene.subset(torch.from_numpy(retained))
     if isinstance(header, PlySceneHeader) and header.sources:
         ply = None
-    return SceneFile(path, scene, ply, retained, stamp, header.format.name, sum(columns.clamped), notes)
+    clamped = sum(columns.clamped)
+    return SceneFile(path, scene, ply, retained, stamp, header.format.name, clamped, notes, header.tag)
 
 
 def _columns(header: SceneHeader, stored: RowLayout | None) -> SceneColumns:
@@ -252,9 +262,9 @@ def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Pa
     assert format.write is not None
     if format is not PLY:
         scene = scene.without_zero_bands()
-    arrays = {field.name: held(getattr(scene, field.name)).detach().cpu().float().numpy() for field in fields(scene)}
+    arrays = {name: held(getattr(scene, name)).detach().cpu().float().numpy() for name in TENSORS}
     try:
-        format.write(output, arrays)
+        format.write(output, arrays, scene.rendering)
     except OutputError as error:
         raise OutputError(f"{target}: {error}") from error
 

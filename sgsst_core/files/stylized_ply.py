@@ -23,6 +23,7 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats.ply import PROPERTIES, RGB
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
+from sgsst_core.files.formats.render_tag import retagged
 from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, file_stamp, write_scene
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import changed
@@ -37,6 +38,7 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
     - Colors of 8 bits in red, green and blue, for programs that show only points, become those of f_dc_*.
     - Dropped rows are absent, and the count in the header is adjusted.
     - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
+    - If another render mode was requested than the file states, comments of the header state it.
 
     A scene in another format is written as a PLY by `write_scene`.
 
@@ -138,12 +140,15 @@ class _ShAttenuation:
 
 
 def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
-    """Return the source's header, with the new number of rows if Gaussians were dropped or split."""
+    """Return the source's header, with the new number of rows if Gaussians were dropped or split.
+
+    If another render mode was requested than the header states, it states that mode.
+    """
     raw = header.raw
-    if source.retained is None and source.copies is None:
-        return raw
-    start, stop = header.vertex.count_span
-    return raw[:start] + str(len(source.scene)).encode() + raw[stop:]
+    if source.retained is not None or source.copies is not None:
+        start, stop = header.vertex.count_span
+        raw = raw[:start] + str(len(source.scene)).encode() + raw[stop:]
+    return retagged(raw, header, source.scene.rendering)
 
 
 #: New values of all Gaussians, by property name.

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import EPS2D, RASTER_TILE
+from sgsst_core.constants import RASTER_TILE
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import CameraKey, Rasterizer, Rows, camera_key
 from sgsst_core.scene.camera import Camera
@@ -147,7 +147,8 @@ class CudaRasterizer(Rasterizer):
         intrinsics = torch.tensor(
             [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=self.device
         )[None]
-        radii, means, depths, conics, _ = self._gsplat.fully_fused_projection(
+        rendering, opacities = self.scene.rendering, self._opacities[None]
+        radii, means, depths, conics, compensations = self._gsplat.fully_fused_projection(
             self._means,
             None,
             self._quats,
@@ -156,12 +157,15 @@ class CudaRasterizer(Rasterizer):
             intrinsics,
             camera.width,
             camera.height,
-            eps2d=EPS2D,
+            eps2d=rendering.eps2d,
             near_plane=self.near,
+            calc_compensations=rendering.antialiased,
             opacities=self._opacities,
         )
+        if rendering.antialiased:
+            opacities = opacities * compensations
         means = means - means.new_tensor([0, band[0]])
         across, down = -(-camera.width // RASTER_TILE), -(-(band[1] - band[0]) // RASTER_TILE)
         _, ids, flat_ids = self._gsplat.isect_tiles(means, radii, depths, RASTER_TILE, across, down)
         offsets = self._gsplat.isect_offset_encode(ids, 1, across, down)
-        return _Splats(means, conics, self._opacities[None], offsets.reshape(1, down, across), flat_ids)
+        return _Splats(means, conics, opacities, offsets.reshape(1, down, across), flat_ids)

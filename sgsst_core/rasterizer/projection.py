@@ -8,6 +8,8 @@ with covariance J V J^T, where J is the Jacobian of the perspective at its cente
 * Its determinant is (sum of the squared 2x2 minors of M) + e trace(M M^T) + e^2 (Cauchy-Binet), a sum of positive
   terms, which cannot cancel. The formula p r - q^2 would have no correct digit for a Gaussian a million times longer
   than wide.
+* An antialiased scene multiplies the opacity by the square root of the minors' fraction of the determinant. Both are
+  sums of positive terms, so the fraction is between 0 and 1.
 * The exponent is computed as a sum of two squares, so it cannot become negative:
   w = dy / sqrt(r), u = (dx - (q / r) dy) sqrt(r / det), power = (u^2 + w^2) / 2.
 * The support of a Gaussian is exactly the area where its alpha is at least ALPHA_MIN: half extents t sqrt(p) and
@@ -23,16 +25,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled, kernel_threads
-from sgsst_core.constants import EPS2D, FRUSTUM_MARGIN, LOG2_ALPHA_MIN, NEAR, TO_POWER_OF_TWO
+from sgsst_core.constants import FRUSTUM_MARGIN, LOG2_ALPHA_MIN, NEAR, TO_POWER_OF_TWO
 from sgsst_core.rasterizer.depth_order import depth_order
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import Rendering
 
 #: Upper bound of float64 rounding errors: in pixels for positions in an image, and relative for extents.
 _ROUNDING = 1e-6
@@ -64,7 +68,7 @@ class Outcome(IntEnum):
     NEAR = 1
     #: Zero quaternion, or overflow of float64, unless the center is far outside the image.
     INVALID = 2
-    #: Opacity below ALPHA_MIN, so it contributes to no pixel.
+    #: Opacity in the view below ALPHA_MIN, so it contributes to no pixel.
     FAINT = 3
     #: No pixel center of the image within its extents.
     OUTSIDE = 4
@@ -110,6 +114,26 @@ class Shapes:
         return shapes
 
 
+class _Blur(NamedTuple):
+    """Blur of projected Gaussians, as an argument of kernels.
+
+    Attributes:
+        variance: Variance in square pixels.
+        squared: Square of the variance. Computed in advance, so that it is not fused with a sum, which would change the
+            rounding.
+        compensated: Whether opacities are compensated for the blur.
+    """
+
+    variance: float
+    squared: float
+    compensated: bool
+
+    @classmethod
+    def of(cls, rendering: Rendering) -> _Blur:
+        """Return the blur of a scene's render mode."""
+        return cls(rendering.eps2d, rendering.eps2d * rendering.eps2d, rendering.antialiased)
+
+
 def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes | None = None) -> Projection:
     """Project a scene onto a camera. The scene may be empty.
 
@@ -140,6 +164,7 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
             np.ascontiguousarray(camera.world_to_camera.double().numpy()),
             intrinsics,
             near,
+            _Blur.of(scene.rendering),
             chunks,
             threads,
             values,
@@ -194,7 +219,7 @@ def _factor_row(row, rotation, deviation):
 
 
 @compiled()
-def _surely_outside(center, size, row, deviation, support):
+def _surely_outside(center, size, row, deviation, support, blur):
     """Return whether a Gaussian is certain to lie outside the image, whatever its orientation.
 
     Its extent is bounded by that of a ball whose standard deviation is the largest of the Gaussian's. Return True only
@@ -204,13 +229,16 @@ def _surely_outside(center, size, row, deviation, support):
     if not distance > 0:
         return False
     largest = max(deviation[0], deviation[1], deviation[2])
-    trace = (row[0] * row[0] + row[1] * row[1] + row[2] * row[2]) * largest * largest + EPS2D
+    trace = (row[0] * row[0] + row[1] * row[1] + row[2] * row[2]) * largest * largest + blur.variance
     return distance * distance * (TO_POWER_OF_TWO * TO_POWER_OF_TWO) > (1 + _ROUNDING) * support * trace
 
 
 @compiled()
-def _covariance(m0, m1):
-    """Return p, q, r and the determinant of M M^T + EPS2D I, without cancellation (see the module docstring)."""
+def _covariance(m0, m1, blur):
+    """Return p, q, r and the determinant of the blurred M M^T, and the determinant without blur.
+
+    Nothing cancels (see the module docstring).
+    """
     p = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2]
     q = m0[0] * m1[0] + m0[1] * m1[1] + m0[2] * m1[2]
     r = m1[0] * m1[0] + m1[1] * m1[1] + m1[2] * m1[2]
@@ -218,11 +246,12 @@ def _covariance(m0, m1):
     minor1 = m0[2] * m1[0] - m0[0] * m1[2]
     minor2 = m0[0] * m1[1] - m0[1] * m1[0]
     minors = minor0 * minor0 + minor1 * minor1 + minor2 * minor2
-    return p + EPS2D, q, r + EPS2D, minors + EPS2D * (p + r) + EPS2D * EPS2D
+    e = blur.variance
+    return p + e, q, r + e, minors + e * (p + r) + blur.squared, minors
 
 
 @compiled()
-def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, value):
+def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, blur, value):
     """Fill one row of `Projection.values`, and return the outcome and the depth."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     width, height = intrinsics[4], intrinsics[5]
@@ -240,12 +269,19 @@ def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, value):
     row0 = _row(fx / z, slope_x, pose[0], pose[2])
     row1 = _row(fy / z, slope_y, pose[1], pose[2])
     u, v = fx * (x / z) + cx, fy * (y / z) + cy
-    if _surely_outside(u, width, row0, deviation, support) or _surely_outside(v, height, row1, deviation, support):
+    if _surely_outside(u, width, row0, deviation, support, blur):
+        return _OUTSIDE, z
+    if _surely_outside(v, height, row1, deviation, support, blur):
         return _OUTSIDE, z
     rotation = _rotation(quat)
     m0 = _factor_row(row0, rotation, deviation)
     m1 = _factor_row(row1, rotation, deviation)
-    p, q, r, det = _covariance(m0, m1)
+    p, q, r, det, unblurred = _covariance(m0, m1, blur)
+    if blur.compensated:
+        opacity += 0.5 * np.log2(unblurred / det)
+        support = opacity - LOG2_ALPHA_MIN
+        if support < 0:
+            return _FAINT, z
     u_scale = TO_POWER_OF_TWO * math.sqrt(r / det)
     reach = math.sqrt(support) / TO_POWER_OF_TWO
     extent_x, extent_y = reach * math.sqrt(p), reach * math.sqrt(r)
@@ -271,8 +307,9 @@ def _compute_shapes(scales, logits, deviations, log2_opacities):
 
 @compiled(parallel=True)
 def _project_chunks(
-    means, quats, deviations, opacities, pose, intrinsics, near, chunks, threads, values, depths, gaussians, tallies
-):
+    means, quats, deviations, opacities, pose, intrinsics, near, blur, chunks, threads, values, depths, gaussians,
+    tallies,
+):  # fmt: skip
     """Project each chunk of the scene, and count the outcomes.
 
     Results of visible Gaussians are written contiguously from the start of each chunk.
@@ -282,7 +319,7 @@ def _project_chunks(
         position = chunks[chunk]
         for i in range(chunks[chunk], chunks[chunk + 1]):
             outcome, depth = _project_one(
-                means[i], quats[i], deviations[i], opacities[i], pose, intrinsics, near, values[position]
+                means[i], quats[i], deviations[i], opacities[i], pose, intrinsics, near, blur, values[position]
             )
             tallies[chunk, outcome] += 1
             if outcome == _VISIBLE:

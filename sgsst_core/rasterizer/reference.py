@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
+from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
 from sgsst_core.rasterizer.base import CameraKey, Rasterizer, Rows, camera_key, check_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -37,7 +37,7 @@ class Splats:
     w_scale: Tensor  # 1 / sqrt(p)
     skew: Tensor  # q / p
     u_scale: Tensor  # sqrt(p / det)
-    opacity: Tensor
+    opacity: Tensor  # in this view: compensated for the blur if the scene is antialiased
     extent_x: Tensor  # half extents in pixels of the area where alpha >= ALPHA_MIN
     extent_y: Tensor
 
@@ -61,7 +61,8 @@ def perspective_derivative(centers: Tensor, camera: Camera) -> Tensor:
 def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
     """Project Gaussians (EWA, Zwicker et al. 2002) in float64.
 
-    Gaussians closer than the near plane, with an opacity below ALPHA_MIN, or with non-finite values are dropped.
+    Gaussians closer than the near plane, with an opacity in the view below ALPHA_MIN, or with non-finite values are
+    dropped.
     """
     pose = camera.world_to_camera.double()
     centers = scene.means.double() @ pose[:3, :3].T + pose[:3, 3]
@@ -72,10 +73,13 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
     factor = perspective_derivative(centers, camera) @ pose[:3, :3] @ rotations
     factor = factor * scene.scales[index].double().exp()[:, None, :]  # covariance without blur is factor factor^T
     m0, m1 = factor[:, 0], factor[:, 1]
-    p, q, r = (m0 * m0).sum(-1) + EPS2D, (m0 * m1).sum(-1), (m1 * m1).sum(-1) + EPS2D
+    eps2d = scene.rendering.eps2d
+    p, q, r = (m0 * m0).sum(-1) + eps2d, (m0 * m1).sum(-1), (m1 * m1).sum(-1) + eps2d
     minors = torch.linalg.cross(m0, m1).square().sum(-1)
-    det = minors + EPS2D * (p + r - EPS2D)  # Cauchy-Binet; p and r already include the blur
+    det = minors + eps2d * (p + r - eps2d)  # Cauchy-Binet; p and r already include the blur
     opacity = scene.opacities[index].double().sigmoid()
+    if scene.rendering.antialiased:
+        opacity = opacity * (minors / det).sqrt()
     reach = (2 * (opacity / ALPHA_MIN).log()).clamp_min(0).sqrt()
     columns = torch.stack(
         [

@@ -20,7 +20,6 @@ from torch import Tensor
 from sgsst_core.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
-    EPS2D,
     FRUSTUM_MARGIN,
     LOG2_ALPHA_MIN,
     RASTER_TILE,
@@ -267,10 +266,12 @@ class TritonRasterizer(Rasterizer):
         depths = torch.empty(count, dtype=torch.float64, device=self.device)
         counts = torch.empty(count, dtype=torch.int32, device=self.device)
         if count:
+            rendering = self.scene.rendering
             with on_device(self.device):
                 kernels.project[(-(-count // block),)](
                     *self._geometry, view, values, depths, counts, count,
-                    EPS2D=EPS2D, MARGIN=FRUSTUM_MARGIN, SUPPORT=-LOG2_ALPHA_MIN, POWER=TO_POWER_OF_TWO, BLOCK=block,
+                    EPS2D=rendering.eps2d, ANTIALIASED=rendering.antialiased, MARGIN=FRUSTUM_MARGIN,
+                    SUPPORT=-LOG2_ALPHA_MIN, POWER=TO_POWER_OF_TWO, BLOCK=block,
                 )  # fmt: skip
         ordered, order = torch.sort(depths, stable=True)
         first_slots = torch.zeros(count + 1, dtype=torch.int64, device=self.device)

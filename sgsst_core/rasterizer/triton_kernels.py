@@ -80,7 +80,8 @@ def _span_of_row(down, first, last, x, y, skew, u_scale, w_scale, support, exten
 @triton.jit
 def project(
     means, quats, scales, logits, camera, values, depths, counts, total,
-    EPS2D: tl.constexpr, MARGIN: tl.constexpr, SUPPORT: tl.constexpr, POWER: tl.constexpr, BLOCK: tl.constexpr,
+    EPS2D: tl.constexpr, ANTIALIASED: tl.constexpr, MARGIN: tl.constexpr, SUPPORT: tl.constexpr,
+    POWER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Run `projection.project` for BLOCK Gaussians per program, and count the raster tiles that each intersects.
 
@@ -136,7 +137,12 @@ def project(
     q = m00 * m10 + m01 * m11 + m02 * m12
     vr = m10 * m10 + m11 * m11 + m12 * m12
     minor0, minor1, minor2 = m01 * m12 - m02 * m11, m02 * m10 - m00 * m12, m00 * m11 - m01 * m10
-    det = minor0 * minor0 + minor1 * minor1 + minor2 * minor2 + EPS2D * (vp + vr) + EPS2D * EPS2D
+    unblurred = minor0 * minor0 + minor1 * minor1 + minor2 * minor2
+    det = unblurred + EPS2D * (vp + vr) + EPS2D * EPS2D
+    if ANTIALIASED:
+        opacity += 0.5 * tl.log(unblurred / det) / _LN2
+        support = opacity + SUPPORT
+        visible = visible & (support >= 0)
     vp, vr = vp + EPS2D, vr + EPS2D
     u_scale, w_scale = POWER * tl.sqrt(vr / det), POWER / tl.sqrt(vr)
     reach = tl.sqrt(tl.maximum(support, 0.0)) / POWER

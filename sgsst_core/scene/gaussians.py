@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,11 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import SceneError
+from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
+
+#: Names of a scene's tensors, in the order of its constructor.
+TENSORS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
 #: Number of Gaussians that are processed at a time.
 _CHUNK = 1 << 16
@@ -31,6 +35,7 @@ class Scene:
         opacities: [N], logits (as in files).
         sh_dc: [N, 3], degree-0 coefficients, which stylization optimizes.
         sh_rest: [N, K, 3] with K = 0, 3, 8 or 15 for SH degree 0 to 3.
+        rendering: Render mode, which every rasterizer follows.
 
     Example:
         >>> scene = load_scene("scene.ply").scene
@@ -44,6 +49,7 @@ class Scene:
     opacities: Tensor  # [N]
     sh_dc: Tensor  # [N, 3]
     sh_rest: Tensor | StoredHarmonics  # [N, K, 3]
+    rendering: Rendering = field(default=CLASSIC, kw_only=True)
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -55,7 +61,7 @@ class Scene:
 
     def subset(self, rows: Tensor) -> Scene:
         """Return a scene of the selected Gaussians only, given a mask [N] bool or indices."""
-        return Scene(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return replace(self, **{name: getattr(self, name)[rows] for name in TENSORS})
 
     def used_degree(self, rows: Tensor | None = None) -> int:
         """Return the highest SH degree with a non-zero coefficient, among the Gaussians of a mask [N] bool, or all."""
@@ -119,7 +125,7 @@ def checked_scene(scene: Scene, names: Mapping[str, str] | None = None) -> Scene
         raise SceneError("The scene has no Gaussians. Give at least one.")
     if all(values[name] is getattr(scene, name) for name in shapes):
         return scene
-    return Scene(**values)
+    return replace(scene, **values)
 
 
 def _checked(name: str, given: Any, shapes: tuple[tuple[int, ...], ...]) -> Any:

@@ -32,6 +32,7 @@ from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
@@ -160,6 +161,8 @@ def fingerprint(
             )
         else:
             digest.update(tensor.contiguous().numpy().data)
+    if scene.rendering != CLASSIC:
+        digest.update(repr(scene.rendering).encode())
     if len(mixture.images) > 1:
         digest.update(repr(mixture.weights).encode())
     if regions is not None:

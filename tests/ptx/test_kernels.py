@@ -13,6 +13,7 @@ from sgsst_core.features.statistics import fused_statistics, layer_statistics_re
 from sgsst_core.loss.statistics_terms import fused_add_style_gradient
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.scene.rendering import CLASSIC, Rendering
 from tests.ptx.driver import PtxDriver, compiled_kernels
 from tests.ptx.machine import Kernel
 from tests.ptx.memory import FaultError
@@ -20,9 +21,11 @@ from tests.sgsst_core.pictures import picture, relative_error
 from tests.small_scenes import ball, cameras
 
 
-@pytest.mark.parametrize("capability", [80, 90])
-def test_images_and_gradients_agree_with_reference(capability: int) -> None:
-    scene, camera = ball(150), cameras(1, 45, 37)[0]
+@pytest.mark.parametrize(
+    ("capability", "rendering"), [(80, CLASSIC), (90, CLASSIC), (80, Rendering("antialiased", 0.1))]
+)
+def test_images_and_gradients_agree_with_reference(capability: int, rendering: Rendering) -> None:
+    scene, camera = replace(ball(150), rendering=rendering), cameras(1, 45, 37)[0]
     reference = make_rasterizer("reference", scene)
     colors = torch.rand((len(scene), 3), generator=torch.Generator().manual_seed(0))
     image_gradient = picture(37, 45, dtype=torch.float32) - 0.5

@@ -17,8 +17,10 @@ from sgsst_core.files.formats import by_name
 from sgsst_core.files.photos import load_photo
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
 from tests.small_scenes import ball, cameras, wall, write_files
-from worker.capture import Capture, choose_axes, read_capture
+from worker.capture import Capture, about_rendering, choose_axes, read_capture
+from worker.inputs import read_scene_and_capture
 from worker.request import SceneRequest
 
 SCENE = wall()
@@ -159,3 +161,32 @@ def unstated(path: Path) -> None:
 def test_axes_that_a_file_states_are_kept(tmp_path: Path) -> None:
     source = spz(tmp_path, turned(SCENE))
     assert choose_axes(source) == ("auto", [])
+
+
+def test_plan_names_the_render_mode_and_doubts_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    write_scene(path, ball())
+    assert about_rendering(read_scene(path)) == []
+    (line,) = about_rendering(read_scene(path).rendered("antialiased", 0.1))
+    assert (line.item, line.decision) == ("rendering", "antialiased, eps2d 0.1")
+    assert line.reason == "as requested; the file states nothing"
+    write_scene(path, replace(ball(), rendering=Rendering("antialiased")))
+    (line,) = about_rendering(read_scene(path))
+    assert line.reason == "the comment 'SplatRenderMode: mip' says so; see --render-mode and --eps2d"
+    (line,) = about_rendering(read_scene(path).rendered("classic", None))
+    assert line.reason == "as requested; the file states antialiased, eps2d 0.3"
+    write_scene(path, replace(ball(), rendering=Rendering("2dgs")))
+    assert [line.decision for line in about_rendering(read_scene(path))] == [
+        "2dgs, eps2d 0.3",
+        "warning: drawn as Gaussians without thickness",
+    ]
+
+
+@pytest.mark.parametrize("mode", ["auto", "classic", "antialiased"])
+def test_job_is_drawn_in_the_requested_mode(tmp_path: Path, mode: RenderMode) -> None:
+    path, cameras, _ = write_files(tmp_path, replace(ball(), rendering=Rendering("antialiased", 0.2)))
+    source = SceneRequest(scene=path, cameras=cameras, render_mode=mode)
+    file, _ = read_scene_and_capture(source)
+    assert file.scene.rendering == (CLASSIC if mode == "classic" else Rendering("antialiased", 0.2))
+    file, _ = read_scene_and_capture(source.model_copy(update={"eps2d": 0.5}))
+    assert file.scene.rendering.eps2d == 0.5

@@ -13,7 +13,7 @@ from __future__ import annotations
 import mmap
 import os
 import socket
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_scene, stays_in_file
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.cost import OPTIMIZER_BYTES
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from worker.processes import home
 
@@ -119,7 +119,7 @@ def _held_bytes(growth: float) -> int | None:
 def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
     """Copy a scene to a memory file; return the scene mapped from there, and its location."""
     stored = file.scene.sh_rest if isinstance(file.scene.sh_rest, StoredHarmonics) else None
-    tensors = {name.name: getattr(file.scene, name.name) for name in fields(Scene)}
+    tensors = {name: getattr(file.scene, name) for name in TENSORS}
     arrays: dict[str, NDArray[Any]] = {name: value.numpy() for name, value in tensors.items() if value is not stored}
     if file.retained is not None:
         arrays["retained"] = file.retained
@@ -134,7 +134,7 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
         for name, (offset, _, _) in layout.items():
             data = np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8)
             memory[offset : offset + data.nbytes] = data.data
-    empty = Scene(*(torch.empty(0) for _ in fields(Scene)))
+    empty = Scene(*(torch.empty(0) for _ in TENSORS), rendering=file.scene.rendering)
     in_file = None if stored is None else stored.arguments
     shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, retained=None), in_file)
     return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared
@@ -152,7 +152,7 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     if shared.harmonics is not None:
         tensors["sh_rest"] = StoredHarmonics(*shared.harmonics)
-    return replace(shared.file, scene=Scene(**tensors), retained=retained)
+    return replace(shared.file, scene=replace(shared.file.scene, **tensors), retained=retained)
 
 
 def _check_room(path: Path, collectives: Collectives, sharing: int, growth: float) -> None:

@@ -24,7 +24,7 @@ from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.style import Style
 
@@ -128,7 +128,7 @@ def ordinary(count: int = 80, *, seed: int = 0, degree: int = 0) -> Scene:
 def among_ordinary(extreme: Scene, *, count: int = 80) -> Scene:
     """Return the extreme Gaussians followed by ordinary Gaussians, whose pixels must stay correct."""
     rest = ordinary(count, degree=extreme.sh_degree)
-    return Scene(*(torch.cat([getattr(extreme, name), getattr(rest, name)]) for name in Scene.__dataclass_fields__))
+    return Scene(*(torch.cat([getattr(extreme, name), getattr(rest, name)]) for name in TENSORS))
 
 
 def repeated(
@@ -348,5 +348,5 @@ def texture(height: int, width: int, seed: int = 0) -> Tensor:
 def without(scene: Scene, rows: Tensor) -> tuple[Scene, Tensor]:
     """Remove rows ([N] bool) from a scene; return the new scene, and the mask [N] bool of the remaining rows."""
     others = ~rows
-    columns = {name: getattr(scene, name)[others] for name in Scene.__dataclass_fields__}
+    columns = {name: getattr(scene, name)[others] for name in TENSORS}
     return replace(scene, **columns), others

@@ -22,7 +22,7 @@ from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.choice import OrbitRequest, make_orbit
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held
 
 _GROUP: Group = "files and orbits"
@@ -120,7 +120,7 @@ def _position_step(scene: Scene, format: SceneFormat) -> float:
 
 
 def _finite(scene: Scene) -> bool:
-    return all(bool(held(getattr(scene, name)).isfinite().all()) for name in Scene.__dataclass_fields__)
+    return all(bool(held(getattr(scene, name)).isfinite().all()) for name in TENSORS)
 
 
 def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:

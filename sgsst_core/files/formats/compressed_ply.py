@@ -28,7 +28,9 @@ from sgsst_core.files.formats.quantized import (
     with_largest,
     without_largest,
 )
+from sgsst_core.files.formats.render_tag import comment_lines, ply_tag
 from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.scene.rendering import Rendering
 
 #: Number of Gaussians per chunk. Each chunk has its own quantization bounds.
 CHUNK_ROWS = 256
@@ -95,7 +97,7 @@ def _read_header(start: FileStart) -> CompressedPlyHeader:
         )
     coefficients = _sh_coefficients(path, header, vertex.count)
     element_offsets(path, header)
-    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, coefficients, header)
+    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, coefficients, header, tag=ply_tag(header))
 
 
 def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:
@@ -177,14 +179,14 @@ def _unpack_harmonics(rows: NDArray[Any], into: NDArray[np.float32]) -> None:
         into[:, i % coefficients, i // coefficients] = _HARMONICS[rows[f"f_rest_{i}"]]
 
 
-def _write(output: BinaryIO, arrays: Arrays) -> None:
+def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     """Write a compressed PLY.
 
     Gaussians are sorted along a space-filling curve, so that chunks are compact and their bounds are tight.
     """
     count, coefficients = arrays["sh_rest"].shape[:2]
     order = along_curve(arrays["means"])
-    output.write(_header(count, coefficients))
+    output.write(_header(count, coefficients, rendering))
     blocks = [order[start : start + _BLOCK_ROWS] for start in range(0, count, _BLOCK_ROWS)]
     packed = []
     for rows in blocks:
@@ -200,8 +202,9 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
             output.write(np.clip(np.floor(rest * 32 + 128), 0, 255).astype(np.uint8).tobytes())
 
 
-def _header(count: int, coefficients: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // CHUNK_ROWS)}"]
+def _header(count: int, coefficients: int, rendering: Rendering) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", *comment_lines(rendering)]
+    lines += [f"element chunk {-(-count // CHUNK_ROWS)}"]
     lines += [f"property float {name}" for name in _BOUNDS]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
     if coefficients:

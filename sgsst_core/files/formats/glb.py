@@ -7,6 +7,8 @@ https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussi
 
 glTF has y up, z forward and x left. Scenes are rotated by 180 degrees about z from and to the axes of a PLY, after the
 transformation of the node that holds them.
+
+The specification does not define antialiasing. Written files state the render mode in the `extras` of the primitive.
 """
 
 from __future__ import annotations
@@ -24,8 +26,10 @@ from numpy.typing import NDArray
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.formats.frame import Frame
 from sgsst_core.files.formats.quantized import SH_C0
+from sgsst_core.files.formats.render_tag import extras_of, extras_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
 from sgsst_core.files.json_files import json_numbers
+from sgsst_core.scene.rendering import Rendering
 
 _MAGIC = b"glTF"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
@@ -199,6 +203,7 @@ def _parsed(
         {name: accessor(*attribute) for name, attribute in _ATTRIBUTES.items()},
         [accessor(name, "VEC3") for name in _HARMONICS[:coefficients]],
         Frame.of(_AXES @ _node_matrix(document, mesh)),
+        tag=extras_tag(primitive.get("extras"), "the extras of the GLB"),
     )
 
 
@@ -295,7 +300,7 @@ def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[s
         yield slice(start, stop), values
 
 
-def _write(output: BinaryIO, arrays: Arrays) -> None:
+def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     """Write a GLB with float32 attributes, and colors for programs that show only points.
 
     Raises:
@@ -305,7 +310,7 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
     Frame.of(_AXES).apply(arrays)
     columns = _columns(arrays)
     data_bytes = sum(column.nbytes for _, column in columns)
-    document = _document(columns, data_bytes)
+    document = _document(columns, data_bytes, extras_of(rendering))
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     length = _HEADER.size + 2 * _CHUNK.size + len(text) + data_bytes
@@ -338,7 +343,7 @@ def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
     return [*found, ("COLOR_0", np.rint(255 * colors).astype(np.uint8))]
 
 
-def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int) -> dict[str, Any]:
+def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int, extras: dict[str, Any]) -> dict[str, Any]:
     """Return the glTF document of a scene whose columns follow each other in the data."""
     accessors: list[dict[str, Any]] = []
     views, offset = [], 0
@@ -354,6 +359,7 @@ def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int) -> dict[
         "attributes": {name: index for index, (name, _) in enumerate(columns)},
         "mode": _POINTS,
         "extensions": {_EXTENSION: _SUPPORTED},
+        **({"extras": extras} if extras else {}),
     }
     return {
         "asset": {"version": "2.0", "generator": "sgsst"},

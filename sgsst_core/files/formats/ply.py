@@ -18,7 +18,9 @@ import numpy as np
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.ply_header import PlyHeader, check_length, read_header
+from sgsst_core.files.formats.render_tag import comment_lines, ply_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, SceneFormat, SceneHeader
+from sgsst_core.scene.rendering import Rendering
 
 #: Properties of the scene's tensors; opacity and f_rest_* follow.
 PROPERTIES = {
@@ -58,8 +60,9 @@ def _read_header(start: FileStart) -> PlySceneHeader:
     stored, sources = _check_properties(start.path, header)
     check_length(start.path, header)
     coefficients = min(stored, COEFFICIENTS[3])
+    notes = _notes(coefficients < stored, sources)
     return PlySceneHeader(
-        PLY, header.vertex.count, coefficients, header, stored, sources, notes=_notes(coefficients < stored, sources)
+        PLY, header.vertex.count, coefficients, header, stored, sources, notes=notes, tag=ply_tag(header)
     )
 
 
@@ -131,12 +134,12 @@ def _likely_content(header: PlyHeader) -> str:
     return "something else" if vertex else "a PLY without vertices"
 
 
-def _write(output: BinaryIO, arrays: Arrays) -> None:
+def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     """Write a binary little-endian float32 PLY with the usual order of properties. Normals are 0."""
     count, coefficients = arrays["sh_rest"].shape[:2]
     names = [*PROPERTIES["means"], "nx", "ny", "nz", *PROPERTIES["sh_dc"]]
     names += [*(f"f_rest_{i}" for i in range(3 * coefficients)), "opacity", *PROPERTIES["scales"], *PROPERTIES["quats"]]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0", *comment_lines(rendering), f"element vertex {count}"]
     lines += [f"property float {name}" for name in names]
     output.write("\n".join([*lines, "end_header", ""]).encode())
     for start in range(0, count, _BLOCK_ROWS):

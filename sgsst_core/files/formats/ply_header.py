@@ -82,6 +82,16 @@ class PlyHeader:
         return not self.byte_order
 
     @property
+    def newline(self) -> bytes:
+        """Return the line end of the header."""
+        return self.raw[3:5] if self.raw[3:5] == b"\r\n" else self.raw[3:4]
+
+    @property
+    def comments(self) -> list[str]:
+        """Return the comments, without their keyword."""
+        return [comment for line in self.raw.split(self.newline) if (comment := comment_of(line)) is not None]
+
+    @property
     def names(self) -> list[str]:
         """Return the names of the elements in the file's order."""
         return [element.name for element in self.elements]
@@ -90,6 +100,12 @@ class PlyHeader:
     def vertex(self) -> PlyElement:
         """Return the element of the Gaussians; raise ValueError if there is none."""
         return self.elements[self.names.index("vertex")]
+
+
+def comment_of(line: bytes) -> str | None:
+    """Return the comment in a line of a header, without its keyword; None if the line is none."""
+    keyword, _, comment = line.strip().partition(b" ")
+    return comment.decode("latin-1").strip() if keyword == b"comment" else None
 
 
 def read_header(path: Path) -> PlyHeader:

@@ -10,6 +10,9 @@ from typing import BinaryIO, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sgsst_core.files.formats.render_tag import UNTAGGED, RenderTag
+from sgsst_core.scene.rendering import Rendering
+
 #: SH coefficients per color channel above degree 0, by SH degree.
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 
@@ -51,12 +54,14 @@ class SceneHeader:
         count: Number of Gaussians.
         coefficients: SH coefficients per color channel above degree 0.
         notes: Notes on what is not read, or read in another way than stored.
+        tag: Render mode that the file states.
     """
 
     format: SceneFormat
     count: int
     coefficients: int
     notes: tuple[str, ...] = field(default=(), kw_only=True)
+    tag: RenderTag = field(default=UNTAGGED, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -77,8 +82,8 @@ class SceneFormat:
         read: Reader, which fills the arrays of a scene, allocated for the header's numbers, and may return notes beyond
             the header's. It need not check for non-finite values. None for PLY, whose scenes are written back with all
             other data (`scene_file`).
-        write: Writer of a scene's arrays, which raises an OutputError without path if it cannot represent them. None if
-            the format is only read.
+        write: Writer of a scene's arrays and its render mode, if the format can state one. It raises an OutputError
+            without path if it cannot represent the arrays. None if the format is only read.
         shown: Whether the page shows scenes of this format (`api/static/viewer`).
         magic: First bytes of all files of a format that the page does not show, so that it can say so.
         media_type: Media type of downloads.
@@ -90,7 +95,7 @@ class SceneFormat:
     read_header: Callable[[FileStart], SceneHeader]
     bytes_per_gaussian: int
     read: Callable[[OpenScene, SceneHeader, Arrays], tuple[str, ...] | None] | None = None
-    write: Callable[[BinaryIO, Arrays], None] | None = None
+    write: Callable[[BinaryIO, Arrays, Rendering], None] | None = None
     shown: bool = False
     magic: bytes = b""
     media_type: str = "application/octet-stream"

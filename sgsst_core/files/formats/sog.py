@@ -3,7 +3,9 @@
 Pixel i of each image belongs to Gaussian i. Positions are 16-bit steps on a logarithmic scale, in two images. Scales
 and colors are indices into codebooks of 256 values. Rotations have three components of 8 bits. SH coefficients are a
 palette of up to 65,536 vectors. Version 1 has linear steps between bounds in place of codebooks. The layout is that of
-https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. Axes are those of the PLY.
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. Axes are those of the PLY. The field
+`model` of meta.json is the render mode, as splat-transform writes it. Written files have their blur in `extras`, which
+is for programs' own values.
 """
 
 from __future__ import annotations
@@ -35,9 +37,11 @@ from sgsst_core.files.formats.quantized import (
     with_largest,
     without_largest,
 )
+from sgsst_core.files.formats.render_tag import RenderTag, extras_of, extras_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
 from sgsst_core.files.formats.unsupported import advice, is_checkpoint
 from sgsst_core.files.json_files import json_numbers
+from sgsst_core.scene.rendering import Rendering
 
 #: Name of the file that describes a scene, in an archive or a folder.
 META_NAME = "meta.json"
@@ -220,7 +224,16 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
         if width not in _COEFFICIENTS_BY_WIDTH:
             raise ValueError(f"width of {names['shN'][0]}: {width}")
         coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"], 1)[0]
-    return SogHeader(SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics)
+    return SogHeader(
+        SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, tag=_tag(meta)
+    )
+
+
+def _tag(meta: dict[str, Any]) -> RenderTag:
+    """Return the render mode that meta.json states."""
+    extras = meta.get("extras")
+    own = extras if isinstance(extras, dict) else {}
+    return extras_tag({**own, "model": meta.get("model", "default")}, "meta.json")
 
 
 def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
@@ -324,7 +337,7 @@ def _blocks(count: int) -> list[slice]:
     return [slice(start, min(start + _BLOCK_ROWS, count)) for start in range(0, count, _BLOCK_ROWS)]
 
 
-def _write(output: BinaryIO, arrays: Arrays) -> None:
+def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     """Write a SOG archive. Gaussians are sorted along a space-filling curve, which compresses better.
 
     Raises:
@@ -357,6 +370,9 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
     }
+    extras = extras_of(rendering)
+    meta |= {"model": extras.pop("model")} if "model" in extras else {}
+    meta |= {"extras": extras} if extras else {}
     if coefficients:
         vectors, labels = palette(sorted_arrays["sh_rest"].reshape(count, -1), _palette_size(count))
         harmonics = value_codebook(vectors)

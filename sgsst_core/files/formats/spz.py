@@ -10,6 +10,9 @@ zstd stream per attribute. SH coefficients of degree 4 are skipped.
 Axes are a matter of convention. Most programs store those of the PLY (RDF: x right, y down, z forward) unchanged; the
 format's library stores RUB (x right, y up, z backward) by default. An extension of the format states them. Written
 files have the axes of the PLY, and say so. Files that state nothing are read as RDF.
+
+A flag states that a scene was trained antialiased. Spark sets it for all scenes. It writes versions up to 3 without
+extension records, so the flag counts only in other files.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, byte_table, opacity_bytes, with_largest, without_largest
+from sgsst_core.files.formats.render_tag import UNTAGGED, RenderTag, stated
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
     Arrays,
@@ -36,6 +40,7 @@ from sgsst_core.files.formats.scene_format import (
     SceneHeader,
 )
 from sgsst_core.files.formats.unsupported import advice
+from sgsst_core.scene.rendering import Rendering
 
 Axes = Literal["rub", "rdf"]
 #: Requested axes; "auto" for those that the file states, else RDF.
@@ -60,7 +65,7 @@ _AXES_EXTENSION = 0xADBE0003
 _AXES_NUMBERS: dict[int, Axes] = {0: "rub", 4: "rub", 6: "rdf"}
 #: Extension record of written files, which states the axes of a PLY.
 _AXES_RECORD = struct.pack("<III", _AXES_EXTENSION, 4, 6)
-_HAS_EXTENSIONS = 2
+_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 #: Maximum number of unknown extensions that a note names.
 _NOTED_EXTENSIONS = 8
 
@@ -148,7 +153,18 @@ def _gzip_header(file_start: FileStart) -> SpzHeader:
         )
     extended = bool(start[14] & _HAS_EXTENSIONS)
     drawn = COEFFICIENTS[min(degree, 3)]
-    return SpzHeader(SPZ, count, drawn, size, version, degree, fractional_bits, sections, extended=extended)
+    return SpzHeader(
+        SPZ,
+        count,
+        drawn,
+        size,
+        version,
+        degree,
+        fractional_bits,
+        sections,
+        extended=extended,
+        tag=_tag(start[14], believed=extended),
+    )
 
 
 def _zstd_header(file_start: FileStart) -> SpzHeader:
@@ -192,7 +208,21 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
         tuple(streams),
         stated_axes=axes,
         notes=_notes(degree, records),
+        tag=_tag(head[14], believed=True),
     )
+
+
+def _tag(flags: int, *, believed: bool) -> RenderTag:
+    """Return the render mode that flags state, with a warning instead if they are not believed."""
+    if not flags & _ANTIALIASED:
+        return UNTAGGED
+    if believed:
+        return stated("antialiased", "the file's flag")
+    reason = (
+        "the file's flag says antialiased, but Spark sets it for all scenes; if the scene was trained so, add "
+        "--render-mode antialiased"
+    )
+    return RenderTag(warnings=(("classic", reason),))
 
 
 def _extension_records(data: bytes) -> list[tuple[int, bytes]]:
@@ -433,7 +463,7 @@ def _decode_harmonics(data: NDArray[np.uint8], stored: int) -> NDArray[Any]:
     return _HARMONICS[data].reshape(-1, stored, 3)[:, : COEFFICIENTS[3]]
 
 
-def _write(output: BinaryIO, arrays: Arrays) -> None:
+def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     """Write SPZ version 3, which most programs can read, with all 8 bits of SH coefficients.
 
     Raises:
@@ -441,7 +471,7 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
     """
     deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
     bits = _fractional_bits(arrays["means"])
-    output.write(deflate.compress(_first_fields(3, arrays, bits) + bytes(1)))
+    output.write(deflate.compress(_first_fields(3, arrays, bits, rendering) + bytes(1)))
     for section in _encoded_sections(arrays, bits):
         for block in section:
             output.write(deflate.compress(block))
@@ -449,7 +479,7 @@ def _write(output: BinaryIO, arrays: Arrays) -> None:
     output.write(deflate.flush())
 
 
-def _write_version_4(output: BinaryIO, arrays: Arrays) -> None:
+def _write_version_4(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     """Write SPZ version 4, with all 8 bits of SH coefficients.
 
     Raises:
@@ -467,18 +497,19 @@ def _write_version_4(output: BinaryIO, arrays: Arrays) -> None:
         if size:
             streams.append((size, compressed))
     table = 32 + len(_AXES_RECORD)
-    output.write(_first_fields(4, arrays, bits) + struct.pack("<BI12x", len(streams), table) + _AXES_RECORD)
+    output.write(_first_fields(4, arrays, bits, rendering) + struct.pack("<BI12x", len(streams), table) + _AXES_RECORD)
     for size, compressed in streams:
         output.write(struct.pack("<QQ", len(compressed), size))
     for _, compressed in streams:
         output.write(compressed)
 
 
-def _first_fields(version: int, arrays: Arrays, bits: int) -> bytes:
+def _first_fields(version: int, arrays: Arrays, bits: int, rendering: Rendering) -> bytes:
     """Return the first 15 bytes of a header, which versions 2 to 4 share."""
     count, coefficients = arrays["sh_rest"].shape[:2]
     degree = next(degree for degree, number in COEFFICIENTS.items() if number == coefficients)
-    return struct.pack("<4sIIBBB", _MAGIC, version, count, degree, bits, _HAS_EXTENSIONS)
+    flags = _HAS_EXTENSIONS | (_ANTIALIASED if rendering.antialiased else 0)
+    return struct.pack("<4sIIBBB", _MAGIC, version, count, degree, bits, flags)
 
 
 def _encoded_sections(arrays: Arrays, bits: int) -> Iterator[Iterator[bytes]]:

@@ -501,7 +501,7 @@ def test_a_written_scene_reads_back(tmp_path: Path, degree: int) -> None:
     generator = torch.Generator().manual_seed(1)
     shapes = {"means": (7, 3), "quats": (7, 4), "scales": (7, 3), "opacities": (7,), "sh_dc": (7, 3)}
     shapes["sh_rest"] = (7, (degree + 1) ** 2 - 1, 3)
-    scene = Scene(**{name: torch.randn(shape, generator=generator) for name, shape in shapes.items()})
+    scene = Scene(*(torch.randn(shape, generator=generator) for shape in shapes.values()))
     write_scene(tmp_path / "new.ply", scene)
     back = read_scene(tmp_path / "new.ply").scene
     assert back.sh_degree == degree

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,13 @@ from sgsst_core.files.formats.quantized import OPACITY_LOGITS
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.files.splats import scene_of_splats
 from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from tests.sgsst_core.trainer_scenes import splats_of, write_gsplat, write_nerfstudio
 from tests.small_scenes import wall
 
 
 def same(first: Scene, second: Scene) -> bool:
-    return all(torch.equal(getattr(first, field.name), getattr(second, field.name)) for field in fields(Scene))
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in TENSORS)
 
 
 def assert_equal(first: Any, second: Any) -> None:

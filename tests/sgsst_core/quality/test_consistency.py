@@ -29,7 +29,7 @@ from sgsst_core.quality.consistency import (
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, look_at, resized
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 #: A power of two, so that positions of planes stay exact when their world is moved by whole numbers.
@@ -60,7 +60,7 @@ def plane(half_width: float, half_height: float, depth: float, color: Tensor | N
 
 
 def joined(first: Scene, second: Scene) -> Scene:
-    return Scene(*(torch.cat([getattr(first, f), getattr(second, f)]) for f in Scene.__dataclass_fields__))
+    return Scene(*(torch.cat([getattr(first, f), getattr(second, f)]) for f in TENSORS))
 
 
 def camera(position: tuple[float, float, float], target: tuple[float, float, float] = (0, 0, DEPTH)) -> Camera:

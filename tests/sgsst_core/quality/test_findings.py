@@ -24,7 +24,7 @@ from sgsst_core.quality.findings import (
 )
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -164,7 +164,7 @@ def test_unseen_and_hardly_seen_gaussians_are_those_of_the_blend_weights(tmp_pat
     scene.means[:10, 2] = -3.0  # behind every camera
     scene.means[10:12] = torch.tensor([0.0, 0.0, 5.0])  # faint, behind two opaque layers
     front = replace(wall(), means=wall().means * torch.tensor([0.9, 0.9, 0.9]))
-    scene = Scene(*(torch.cat([getattr(scene, n), getattr(front, n)]) for n in Scene.__dataclass_fields__))
+    scene = Scene(*(torch.cat([getattr(scene, n), getattr(front, n)]) for n in TENSORS))
     found = seen_by(tmp_path, scene, cameras())
     file = stored(tmp_path, scene)
     rasterizer = make_rasterizer("reference", file.scene)

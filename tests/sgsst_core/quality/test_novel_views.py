@@ -30,7 +30,7 @@ from sgsst_core.quality.novel_views import MOST_VIEWS, NovelViews
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
-from sgsst_core.scene.gaussians import Scene, sampled
+from sgsst_core.scene.gaussians import TENSORS, Scene, sampled
 from sgsst_core.scene.pyramid import resize_area
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Style
@@ -281,7 +281,7 @@ def test_what_is_kept_changes_nothing_and_the_job_s_loss_is_left_alone(network, 
 def test_consistency_does_not_see_what_cannot_be_seen(network, lpips):
     front, back = wall(), wall()
     back = replace(back, means=back.means * torch.tensor([1.0, 1, -1]))  # behind all cameras
-    both = Scene(*(torch.cat([getattr(front, f), getattr(back, f)]) for f in Scene.__dataclass_fields__))
+    both = Scene(*(torch.cat([getattr(front, f), getattr(back, f)]) for f in TENSORS))
     measured = novel_views(both, cameras(10), network, lpips=lpips)
     before = measured.measure(both.sh_dc)
     noise = torch.randn(len(back), 3, generator=torch.Generator().manual_seed(0))
@@ -318,7 +318,7 @@ def test_a_view_inside_of_something_is_not_measured(network):
     centered = shell.means - torch.tensor([0.0, 0, 3])
     shell = replace(shell, means=centered * (0.4 / 0.7), scales=torch.full_like(shell.scales, math.log(0.04)))
     room = wall()
-    both = Scene(*(torch.cat([getattr(room, f), getattr(shell, f)]) for f in Scene.__dataclass_fields__))
+    both = Scene(*(torch.cat([getattr(room, f), getattr(shell, f)]) for f in TENSORS))
     empty, filled = novel_views(room, views, network), novel_views(both, views, network)
     assert names(empty.cameras) == names(filled.cameras) == ["0–1", "1–2", "2–3"]
     assert (empty.views, empty.pairs[SHORT_RANGE]) == ([0, 1], [(0, 1), (1, 2)])

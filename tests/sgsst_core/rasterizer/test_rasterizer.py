@@ -31,6 +31,7 @@ from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, check_in
 from sgsst_core.rasterizer.vectors import as_float
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import Rendering
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (
@@ -66,6 +67,8 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "one pixel": lambda: (cloud(seed=6), camera(1, 1)),
     "one row": lambda: (cloud(seed=7), camera(333, 1)),
     "close by": lambda: (cloud(seed=8, depth=0.3), camera()),
+    "antialiased": lambda: (replace(cloud(900, seed=14, log_scale=-4.0), rendering=Rendering("antialiased")), camera()),
+    "other blur": lambda: (replace(_needles(), rendering=Rendering("antialiased", 0.1)), camera(97, 61)),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cuda import CudaRasterizer, gsplat_alpha_max
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
+from sgsst_core.scene.rendering import CLASSIC, Rendering
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, pixels_like, rotated_pose
 
@@ -33,9 +35,11 @@ def test_gsplat_renders() -> None:
 @pytest.mark.gpu
 @needs_gpu
 @needs_gsplat
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_cuda_agrees_with_the_reference(seed: int) -> None:
-    scene, view = cloud(800, seed=seed), camera(130, 75, pose=rotated_pose())
+@pytest.mark.parametrize(
+    ("seed", "rendering"), [(0, CLASSIC), (1, CLASSIC), (2, CLASSIC), (3, Rendering("antialiased", 0.1))]
+)
+def test_cuda_agrees_with_the_reference(seed: int, rendering: Rendering) -> None:
+    scene, view = replace(cloud(800, seed=seed), rendering=rendering), camera(130, 75, pose=rotated_pose())
     background = (0.2, 0.5, 1.0)
     cuda = CudaRasterizer(scene, background=background)
     reference = ReferenceRasterizer(scene, background=background, alpha_max=cuda.alpha_max)

@@ -29,6 +29,7 @@ from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import Rendering
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, rotated_pose
 
@@ -77,6 +78,11 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "one row": lambda: (cloud(100, seed=7), camera(133, 1)),
     "close by": lambda: (cloud(100, seed=8, depth=0.3), camera(33, 20)),
     "far from the origin": far_away,
+    "antialiased": lambda: (
+        replace(cloud(300, seed=14, log_scale=-4.0), rendering=Rendering("antialiased")),
+        camera(40, 35),
+    ),
+    "antialiased needles": lambda: (replace(needles(), rendering=Rendering("antialiased", 0.1)), camera(49, 31)),
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from sgsst_core.refine.split import (
     split,
     split_axis,
 )
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rotations import unit_rotations
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.splat_scenes import camera, cloud, single
@@ -100,11 +100,11 @@ def test_unsplit_gaussians_and_inherited_properties_are_bit_identical(monkeypatc
     for name in ("quats", "sh_dc", "sh_rest"):
         assert torch.equal(getattr(children, name), getattr(scene, name)[parents])
     unsplit = (piece_counts(pieces) == 1)[parents]
-    for field in fields(Scene):
-        assert torch.equal(getattr(children, field.name)[unsplit], getattr(scene, field.name)[parents][unsplit])
+    for name in TENSORS:
+        assert torch.equal(getattr(children, name)[unsplit], getattr(scene, name)[parents][unsplit])
     monkeypatch.setattr(module, "_CHUNK", 1 << 18)
     again = split(scene, pieces)
-    assert all(torch.equal(getattr(again, field.name), getattr(children, field.name)) for field in fields(Scene))
+    assert all(torch.equal(getattr(again, name), getattr(children, name)) for name in TENSORS)
     assert split(scene, torch.ones(40, 3, dtype=torch.uint8)) is scene
 
 
@@ -136,8 +136,8 @@ def test_extreme_gaussians_have_finite_children_or_are_not_split() -> None:
     pieces = torch.ones(count, 3, dtype=torch.uint8)
     pieces[possible] = torch.tensor([4, 3, 5], dtype=torch.uint8)
     children = split(scene, pieces)
-    for field in fields(Scene):
-        assert bool(torch.isfinite(getattr(children, field.name)).all()), field.name
+    for name in TENSORS:
+        assert bool(torch.isfinite(getattr(children, name)).all()), name
     opacity = torch.sigmoid(children.opacities.double())
     assert bool((opacity <= torch.sigmoid(scene.opacities.double())[parents_of(pieces)]).all())
     pieces[5, 0] = 3

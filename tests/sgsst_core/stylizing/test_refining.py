@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import choice
 from sgsst_core.refine.choice import LEAST_PSNR
 from sgsst_core.refine.split import Refinement, parents_of, piece_counts
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import Settings, make_settings
 from sgsst_core.stylizing import refining
 from sgsst_core.stylizing.loop import run
@@ -39,10 +39,7 @@ def large_wall() -> Scene:
         sh_dc=before.sh_dc * 0.3,
     )
     before.scales[0] = torch.tensor([0.9, 0.002, 0.002]).log()
-    joined = {
-        field.name: torch.cat([getattr(part, field.name) for part in (behind, before)]) for field in fields(Scene)
-    }
-    return Scene(**joined)
+    return Scene(*(torch.cat([getattr(part, name) for part in (behind, before)]) for name in TENSORS))
 
 
 def settings(**values: object) -> Settings:

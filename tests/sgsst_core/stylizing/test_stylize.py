@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from sgsst_core.errors import CameraError, ImageError, SceneError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import as_scene
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.sgsst_core.trainer_scenes import splats_of, write_gsplat, write_nerfstudio
@@ -52,7 +52,7 @@ def run(scene: Any, weights: BackboneWeights, **settings: Any) -> Any:
 
 
 def copied(scene: Scene) -> Scene:
-    return Scene(*(held(getattr(scene, field.name)).clone() for field in fields(Scene)))
+    return Scene(*(held(getattr(scene, name)).clone() for name in TENSORS))
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -67,10 +67,10 @@ def test_a_scene_comes_back_in_its_form_with_new_colors(
     after, alone = as_scene(result), run(before, tiny_weights)
     assert torch.equal(after.sh_dc, alone.sh_dc)
     assert not torch.equal(after.sh_dc, before.sh_dc)
-    for field in fields(Scene):
-        assert torch.equal(getattr(before, field.name), getattr(kept, field.name)), "the given scene stays"
-        if field.name != "sh_dc":
-            assert torch.equal(getattr(after, field.name), getattr(before, field.name))
+    for name in TENSORS:
+        assert torch.equal(getattr(before, name), getattr(kept, name)), "the given scene stays"
+        if name != "sh_dc":
+            assert torch.equal(getattr(after, name), getattr(before, name))
     if form in ("splats", "activated", "numpy", "parameters"):
         assert {key: (value.shape, value.dtype) for key, value in result.items()} == {
             key: (value.shape, value.dtype) for key, value in given.items()
@@ -92,8 +92,8 @@ def test_split_and_attenuated_scenes_come_back_in_their_form(
     after = as_scene(result)
     assert len(after) > len(before)
     alone = run(before, tiny_weights, refine=2, sh_attenuation=0.25)
-    for field in fields(Scene):
-        found, wanted = (held(getattr(each, field.name)) for each in (after, alone))
+    for name in TENSORS:
+        found, wanted = (held(getattr(each, name)) for each in (after, alone))
         tolerance = 1e-5 if form == "activated" else 0  # exp and log round
         torch.testing.assert_close(found, wanted, rtol=tolerance, atol=tolerance)
     if isinstance(given, dict):
@@ -103,9 +103,7 @@ def test_split_and_attenuated_scenes_come_back_in_their_form(
         suffix = "ckpt" if form == "nerfstudio" else "ply"
         save(tmp_path / f"out.{suffix}", result)
         saved = as_scene(load_scene(tmp_path / f"out.{suffix}"))
-        assert all(
-            torch.equal(held(getattr(saved, each.name)), held(getattr(after, each.name))) for each in fields(Scene)
-        )
+        assert all(torch.equal(held(getattr(saved, name)), held(getattr(after, name))) for name in TENSORS)
     if form == "ply":
         with pytest.raises(SceneError, match="split already"):
             run(result, tiny_weights, refine=2)
@@ -158,7 +156,7 @@ def test_unusable_arguments_are_refused_in_a_sentence(tiny_weights: BackboneWeig
 
 def test_arrays_of_numpy_make_a_scene(tiny_weights: BackboneWeights) -> None:
     scene = wall(sh_degree=1)
-    arrays = Scene(*(getattr(scene, field.name).double().numpy() for field in fields(Scene)))
+    arrays = Scene(*(getattr(scene, name).double().numpy() for name in TENSORS))
     arrays = replace(arrays, opacities=arrays.opacities[:, None], sh_dc=arrays.sh_dc[:, None])
     view = cameras(1)[0]
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])

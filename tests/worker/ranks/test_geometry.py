@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import hashlib
 import os
-from dataclasses import fields
 from pathlib import Path
 from unittest.mock import patch
 
@@ -20,7 +19,7 @@ from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
@@ -33,7 +32,7 @@ linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory 
 
 def digest(scene: Scene) -> str:
     """Return a hash of all tensors of a scene."""
-    return hashlib.sha256(b"".join(getattr(scene, field.name).numpy().tobytes() for field in fields(Scene))).hexdigest()
+    return hashlib.sha256(b"".join(getattr(scene, name).numpy().tobytes() for name in TENSORS)).hexdigest()
 
 
 def shared(collectives: Collectives, path: Path, drop: bool) -> tuple[str, bool, int, int, int]:

@@ -6,7 +6,6 @@ import copy
 import struct
 import tracemalloc
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held
 from tests.small_scenes import wall
 
@@ -36,7 +35,7 @@ def scene_of(data: gsply.GSData | None) -> Scene:
 
 
 def gsply_of(scene: Scene) -> gsply.GSData:
-    arrays = {field.name: getattr(scene, field.name).numpy() for field in fields(scene)}
+    arrays = {name: getattr(scene, name).numpy() for name in TENSORS}
     rest = arrays["sh_rest"]
     return gsply.GSData.from_arrays(
         means=arrays["means"],
@@ -51,13 +50,13 @@ def gsply_of(scene: Scene) -> gsply.GSData:
 
 def assert_close(found: Scene, expected: Scene, *, opacities: float = 1.1e-3, others: float = 3e-6) -> None:
     """Assert that scenes are equal up to rounding and the sign of quaternions, and that opacities are finite."""
-    for field in fields(Scene):
-        first, second = getattr(found, field.name).double(), getattr(expected, field.name).double()
+    for name in TENSORS:
+        first, second = getattr(found, name).double(), getattr(expected, name).double()
         tolerance = others
-        if field.name == "quats":
+        if name == "quats":
             first, second = (torch.nn.functional.normalize(each, dim=1) for each in (first, second))
             second = second * (first * second).sum(dim=1, keepdim=True).sign()
-        if field.name == "opacities":
+        if name == "opacities":
             assert bool(torch.isfinite(first).all())
             first, second, tolerance = first.sigmoid(), second.sigmoid(), opacities
         torch.testing.assert_close(first, second, rtol=tolerance, atol=tolerance)
@@ -105,7 +104,7 @@ def check_damage(path: Path, good: bytes, wrap: Callable[[bytes], bytes] = bytes
             scene = read_scene(path).scene
         except SceneError:
             continue
-        assert all(bool(torch.isfinite(held(getattr(scene, field.name))).all()) for field in fields(scene)), trial
+        assert all(bool(torch.isfinite(held(getattr(scene, name))).all()) for name in TENSORS), trial
 
 
 def ksplat(scene: Scene, level: int, bucket_size: int = 256) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ import torch
 from sgsst_core.files.formats.frame import Frame, basis
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import spherical_harmonics
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
@@ -23,9 +23,9 @@ def matrix(scale: float = 1.0) -> np.ndarray:
 
 
 def applied(frame: Frame, scene: Scene) -> Scene:
-    arrays = {field.name: getattr(scene, field.name).numpy().copy() for field in fields(scene)}
+    arrays = {name: getattr(scene, name).numpy().copy() for name in TENSORS}
     frame.apply(arrays)
-    return Scene(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+    return Scene(*(torch.from_numpy(array) for array in arrays.values()))
 
 
 def test_basis_is_that_of_the_renderer() -> None:
