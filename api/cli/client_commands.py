@@ -137,7 +137,7 @@ def download(
         "stylized.ply"
     ),
     out: Annotated[Path | None, typer.Option(help="File to write, or folder for 'all'. [default: NAME]")] = None,
-    form: Annotated[
+    format: Annotated[
         ExtraName | None,
         typer.Option("--format", help="Compressed format of stylized.ply. [default: from the ending of --out]"),
     ] = None,
@@ -153,9 +153,9 @@ def download(
             target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
             target.parent.mkdir(parents=True, exist_ok=True)
             with transfer_bar(error_console, each) as progress:
-                chosen = (form or _format_of(target)) if each == "stylized.ply" else None
-                if form and out is None and each == "stylized.ply":
-                    target = Path(result_name(each, by_name(form)))
+                chosen = (format or _format_of(target)) if each == "stylized.ply" else None
+                if format and out is None and each == "stylized.ply":
+                    target = Path(result_name(each, by_name(format)))
                 written.append(str(client.download(job, target, each, progress, chosen)))
             if not as_json:
                 _print_compression_loss(client, job, chosen)
@@ -275,21 +275,21 @@ def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
         error_console.print(_job_text(job))
         raise typer.Exit(FAILURE)
     with transfer_bar(error_console, out.name) as progress:
-        client.download(job.id, out, progress=progress, form=_format_of(out))
+        client.download(job.id, out, progress=progress, format=_format_of(out))
     if not as_json:
         _print_compression_loss(client, job.id, _format_of(out))
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
 
 
-def _print_compression_loss(client: Client, job_id: str, form: ExtraName | None) -> None:
+def _print_compression_loss(client: Client, job_id: str, format: ExtraName | None) -> None:
     """Print the quality loss of a compressed result."""
-    if form is None:
+    if format is None:
         return
     with tempfile.TemporaryDirectory() as folder:
-        name = f"{result_name('stylized.ply', by_name(form))}.json"
+        name = f"{result_name('stylized.ply', by_name(format))}.json"
         loss = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
     psnr = "renders identical to" if loss["psnr_db"] is None else f"{loss['psnr_db']:.1f} dB PSNR against"
-    error_console.print(f"{form}, {loss['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
+    error_console.print(f"{format}, {loss['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
 
 
 def _format_of(out: Path) -> ExtraName | None:

@@ -172,19 +172,19 @@ class AsyncClient:
         target: str | Path,
         name: str = "stylized.ply",
         progress: Progress = no_progress,
-        form: str | None = None,
+        format: str | None = None,
     ) -> Path:
         """Download a file of a job, and check its SHA-256. If part of it was downloaded before, resume from there.
 
         Args:
-            form: Format of stylized.ply, such as "spz"; None for PLY. The service converts the file on the
+            format: Format of stylized.ply, such as "spz"; None for PLY. The service converts the file on the
                 first request.
 
         Raises:
             RequestError: If the file does not exist, or does not exist yet.
         """
         target = Path(target)
-        query = f"?format={form}" if form else ""
+        query = f"?format={format}" if format else ""
         await self._transport.fetch(Download(f"/v1/jobs/{job_id}/artifacts/{name}{query}", target, progress))
         return target
 

@@ -169,8 +169,8 @@ class Connection(HttpToolsProtocol):
 
     def _refuse(self, error: ServiceError) -> None:
         """Close the connection. Send the error first, unless a response to this request has already started."""
-        begun = self.cycle is not None and self.cycle.response_started
-        if not begun or (self.cycle.response_complete and self._stage is not _Stage.BODY):
+        started = self.cycle is not None and self.cycle.response_started
+        if not started or (self.cycle.response_complete and self._stage is not _Stage.BODY):
             answer = from_service(error)
             lines = [f"HTTP/1.1 {error.status} {HTTPStatus(error.status).phrase}".encode()]
             lines += [name + b": " + value for name, value in (*answer.raw_headers, (b"connection", b"close"))]

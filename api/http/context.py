@@ -105,18 +105,20 @@ class Caller:
 
 async def get_context(request: Request) -> Context:
     """Return the app's context. It is async because FastAPI runs plain functions in another thread."""
-    found: Context = request.app.state.context
-    return found
+    context: Context = request.app.state.context
+    return context
 
 
 ContextDep = Annotated[Context, Depends(get_context)]
-_bearer = HTTPBearer(auto_error=False, description="An API key: `sgsst keys create NAME` on the service's machine.")
+_bearer = HTTPBearer(
+    auto_error=False, description="API key created by `sgsst keys create NAME` on the service's machine."
+)
 
 
 session_cookie = APIKeyCookie(
     name=SESSION_COOKIE,
     auto_error=False,
-    description="A browser's session: `POST /v1/session` gives it for an API key.",
+    description="Session cookie of a browser, from `POST /v1/session`.",
 )
 
 
@@ -182,7 +184,7 @@ def check_origin(request: Request, *, required: bool = True) -> None:
         raise CrossOriginError("Pages of other sites may not use the sessions of this service.")
     if required and origin is None and site is None:
         raise CrossOriginError(
-            "A request with a session's cookie that changes something must say which page it comes from (Origin). "
+            "A request with a session cookie that changes something must state its page (Origin). "
             "Programs send an API key instead: 'Authorization: Bearer KEY'."
         )
 
@@ -198,7 +200,9 @@ def _check_site(request: Request, settings: ServiceSettings) -> None:
     """
     host = _host_name(request.headers.get("host", ""))
     if settings.on_loopback and not is_loopback(host):
-        raise ForeignSiteError(f"The service is open to this machine only, and {host[:100]!r} is not one of its names.")
+        raise ForeignSiteError(
+            f"The service accepts requests from this machine only, and {host[:100]!r} is not one of its names."
+        )
     origin = request.headers.get("origin")
     if origin is not None and _netloc(origin) != request.headers.get("host"):
         raise ForeignSiteError(f"Pages of {origin!r} may not use this service without an API key.")

@@ -31,33 +31,37 @@ _DATE = {"type": "string", "pattern": "GMT$"}
 
 #: Headers of responses: description, schema, example.
 _HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
-    "Accept-Ranges": ("Parts can be asked for.", {"const": "bytes"}, "bytes"),
-    "Cache-Control": ("Answers belong to one key, and change.", _TEXT, "private, no-cache"),
-    "Content-Disposition": ("A name for the file.", _TEXT, 'attachment; filename="plush-stylized.ply"'),
-    "Content-Length": ("Bytes of the body.", _COUNT, 42301),
-    "Content-Range": ("Which part this is, of how many bytes.", _TEXT, "bytes 0-1023/42301"),
-    "Content-Security-Policy": ("Pages of results are shown in a sandbox.", _TEXT, "sandbox allow-scripts"),
-    "ETag": ("Of this state, for `If-None-Match`.", {"type": "string", "pattern": '^"[0-9a-f]+"$'}, f'"{SHA256}"'),
-    "Idempotency-Replayed": ("Nothing was made: it was there already.", {"const": "true"}, "true"),
-    "Location": ("Where what was made is.", _TEXT, f"/v1/jobs/{JOB_ID}"),
-    "Retry-After": ("Seconds after which to ask again.", _COUNT, 2),
+    "Accept-Ranges": ("Ranges can be requested.", {"const": "bytes"}, "bytes"),
+    "Cache-Control": ("Responses are private to one key, and change.", _TEXT, "private, no-cache"),
+    "Content-Disposition": ("Suggested name of the file.", _TEXT, 'attachment; filename="plush-stylized.ply"'),
+    "Content-Length": ("Size of the body in bytes.", _COUNT, 42301),
+    "Content-Range": ("Range of this part, and size of the file in bytes.", _TEXT, "bytes 0-1023/42301"),
+    "Content-Security-Policy": ("HTML results run in a sandbox.", _TEXT, "sandbox allow-scripts"),
+    "ETag": ("Tag of this state, for `If-None-Match`.", {"type": "string", "pattern": '^"[0-9a-f]+"$'}, f'"{SHA256}"'),
+    "Idempotency-Replayed": ("Nothing was created: it existed already.", {"const": "true"}, "true"),
+    "Location": ("Address of the new resource.", _TEXT, f"/v1/jobs/{JOB_ID}"),
+    "Retry-After": ("Seconds to wait before the next request.", _COUNT, 2),
     "Set-Cookie": (
-        "The session.",
+        "Session cookie.",
         {"type": "string", "pattern": "^sgsst_session="},
         'sgsst_session=""; HttpOnly; Max-Age=0; Path=/; SameSite=strict',
     ),
-    "Tus-Checksum-Algorithm": ("For `Upload-Checksum`.", _TEXT, "sha256,sha1,md5"),
-    "Tus-Extension": ("What is spoken beside the protocol's core.", _TEXT, "creation,expiration,checksum,termination"),
-    "Tus-Max-Size": ("Bytes that a file may have.", _COUNT, 16_000_000_000),
-    "Tus-Resumable": ("The protocol's version.", {"const": "1.0.0"}, "1.0.0"),
-    "Tus-Version": ("Versions that are spoken.", _TEXT, "1.0.0"),
-    "Upload-Expires": ("When it is removed, unless more comes.", _DATE, "Sun, 22 Nov 2026 14:02:11 GMT"),
-    "Upload-Length": ("Bytes of the whole file.", _COUNT, 42301),
-    "Upload-Metadata": ("As it was given.", _TEXT, "filename c2NlbmUucGx5"),
-    "Upload-Offset": ("Bytes that are there: where to go on.", _COUNT, 16384),
-    "WWW-Authenticate": ("How to show who is asking.", _TEXT, "Bearer"),
-    "X-Accel-Buffering": ("Proxies hand events on at once.", {"const": "no"}, "no"),
-    "X-Content-Type-Options": ("Browsers do not guess.", {"const": "nosniff"}, "nosniff"),
+    "Tus-Checksum-Algorithm": ("Algorithms for `Upload-Checksum`.", _TEXT, "sha256,sha1,md5"),
+    "Tus-Extension": ("Supported extensions of the protocol.", _TEXT, "creation,expiration,checksum,termination"),
+    "Tus-Max-Size": ("Maximum size of a file in bytes.", _COUNT, 16_000_000_000),
+    "Tus-Resumable": ("Protocol version.", {"const": "1.0.0"}, "1.0.0"),
+    "Tus-Version": ("Supported protocol versions.", _TEXT, "1.0.0"),
+    "Upload-Expires": (
+        "Time at which the upload is deleted, unless more bytes arrive.",
+        _DATE,
+        "Sun, 22 Nov 2026 14:02:11 GMT",
+    ),
+    "Upload-Length": ("Size of the whole file in bytes.", _COUNT, 42301),
+    "Upload-Metadata": ("Metadata as given at creation.", _TEXT, "filename c2NlbmUucGx5"),
+    "Upload-Offset": ("Number of received bytes, where the next part starts.", _COUNT, 16384),
+    "WWW-Authenticate": ("Authentication scheme.", _TEXT, "Bearer"),
+    "X-Accel-Buffering": ("Proxies must not buffer events.", {"const": "no"}, "no"),
+    "X-Content-Type-Options": ("Browsers must not guess the media type.", {"const": "nosniff"}, "nosniff"),
 }
 
 
@@ -132,9 +136,9 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
     """
     schemas = document["components"]["schemas"]
     for model in models:
-        made = model.model_json_schema(ref_template="#/components/schemas/{model}")
-        schemas |= made.pop("$defs", {})
-        schemas[model.__name__] = made
+        schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas |= schema.pop("$defs", {})
+        schemas[model.__name__] = schema
     for path in document["paths"].values():
         for method, operation in path.items():
             for parameter in operation.get("parameters", []):

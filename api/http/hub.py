@@ -22,7 +22,7 @@ _POLL_SECONDS = 0.3
 #: Seconds without an event after which a comment is sent, so that proxies do not drop the connection as idle.
 HEARTBEAT_SECONDS = 15.0
 #: Number of events that are buffered per watched job. A watcher that is farther behind reads the database.
-_KEPT = 300
+_BUFFERED = 300
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class _Channel:
     items: deque[Item] = field(default_factory=deque)
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     watchers: int = 0
-    gone: bool = False
+    deleted: bool = False
 
 
 class Hub:
@@ -85,7 +85,7 @@ class Hub:
         channel.watchers += 1
         try:
             yield b"retry: 2000\n\n"
-            while not self._closing.is_set() and not channel.gone:
+            while not self._closing.is_set() and not channel.deleted:
                 changed = channel.changed
                 items = await self._events_after(job_id, channel, after)
                 for item in items:
@@ -114,20 +114,20 @@ class Hub:
         return [_to_item(row) for row in rows]
 
     async def _poll(self) -> None:
-        away = False
+        unavailable = False
         while True:
             await asyncio.sleep(_POLL_SECONDS)
             if not self._channels:
                 continue
             try:
                 await self._read_new_events()
-                away = False
+                unavailable = False
             except DatabaseUnavailableError as error:  # Watchers wait until the database is back.
-                if not away:
-                    _log.warning("events cannot be read: %s", error)
-                away = True
+                if not unavailable:
+                    _log.warning("cannot read events: %s", error)
+                unavailable = True
             except Exception:
-                _log.exception("events could not be read")
+                _log.exception("reading events failed")
 
     async def _read_new_events(self) -> None:
         watched = dict(self._channels)
@@ -135,7 +135,7 @@ class Hub:
         for job_id, channel in watched.items():
             number = newest.get(job_id)
             if number is None:  # the job was deleted
-                channel.gone = True
+                channel.deleted = True
                 _wake_watchers(channel)
                 continue
             if not channel.last:
@@ -145,7 +145,7 @@ class Hub:
                 rows = await asyncio.to_thread(self._store.jobs.events, job_id, channel.last)
                 channel.items.extend(_to_item(row) for row in rows)
                 channel.last = rows[-1].id if rows else channel.last
-                while len(channel.items) > _KEPT:
+                while len(channel.items) > _BUFFERED:
                     channel.base = channel.items.popleft().id
                 _wake_watchers(channel)
 

@@ -29,12 +29,12 @@ _ENDS = (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELED)
 _COUNTERS = {
     "sgsst_jobs_submitted": _Counter("Jobs that were accepted."),
     "sgsst_jobs_finished": _Counter("Jobs that have ended, by status.", "status", tuple(map(str, _ENDS))),
-    "sgsst_attempts": _Counter("Attempts that were begun."),
+    "sgsst_attempts": _Counter("Attempts that were started."),
     "sgsst_attempts_ended": _Counter(
         "Attempts that have ended, by outcome.", "outcome", tuple(map(str, AttemptOutcome))
     ),
-    "sgsst_outages": _Counter("Attempts that a machine, the network or the store of files made fail."),
-    "sgsst_lease_expirations": _Counter("Leases that ran out because a dispatcher was not heard of."),
+    "sgsst_outages": _Counter("Attempts that failed because of a machine, the network or the file store."),
+    "sgsst_lease_expirations": _Counter("Leases that expired because their dispatcher did not renew them."),
 }
 _HISTOGRAMS = {
     "sgsst_queue_wait_seconds": "Seconds that jobs waited for their attempts.",
@@ -90,29 +90,31 @@ class _StoreCollector(Collector):
         )
         yield from self._counters()
         rates = [step / seconds for step, seconds in operations.steps_and_seconds()]
-        yield GaugeMetricFamily("sgsst_iterations_per_second", "Of all running jobs together.", sum(rates))
+        yield GaugeMetricFamily(
+            "sgsst_iterations_per_second", "Iterations per second of all running jobs together.", sum(rates)
+        )
         alive = operations.dispatchers()
         yield GaugeMetricFamily("sgsst_dispatchers", "Dispatchers that are alive.", len(alive))
         places, free = sum(row.places for row in alive), sum(row.free for row in alive)
-        yield GaugeMetricFamily("sgsst_places", "GPUs, or places for jobs where there are none.", places)
-        yield GaugeMetricFamily("sgsst_places_free", "Those that no job has.", free)
-        room = shutil.disk_usage(self._folder)
-        yield GaugeMetricFamily("sgsst_disk_free_bytes", "Of the disk that this process receives files on.", room.free)
-        yield GaugeMetricFamily("sgsst_disk_bytes", "All of that disk.", room.total)
+        yield GaugeMetricFamily("sgsst_places", "GPUs, or slots for jobs on hosts without GPUs.", places)
+        yield GaugeMetricFamily("sgsst_places_free", "GPUs or slots that no job occupies.", free)
+        disk = shutil.disk_usage(self._folder)
+        yield GaugeMetricFamily("sgsst_disk_free_bytes", "Free bytes of the disk that receives files.", disk.free)
+        yield GaugeMetricFamily("sgsst_disk_bytes", "Size of that disk.", disk.total)
 
     def _counters(self) -> Iterable[Metric]:
-        found: defaultdict[str, dict[str, float]] = defaultdict(dict)
+        stored: defaultdict[str, dict[str, float]] = defaultdict(dict)
         for name, labels, value in self._store.operations.counters():
-            found[name][labels.partition("=")[2].strip('"')] = value
+            stored[name][labels.partition("=")[2].strip('"')] = value
         for name, counter in _COUNTERS.items():
             family = CounterMetricFamily(name, counter.help, labels=[counter.label] if counter.label else None)
-            values = found[f"{name}_total"]
+            values = stored[f"{name}_total"]
             for label in sorted({*counter.values, *values} if counter.label else {""}):
                 family.add_metric([label] if counter.label else [], values.get(label, 0.0))
             yield family
         for name, help_text in _HISTOGRAMS.items():
-            buckets = found[f"{name}_bucket"]
-            number, total = (found[f"{name}_{part}"].get("", 0.0) for part in ("count", "sum"))
+            buckets = stored[f"{name}_bucket"]
+            number, total = (stored[f"{name}_{part}"].get("", 0.0) for part in ("count", "sum"))
             yield HistogramMetricFamily(name, help_text, _cumulative(buckets, number), total)
 
 

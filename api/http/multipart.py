@@ -348,8 +348,8 @@ class _Form:
             return
         text = self._text.decode("utf-8", "replace")
         if self._role not in _TEXT_FIELDS:
-            place = len(self.received.files) + len(self.received.uploads)
-            self.received.uploads.append((place, self._role, text.strip()))
+            index = len(self.received.files) + len(self.received.uploads)
+            self.received.uploads.append((index, self._role, text.strip()))
         elif self._role in self.received.texts:
             raise RefusedInputError(f"The field {self._role!r} was sent twice. Send it once.", "invalid-request")
         else:

@@ -18,7 +18,7 @@ from service.errors import ServiceError
 
 _EVENTS = "text/event-stream"
 #: Status in the log if the client has closed the connection, as in nginx. It is never sent.
-_NOBODY_LISTENS = 499
+_CLIENT_CLOSED = 499
 _EVENT = {
     "type": "object",
     "required": ["event", "data"],
@@ -32,8 +32,8 @@ _PLANNING = {"step": 5, "total": 24, "fraction": 0.208, "eta_s": 31.5}
 DRY_RUN: dict[str, Any] = {
     "model": PlanView,
     "description": "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: "
-    "`planning`, how many views have been looked at; at last `plan`, or the `problem` that was found after the answer "
-    "had begun.",
+    "`planning`, the number of surveyed views; finally `plan`, or a `problem` that occurred after the response "
+    "started.",
     "content": {
         _EVENTS: {
             "schema": _EVENT,
@@ -60,46 +60,46 @@ async def answer_plan(request: Request, plan: Planning, workers: int | None) -> 
     """
     if _EVENTS in request.headers.get("accept", ""):
         sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        told: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+        reports: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
         # Started here rather than in `_events`, so that the plan releases its resources even if no event is read.
-        task = asyncio.create_task(plan(told.put_nowait))
-        task.add_done_callback(lambda _: told.put_nowait(None))
-        return StreamingResponse(_events(task, told, workers), 200, sent, _EVENTS)
-    planning, leaving = asyncio.create_task(plan(lambda now: None)), asyncio.create_task(_left(request))
+        task = asyncio.create_task(plan(reports.put_nowait))
+        task.add_done_callback(lambda _: reports.put_nowait(None))
+        return StreamingResponse(_events(task, reports, workers), 200, sent, _EVENTS)
+    planning, leaving = asyncio.create_task(plan(lambda now: None)), asyncio.create_task(_wait_for_disconnect(request))
     try:
         await asyncio.wait((planning, leaving), return_when=asyncio.FIRST_COMPLETED)
         if not planning.done():
-            return Response(status_code=_NOBODY_LISTENS)
+            return Response(status_code=_CLIENT_CLOSED)
         return JSONResponse(_view(planning.result(), workers))
     finally:
         planning.cancel()
         leaving.cancel()
 
 
-async def _left(request: Request) -> None:
+async def _wait_for_disconnect(request: Request) -> None:
     """Return once the client has closed its connection; the body of the request must have been read."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
 
-def _view(found: Mapping[str, Any], workers: int | None) -> dict[str, Any]:
-    return PlanView(**found, workers=workers).model_dump(mode="json")
+def _view(plan: Mapping[str, Any], workers: int | None) -> dict[str, Any]:
+    return PlanView(**plan, workers=workers).model_dump(mode="json")
 
 
 async def _events(
-    task: asyncio.Task[dict[str, Any]], told: asyncio.Queue[dict[str, Any] | None], workers: int | None
+    task: asyncio.Task[dict[str, Any]], reports: asyncio.Queue[dict[str, Any] | None], workers: int | None
 ) -> AsyncIterator[bytes]:
     """Yield the events of a plan until it is done; ending the iteration stops the planning."""
     try:
         while True:
             try:
-                now = await asyncio.wait_for(told.get(), HEARTBEAT_SECONDS)
+                report = await asyncio.wait_for(reports.get(), HEARTBEAT_SECONDS)
             except TimeoutError:
                 yield b": still here\n\n"
                 continue
-            if now is None:
+            if report is None:
                 break
-            yield _event("planning", now)
+            yield _event("planning", report)
         try:
             yield _event("plan", _view(task.result(), workers))
         except ServiceError as error:

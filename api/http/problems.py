@@ -153,7 +153,7 @@ async def _system_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, OSError)
     if error.errno not in (errno.EMFILE, errno.ENFILE):
         raise error
-    detail = "The service has as many files open as its system allows. Try again later."
+    detail = "The service has reached its limit of open files. Try again later."
     return from_service(TooManyConnectionsError(detail))
 
 

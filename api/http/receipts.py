@@ -49,7 +49,7 @@ class Receipts:
                 try:
                     await asyncio.to_thread(self.inputs.renew_receipts, list(self.active))
                 except DatabaseUnavailableError:  # receipts survive several missed renewals
-                    _log.warning("receipts could not be renewed; retrying")
+                    _log.warning("cannot renew receipts; retrying")
 
 
 class Receipt:

@@ -35,15 +35,19 @@ class LongerThanDeclaredError(TooLargeError):
         super().__init__(f"More bytes come than the {length:,} of Upload-Length.", length)
 
 
-async def append_body(request: Request, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> float:
-    """Append the request's body to the upload, and return the upload's new expiry time."""
-    writer = await asyncio.to_thread(_Writer, context, row, wanted)
+async def append_body(request: Request, context: Context, row: UploadRow, checksum: tuple[str, bytes] | None) -> float:
+    """Append the request's body to the upload, and return the upload's new expiry time.
+
+    Args:
+        checksum: Algorithm and expected digest of the body; None for no check.
+    """
+    writer = await asyncio.to_thread(_Writer, context, row, checksum)
     try:
         try:
             async for block in body_blocks(request, context.settings):
                 await context.threads.run(row.owner, writer.write, block)
         except ServiceError:
-            if wanted is None:
+            if checksum is None:
                 await context.threads.run(row.owner, writer.save)  # no checksum can contradict them
             raise
         return await context.threads.run(row.owner, writer.finish)
@@ -54,11 +58,11 @@ async def append_body(request: Request, context: Context, row: UploadRow, wanted
 class _Writer:
     """Writer that checks received bytes and saves them at intervals."""
 
-    def __init__(self, context: Context, row: UploadRow, wanted: tuple[str, bytes] | None) -> None:
-        self._context, self._row, self._wanted = context, row, wanted
+    def __init__(self, context: Context, row: UploadRow, checksum: tuple[str, bytes] | None) -> None:
+        self._context, self._row, self._checksum = context, row, checksum
         self._seconds = context.settings.upload_hours * 3600
         self._part = context.blobs.append(row, self._seconds)
-        self._digest = hashlib.new(wanted[0]) if wanted else None
+        self._digest = hashlib.new(checksum[0]) if checksum else None
         self._offset = self._saved = row.offset
 
     def write(self, block: bytes) -> None:
@@ -79,7 +83,7 @@ class _Writer:
 
     def finish(self) -> float:
         """Verify and save the bytes of the request. Store the file as a blob if the upload is complete."""
-        if self._digest is not None and self._wanted is not None and self._digest.digest() != self._wanted[1]:
+        if self._digest is not None and self._checksum is not None and self._digest.digest() != self._checksum[1]:
             self._part.discard()
             raise ChecksumError
         expires = self.save()

@@ -72,18 +72,20 @@ class ProgressView(BaseModel):
     )
 
     stage: str = Field(
-        description="`reading`, `planning` (looking at the views), `starting`, `coarse` (coarsest scale), `sos` (all "
+        description="`reading`, `planning` (surveying the views), `starting`, `coarse` (coarsest scale), `sos` (all "
         "scales) or `measuring` (views between the cameras)."
     )
-    step: int = Field(description="Steps done; views looked at while `planning`.")
-    total: int = Field(description="Steps, or views, at most; 0 while they are not known.")
-    fraction: float = Field(description="Of the steps, or of the views, 0 to 1.")
-    eta_s: float | None = Field(description="Seconds left with all that is measured, as far as that can be told.")
+    step: int = Field(description="Completed steps; surveyed views while `planning`.")
+    total: int = Field(description="Maximum number of steps or views; 0 while unknown.")
+    fraction: float = Field(description="Completed fraction of the steps or views, 0 to 1.")
+    eta_s: float | None = Field(
+        description="Estimated remaining seconds, including measurements at the end; null if unknown."
+    )
     loss: float | None
     scales: list[float | None] | None = Field(
-        None, description="The loss of each scale, full size first; null for scales that the step has left out."
+        None, description="Loss of each scale, full size first; null for scales that the step skipped."
     )
-    seconds: float | None = Field(description="Of all steps so far.")
+    seconds: float | None = Field(description="Seconds of all steps so far.")
     attempt: int
     updated_at: datetime
 
@@ -103,12 +105,12 @@ class ProgressPoint(BaseModel):
     )
 
     attempt: int
-    stage: str = Field(description="As in a job's progress.")
-    step: int = Field(description="Of an attempt that goes on from a checkpoint, they begin behind that.")
+    stage: str = Field(description="Same as in a job's progress.")
+    step: int = Field(description="Completed steps; an attempt that resumes from a checkpoint starts behind it.")
     total: int
-    seconds: float = Field(description="Of all steps so far.")
+    seconds: float = Field(description="Seconds of all steps so far.")
     loss: float
-    scales: list[float | None] | None = Field(description="As in a job's progress.")
+    scales: list[float | None] | None = Field(description="Same as in a job's progress.")
     updated_at: datetime
 
 
@@ -119,7 +121,7 @@ class ProgressHistory(BaseModel):
 
     points: list[ProgressPoint] = Field(
         max_length=MOST_POINTS,
-        description="Evenly in the logarithm of seconds; first and last are the job's first and last.",
+        description="Points evenly spaced in the logarithm of seconds, including the job's first and last.",
     )
 
 
@@ -143,7 +145,7 @@ class AttemptView(BaseModel):
     started_at: datetime
     finished_at: datetime | None
     outcome: OutcomeName | None = Field(
-        description="`lost`: its dispatcher was not heard of again; `released`: it shut down and put the job back."
+        description="`lost`: its dispatcher stopped responding; `released`: it shut down and returned the job."
     )
     error: ErrorView | None
 
@@ -161,7 +163,7 @@ class Links(BaseModel):
     self: str
     events: str
     artifacts: str
-    result: str | None = Field(description="The stylized PLY, once it is there.")
+    result: str | None = Field(description="Address of the stylized PLY once it exists.")
 
 
 class JobView(BaseModel):
@@ -195,18 +197,18 @@ class JobView(BaseModel):
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
-    expires_at: datetime | None = Field(description="When the results are removed, or the record of an expired job.")
-    attempt: int = Field(description="Of the attempt that runs or ran last; 0 before the first.")
-    queue_position: int | None = Field(description="1 is next; null where the job is not queued.")
-    preview: str | None = Field(
-        description="The artifact with the newest picture of the job; null where there is none yet."
+    expires_at: datetime | None = Field(
+        description="Time at which the results are deleted, or the record of an expired job."
     )
+    attempt: int = Field(description="Number of the latest attempt; 0 before the first.")
+    queue_position: int | None = Field(description="1 is next; null if the job is not queued.")
+    preview: str | None = Field(description="Artifact with the newest preview image; null if there is none yet.")
     progress: ProgressView | None
-    result: dict[str, Any] | None = Field(description="Steps, why it stopped, loss before and after.")
+    result: dict[str, Any] | None = Field(description="Steps, reason to stop, and loss before and after.")
     error: ErrorView | None
     parameters: dict[str, Any] = Field(
-        description="As `JobParameters`, with defaults for what was not told; what an earlier version took is shown as "
-        "it was told then."
+        description="As `JobParameters`, with defaults for omitted fields; fields of an earlier version are shown as "
+        "they were stored."
     )
     inputs: list[InputView]
     links: Links
@@ -226,7 +228,7 @@ class JobPage(BaseModel):
     model_config = _with_example(jobs=[_example_of(JobView)], next_cursor=JOB_ID)
 
     jobs: list[JobView]
-    next_cursor: str | None = Field(description="For the next page; null on the last one.")
+    next_cursor: str | None = Field(description="`cursor` of the next page; null on the last one.")
 
 
 class ArtifactView(BaseModel):
@@ -332,11 +334,13 @@ class PlanView(BaseModel):
     pixels: int
     style: list[int] = Field(description="Width and height.")
     photos: int
-    workers: int | None = Field(description="As asked for; null where the service decides when the job starts.")
-    estimated_seconds: float | None = Field(description="Of all steps; null where it cannot be told.")
-    memory_bytes: int | None = Field(description="At the peak, as far as that can be told.")
-    device_memory_bytes: int | None = Field(None, description="The same of a GPU's memory; null where no GPU computes.")
-    plan: dict[str, Any] = Field(description="As `plan.json` and `sgsst plan`.")
+    workers: int | None = Field(description="Requested workers; null if the service decides when the job starts.")
+    estimated_seconds: float | None = Field(description="Estimated seconds of all steps; null if unknown.")
+    memory_bytes: int | None = Field(description="Estimated peak memory; null if unknown.")
+    device_memory_bytes: int | None = Field(
+        None, description="Estimated peak memory of the GPU; null if no GPU is used."
+    )
+    plan: dict[str, Any] = Field(description="Plan in the format of `plan.json`.")
 
 
 class SignIn(BaseModel):
@@ -348,7 +352,9 @@ class SignIn(BaseModel):
         json_schema_extra={"examples": [{"key": "sgsst_ThisIsNoKeyButAnExampleOfOne"}]},
     )
 
-    key: str = Field(min_length=1, max_length=200, description="`sgsst keys create NAME` on the service's machine.")
+    key: str = Field(
+        min_length=1, max_length=200, description="Key created by `sgsst keys create NAME` on the service's machine."
+    )
 
 
 class JobChange(BaseModel):
@@ -365,7 +371,7 @@ class SessionView(BaseModel):
     model_config = _with_example(keys_needed=True, signed_in=True)
 
     keys_needed: bool = Field(description="Whether an API key is required.")
-    signed_in: bool = Field(description="Whether the cookie is that of a session.")
+    signed_in: bool = Field(description="Whether the cookie belongs to a valid session.")
 
 
 class Health(BaseModel):
@@ -376,7 +382,7 @@ class Health(BaseModel):
     )
 
     status: Literal["ok", "waiting", "unavailable"] = Field(
-        description="`waiting`: jobs are taken in, but nobody is there to run them yet."
+        description="`waiting`: jobs are accepted, but no dispatcher is running."
     )
     checks: dict[str, str]
 
@@ -452,13 +458,13 @@ def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) ->
 
 def input_views(job: JobRow) -> list[InputFileView]:
     """Return the files that a job was created from."""
-    found, places = [], Counter[str]()
+    views, counts = [], Counter[str]()
     for entry in job.inputs:
-        role, place = entry["role"], places[entry["role"]]
-        places[role] += 1
-        address = f"/v1/jobs/{job.id}/inputs/{role}" + (f":{place}" if place else "")
-        found.append(InputFileView(**entry, url=address))
-    return found
+        role, index = entry["role"], counts[entry["role"]]
+        counts[role] += 1
+        address = f"/v1/jobs/{job.id}/inputs/{role}" + (f":{index}" if index else "")
+        views.append(InputFileView(**entry, url=address))
+    return views
 
 
 def progress_history(points: list[Point]) -> ProgressHistory:

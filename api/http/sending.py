@@ -29,12 +29,20 @@ _ETAG = re.compile(r'"[^"]*"')
 
 IfNoneMatch = Annotated[
     str | None,
-    Header(alias="If-None-Match", description="An ETag; the same one is answered with 304.", examples=['"e7d2c939"']),
+    Header(
+        alias="If-None-Match",
+        description="ETag of the known content; if it is current, the answer is 304.",
+        examples=['"e7d2c939"'],
+    ),
 ]
 RangeHeader = Annotated[str | None, Header(alias="Range", description="One range of bytes.", examples=["bytes=0-1023"])]
 IfRange = Annotated[
     str | None,
-    Header(alias="If-Range", description="An ETag; for another one all is sent.", examples=[f'"{SHA256}"']),
+    Header(
+        alias="If-Range",
+        description="ETag of the partial file; if the file has changed, it is sent as a whole.",
+        examples=[f'"{SHA256}"'],
+    ),
 ]
 
 
@@ -83,16 +91,16 @@ class SentFile:
     read: Callable[[int, int], Iterator[bytes]]
 
 
-def file_answers(begins: dict[str, Any], *, always_policy: bool = False) -> Responses:
+def file_answers(starts: dict[str, Any], *, always_policy: bool = False) -> Responses:
     """Return the OpenAPI documentation of responses with a file.
 
     Args:
-        begins: Start of a file's content for each media type, as examples.
+        starts: Start of a file's content for each media type, as examples.
         always_policy: Whether every file has a Content-Security-Policy.
     """
     content = {
-        kind: {"schema": {} if "json" in kind else {"type": "string", "format": "binary"}, "example": begin}
-        for kind, begin in begins.items()
+        kind: {"schema": {} if "json" in kind else {"type": "string", "format": "binary"}, "example": start}
+        for kind, start in starts.items()
     }
     always = (*_SENT, "Content-Security-Policy") if always_policy else _SENT
     maybe = () if always_policy else ("Content-Security-Policy",)
@@ -103,11 +111,14 @@ def file_answers(begins: dict[str, Any], *, always_policy: bool = False) -> Resp
             "content": content,
         },
         206: {
-            "description": "The part that `Range` asks for.",
+            "description": "The range requested by `Range`.",
             "headers": headers(*always, "Content-Length", "Content-Range", maybe=maybe),
             "content": content,
         },
-        304: {"description": "`If-None-Match` names what is there.", "headers": headers(*always, maybe=maybe)},
+        304: {
+            "description": "The content has not changed since the ETag of `If-None-Match`.",
+            "headers": headers(*always, maybe=maybe),
+        },
     }
 
 
@@ -175,10 +186,10 @@ def disposition(name: str, *, inline: bool) -> str:
     last = re.sub(r"[\x00-\x1f\x7f-\x9f\"*:<>?|\u202a-\u202e\u2066-\u2069]+", "_", re.split(r"[/\\]", name)[-1])
     last = last[-_MAX_NAME:].strip(" .")
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", last).strip("._") or "file"
-    found = f'{"inline" if inline else "attachment"}; filename="{plain}"'
+    header = f'{"inline" if inline else "attachment"}; filename="{plain}"'
     if last.isascii() or not last:
-        return found
-    return f"{found}; filename*=UTF-8''{quote(last, safe='', errors='replace')}"
+        return header
+    return f"{header}; filename*=UTF-8''{quote(last, safe='', errors='replace')}"
 
 
 def _parse_range(text: str, size: int) -> tuple[int, int] | None:

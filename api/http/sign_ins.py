@@ -35,9 +35,9 @@ class SignIns:
 
     def check(self, address: str) -> None:
         """Raise TooManyTriesError if an address has failed too often recently."""
-        found = self._failures.get(address)
-        if found is not None and len(found) == MOST_FAILURES:
-            left = found[0] + WITHIN_SECONDS - self._clock()
+        failures = self._failures.get(address)
+        if failures is not None and len(failures) == MOST_FAILURES:
+            left = failures[0] + WITHIN_SECONDS - self._clock()
             if left > 0:
                 raise TooManyTriesError(retry_after=int(left) + 1)
 

@@ -25,10 +25,10 @@ from sgsst_core.files.formats import FORMATS
 
 FOLDER = Path(__file__).parents[1] / "static"
 #: Placeholder in pages for the URL prefix of the files.
-_PLACE = b"{{static}}"
+_PREFIX = b"{{static}}"
 _DIGEST_LETTERS = 16
 #: Minimum size in bytes of files to compress. Smaller files fit in one packet anyway.
-_LEAST_PACKED = 1000
+_MIN_COMPRESSED = 1000
 _TEXTS = (".css", ".html", ".js", ".json", ".map", ".md", ".svg", ".txt")
 _KINDS = {
     ".js": "text/javascript; charset=utf-8",
@@ -43,7 +43,7 @@ POLICY = (
 #: Content-Security-Policy of `/docs`. Swagger UI's style sheet has inline icons.
 DOCS_POLICY = POLICY.replace("img-src 'self' blob:", "img-src 'self' data:")
 _PAGES = {"/": ("index.html", POLICY), "/docs": ("docs.html", DOCS_POLICY)}
-_FOR_EVER = "public, max-age=31536000, immutable"
+_IMMUTABLE = "public, max-age=31536000, immutable"
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class StaticFile:
 
     Attributes:
         body: Content.
-        packed: Content with gzip compression; None if that saves nothing.
+        compressed: Content with gzip compression; None if that saves nothing.
         digest: SHA-256 of the content.
         kind: Media type.
     """
 
     body: bytes
-    packed: bytes | None
+    compressed: bytes | None
     digest: str
     kind: str
 
@@ -93,7 +93,7 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
     for name, body in contents.items():
         whole.update(f"{name}\0{len(body)}\0".encode() + body)
     digest = whole.hexdigest()[:_DIGEST_LETTERS]
-    pages = {name: contents.pop(name).replace(_PLACE, f"/static/{digest}".encode()) for name, _ in _PAGES.values()}
+    pages = {name: contents.pop(name).replace(_PREFIX, f"/static/{digest}".encode()) for name, _ in _PAGES.values()}
     return StaticFiles(
         digest, *({name: _file(name, body) for name, body in part.items()} for part in (contents, pages))
     )
@@ -114,24 +114,24 @@ def _filled_modules() -> dict[str, tuple[bytes, object]]:
 
 def _file(name: str, body: bytes) -> StaticFile:
     suffix = Path(name).suffix
-    packed = gzip.compress(body, mtime=0) if suffix in _TEXTS and len(body) >= _LEAST_PACKED else None
+    compressed = gzip.compress(body, mtime=0) if suffix in _TEXTS and len(body) >= _MIN_COMPRESSED else None
     kind = _KINDS.get(suffix) or mimetypes.guess_type(name)[0] or "application/octet-stream"
-    return StaticFile(body, packed, hashlib.sha256(body).hexdigest(), kind)
+    return StaticFile(body, compressed, hashlib.sha256(body).hexdigest(), kind)
 
 
 def add_static(app: FastAPI) -> None:
     """Add routes for all static files. They require no key, because they are the same for everybody."""
-    found = static_files()
+    static = static_files()
 
     async def get_page(request: Request) -> Response:
         name, policy = _PAGES[request.url.path]
-        return _answer(request, found.pages[name], "no-cache", policy)
+        return _answer(request, static.pages[name], "no-cache", policy)
 
     async def get_file(request: Request, digest: str, name: str) -> Response:
-        file = found.files.get(name) if digest == found.digest else None
+        file = static.files.get(name) if digest == static.digest else None
         if file is None:
             raise NotFoundError("There is no such file in this version of the page. Load the page again.")
-        return _answer(request, file, _FOR_EVER, POLICY)
+        return _answer(request, file, _IMMUTABLE, POLICY)
 
     options = {"methods": ["GET", "HEAD"], "include_in_schema": False}
     for path in _PAGES:
@@ -140,8 +140,8 @@ def add_static(app: FastAPI) -> None:
 
 
 def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Response:
-    packed = file.packed if _takes_gzip(request.headers.get("accept-encoding", "")) else None
-    tag = f'"{file.digest}-gzip"' if packed is not None else f'"{file.digest}"'
+    compressed = file.compressed if _accepts_gzip(request.headers.get("accept-encoding", "")) else None
+    tag = f'"{file.digest}-gzip"' if compressed is not None else f'"{file.digest}"'
     sent = {
         "ETag": tag,
         "Cache-Control": caching,
@@ -152,11 +152,11 @@ def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Re
     }
     if names_etag(request.headers.get("if-none-match"), tag):
         return Response(status_code=304, headers=sent)
-    if packed is not None:
+    if compressed is not None:
         sent["Content-Encoding"] = "gzip"
-    return Response(file.body if packed is None else packed, headers=sent, media_type=file.kind)
+    return Response(file.body if compressed is None else compressed, headers=sent, media_type=file.kind)
 
 
-def _takes_gzip(accepted: str) -> bool:
+def _accepts_gzip(accepted: str) -> bool:
     """Return whether an Accept-Encoding header accepts gzip; `q=0` refuses it."""
     return re.search(r"\bgzip\b(?!\s*;\s*q=0(\.0*)?\s*(,|$))", accepted) is not None

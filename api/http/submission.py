@@ -69,7 +69,7 @@ class JobFromUploads(BaseModel):
     scene: str = Field(description=f"Id of the upload with the 3DGS scene: {TITLES}.")
     style: str | Annotated[list[str], Field(min_length=1, max_length=MOST_STYLES)] = Field(
         description="Id of the upload with the style image; or a list of several, which are mixed by `style_weights`, "
-        "or are those of `regions`."
+        "or belong to `regions`."
     )
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
@@ -89,14 +89,14 @@ _FORM = {
             "minItems": 1,
             "maxItems": MOST_STYLES,
             "description": "Style image; or the id of an upload. Several are mixed by `style_weights`; those that "
-            "`regions` name are theirs.",
+            "`regions` name belong to the regions.",
         },
         "cameras": {
             "type": "array",
             "items": _FILE,
             "description": "cameras.json, transforms.json, or the files of a COLMAP model.",
         },
-        "photos": {"type": "array", "items": _FILE, "description": "Named as the cameras say."},
+        "photos": {"type": "array", "items": _FILE, "description": "Photos with the names that the cameras give."},
         "parameters": {"type": "string", "description": "JSON: see JobParameters."},
         "webhook": {"type": "string", "description": "URL to notify when the job ends."},
     },

@@ -256,7 +256,7 @@ def test_compressed_scene_and_results_in_other_formats(
         assert (other.status_code, other.json()["code"]) == (422, "invalid-request")
         assert list((service.data / "packing").iterdir()) == []
         with Client(service.url) as user:
-            user.download(job_id, tmp_path / "mine", form="spz")
+            user.download(job_id, tmp_path / "mine", format="spz")
             assert (tmp_path / "mine").read_bytes() == client.get(where, params={"format": "spz"}).content
         command = [sys.executable, "-m", "api.cli", "download", job_id, "--url", service.url]
         command += ["--out", str(tmp_path / "other.compressed.ply")]

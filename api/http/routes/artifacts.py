@@ -91,7 +91,7 @@ _ANSWERS: Responses = {
             "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",
             OutputError.code,
         ),
-        InspectionLimitError("Packing the result takes more time or memory than allowed."),
+        InspectionLimitError("Compressing the result takes more time or memory than allowed."),
         BusyError,
         NoSpaceError,
         StoreError,
@@ -113,27 +113,27 @@ _ANSWERS: Responses = {
 async def get_artifact(
     request: Request,
     job_id: JobId,
-    name: Annotated[str, Path(description="As the list of artifacts has it.", examples=["stylized.ply"])],
+    name: Annotated[str, Path(description="Name in the list of artifacts.", examples=["stylized.ply"])],
     context: ContextDep,
     caller: CallerDep,
     range_: RangeHeader = None,
     if_range: IfRange = None,
     if_none_match: IfNoneMatch = None,
-    form: Annotated[
+    format_: Annotated[
         ResultName | None,
         Query(
             alias="format",
-            description="Of `stylized.ply`: another form of it. It is made when it is first asked for, which takes "
-            "some ten seconds for a million Gaussians, and is kept beside the PLY; "
-            f"{listed([f'`{result_name(RESULT, each)}.json`' for each in EXTRA_FORMATS])} then says what it loses, as "
-            "PSNR of the job's views.",
+            description="Format of `stylized.ply`. The file is converted at the first request, which takes about ten "
+            "seconds for a million Gaussians, and stored beside the PLY; "
+            f"{listed([f'`{result_name(RESULT, each)}.json`' for each in EXTRA_FORMATS])} then has its loss as PSNR in "
+            "the job's views.",
             examples=["spz"],
         ),
     ] = None,
 ) -> Response:
     """Download a file, whole or in ranges. Resume with `Range` and `If-Range`."""
     job = await asyncio.to_thread(find, context, caller, job_id)
-    row = await _find_artifact(context, job, name, form)
+    row = await _find_artifact(context, job, name, format_)
     kind = media_type(row.name)
     file = SentFile(
         sha256=row.sha256,
@@ -148,12 +148,12 @@ async def get_artifact(
     return await send_file(request, file, range_, if_range, if_none_match)
 
 
-async def _find_artifact(context: Context, job: JobRow, name: str, form: ResultName | None) -> ArtifactRow:
+async def _find_artifact(context: Context, job: JobRow, name: str, format_: ResultName | None) -> ArtifactRow:
     """Return the database row of a published file, or of the result in another format."""
-    if form is not None and form != PLY.name:
+    if format_ is not None and format_ != PLY.name:
         if name != RESULT:
-            raise RefusedInputError(f"Only {RESULT} has other forms. Leave 'format' out.", "invalid-request")
-        return await context.compressor.compressed(job, by_name(form))
+            raise RefusedInputError(f"Only {RESULT} has other formats. Omit 'format'.", "invalid-request")
+        return await context.compressor.compressed(job, by_name(format_))
     row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
     if row is None:
         raise NoArtifactError(job.id, name[:80])

@@ -23,7 +23,7 @@ _EVENT = {
     "type": "object",
     "required": ["id", "event", "data"],
     "properties": {
-        "id": {"type": "string", "pattern": "^[0-9]+$", "description": "For `Last-Event-ID`."},
+        "id": {"type": "string", "pattern": "^[0-9]+$", "description": "Number for `Last-Event-ID`."},
         "event": {"type": "string", "enum": ["status", "progress", "artifact"]},
         "data": {"type": "string", "contentMediaType": "application/json"},
     },
@@ -50,7 +50,7 @@ _EXAMPLES = {
     responses={
         200: {
             "description": "Events `status`, `progress` and `artifact`, until the job has ended. Each is sent as the "
-            "lines `id: `, `event: ` and `data: ` with an empty line behind them.",
+            "lines `id: `, `event: ` and `data: `, followed by an empty line.",
             "headers": headers("Cache-Control", "X-Accel-Buffering"),
             "content": {
                 "text/event-stream": {
@@ -62,7 +62,7 @@ _EXAMPLES = {
                 }
             },
         },
-        204: {"description": "The job has ended, and `Last-Event-ID` was its last event: do not come back."},
+        204: {"description": "The job has ended, and `Last-Event-ID` was its last event: do not reconnect."},
         **problems(
             NoJobError,
             invalid("header.Last-Event-ID", "Input should be greater than or equal to 0"),
@@ -75,7 +75,13 @@ async def watch_job(
     caller: CallerDep,
     last_event_id: Annotated[
         Digits | None,
-        Header(alias="Last-Event-ID", ge=0, lt=2**62, description="Go on after this event.", examples=[42]),
+        Header(
+            alias="Last-Event-ID",
+            ge=0,
+            lt=2**62,
+            description="ID of the last received event; later ones follow.",
+            examples=[42],
+        ),
     ] = None,
 ) -> Response:
     """Watch a job. Resume an interrupted stream with `Last-Event-ID`, which browsers' `EventSource` sends by itself."""

@@ -148,10 +148,10 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
     """
     job = find(context, caller, job_id)
     match = re.fullmatch(r"([a-z]{1,10})(?::(\d{1,6}))?", role, re.ASCII)
-    found = [entry for entry in job.inputs if match is not None and entry["role"] == match[1]]
-    place = int(match[2] or 0) if match is not None else 0
-    if place < len(found) and job.status != JobStatus.EXPIRED:
-        entry = found[place]
+    entries = [entry for entry in job.inputs if match is not None and entry["role"] == match[1]]
+    index = int(match[2] or 0) if match is not None else 0
+    if index < len(entries) and job.status != JobStatus.EXPIRED:
+        entry = entries[index]
         row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
         if row is not None:
             return entry, row

@@ -78,13 +78,13 @@ IdempotencyHeader = Annotated[
         alias="Idempotency-Key",
         min_length=1,
         max_length=180,
-        description="The same request with the same key creates nothing twice, for a day.",
+        description="Unique key of the request. Repeating it within a day creates nothing twice.",
         examples=["5f0c9a52-9a3b-4c39-8a1c-0d9a2b8b6d1e"],
     ),
 ]
 
 
-JobId = Annotated[str, Path(description="Of a job.", examples=[JOB_ID])]
+JobId = Annotated[str, Path(description="ID of a job.", examples=[JOB_ID])]
 #: Headers of a response that shows a job.
 _SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
 #: Operations that a client may call next on a job.
@@ -109,7 +109,7 @@ _FOLLOWING_OPERATIONS = (
     responses={
         200: DRY_RUN,
         202: {
-            "description": "The job was accepted: it will not be lost.",
+            "description": "The job is queued.",
             "headers": headers("Location", "Retry-After", maybe=("Idempotency-Replayed",)),
             "links": links(*_FOLLOWING_OPERATIONS, job_id="$response.body#/id"),
         },
@@ -131,19 +131,23 @@ async def create_job(
         receipt = await stack.enter_async_context(context.receipts.of(caller.owner, caller.quotas))
         is_json = media_type(request) == "application/json"
         reading = _from_json(request, context) if is_json else _from_form(request, context, receipt)
-        wanted = await context.threads.run(caller.owner, _find_files, context, caller, await reading)
-        if not wanted.checked:
-            await context.inspector.inspect("validate", caller.owner, wanted.inputs, wanted.rows, wanted.parameters)
+        job_request = await context.threads.run(caller.owner, _find_files, context, caller, await reading)
+        if not job_request.checked:
+            await context.inspector.inspect(
+                "validate", caller.owner, job_request.inputs, job_request.rows, job_request.parameters
+            )
         if not dry_run:
-            return await asyncio.to_thread(_queue_job, context, caller, wanted, idempotency_key, receipt)
+            return await asyncio.to_thread(_queue_job, context, caller, job_request, idempotency_key, receipt)
         stack.pop_all()  # keep the files, which planning needs after this function returns
 
     async def plan(show: Show) -> dict[str, Any]:
         async with receipt:
             inspect = context.inspector.inspect
-            return await inspect("plan", caller.owner, wanted.inputs, wanted.rows, wanted.parameters, show)
+            return await inspect(
+                "plan", caller.owner, job_request.inputs, job_request.rows, job_request.parameters, show
+            )
 
-    return await answer_plan(request, plan, wanted.parameters.workers)
+    return await answer_plan(request, plan, job_request.parameters.workers)
 
 
 @dataclass(frozen=True)
@@ -184,14 +188,14 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
 
 
 def _queue_job(
-    context: Context, caller: Caller, wanted: _JobRequest, idempotency_key: str | None, receipt: Receipt
+    context: Context, caller: Caller, job_request: _JobRequest, idempotency_key: str | None, receipt: Receipt
 ) -> Response:
     """Queue a checked job, and return the response."""
-    parameters, webhook = wanted.parameters, wanted.webhook
-    idempotency = _idempotency(idempotency_key, wanted.inputs, parameters, webhook)
+    parameters, webhook = job_request.parameters, job_request.webhook
+    idempotency = _idempotency(idempotency_key, job_request.inputs, parameters, webhook)
     values = parameters.model_dump(mode="json", exclude_unset=True)
-    name = parameters.name or default_job_name(wanted.inputs)
-    new = NewJob(caller.owner, name, caller.priority, values, wanted.inputs, webhook or None)
+    name = parameters.name or default_job_name(job_request.inputs)
+    new = NewJob(caller.owner, name, caller.priority, values, job_request.inputs, webhook or None)
     jobs = context.store.jobs
     job, created = jobs.create(
         new,
@@ -227,7 +231,7 @@ async def _from_json(request: Request, context: Context) -> Parts:
     styles = [job.style] if isinstance(job.style, str) else job.style
     named = [("scene", job.scene), *(("style", each) for each in styles)]
     named += [("cameras", each) for each in job.cameras] + [("photos", each) for each in job.photos]
-    uploads = [(place, *each) for place, each in enumerate(named)]
+    uploads = [(index, *each) for index, each in enumerate(named)]
     return Received(uploads=uploads), job.parameters, job.webhook
 
 
@@ -248,10 +252,10 @@ def _resolve_inputs(
             raise UnknownUploadError(upload_id, role)
         digests.append(_upload_digest(context, upload, role))
     rows = context.store.inputs.hold(sorted({*digests, *(entry["sha256"] for entry in inputs)}))
-    for number, ((place, role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
+    for number, ((index, role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
         name = clean_name(role, uploads[upload_id].filename, number)
         # Keep the order of the request: style weights follow the order of the styles.
-        inputs.insert(place, {"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
+        inputs.insert(index, {"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
     return inputs, rows
 
 
@@ -271,8 +275,8 @@ def _idempotency(
     if key is None:
         return None
     # Defaults are excluded so that the digest stays the same if a later version adds parameters.
-    told = parameters.model_dump(mode="json", exclude_defaults=True)
-    text = json.dumps([list(inputs), told, webhook], sort_keys=True)
+    values = parameters.model_dump(mode="json", exclude_defaults=True)
+    text = json.dumps([list(inputs), values, webhook], sort_keys=True)
     return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())
 
 
@@ -290,7 +294,7 @@ def list_jobs(
     caller: CallerDep,
     status: Annotated[
         list[StatusName] | None,
-        Query(description="Only these; may be given several times.", examples=[["queued", "running"]]),
+        Query(description="Show only jobs with this status; may be repeated.", examples=[["queued", "running"]]),
     ] = None,
     cursor: Annotated[
         str | None, Query(pattern="^job_[0-9a-f]{31}$", description="`next_cursor` of a page.", examples=[JOB_ID])
@@ -398,7 +402,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
     response_model=JobDetail,
     responses={
         202: {
-            "description": "It waits for its turn again.",
+            "description": "The job is queued again.",
             "headers": _SHOWN,
             "links": links("get_job", "cancel_job", "list_artifacts", job_id="$response.body#/id"),
         },

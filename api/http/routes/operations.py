@@ -24,7 +24,7 @@ async def livez() -> Health:
     operation_id="readyz",
     responses={
         503: {
-            "description": "Something that jobs need is away; `checks` says what.",
+            "description": "Something that jobs need is unavailable; `checks` names it.",
             "headers": headers("Retry-After"),
             "content": {
                 "application/json": {
@@ -49,13 +49,14 @@ async def readyz(context: ContextDep) -> Response:
     check `dispatchers` is "none". Otherwise that check is the number of dispatchers that are alive. The answer comes
     within a second; a check that has not returned by then has failed (`TimeoutError`).
     """
-    found = await context.readiness.run()
+    outcomes = await context.readiness.run()
     checks = {
-        name: type(outcome).__name__ if isinstance(outcome, BaseException) else "ok" for name, outcome in found.items()
+        name: type(outcome).__name__ if isinstance(outcome, BaseException) else "ok"
+        for name, outcome in outcomes.items()
     }
     if not all(value == "ok" for value in checks.values()):
         return JSONResponse(Health(status="unavailable", checks=checks).model_dump(), 503, {"Retry-After": "5"})
-    alive = found["database"]
+    alive = outcomes["database"]
     view = Health(status="ok" if alive else "waiting", checks={**checks, "dispatchers": str(alive or "none")})
     return JSONResponse(view.model_dump())
 
@@ -65,7 +66,7 @@ async def readyz(context: ContextDep) -> Response:
     response_class=PlainTextResponse,
     responses={
         200: {
-            "description": "The text form of Prometheus.",
+            "description": "Metrics in the Prometheus text format.",
             "content": {"text/plain": {"example": 'sgsst_jobs{status="queued"} 3.0\n'}},
         },
         **problems(key=False),

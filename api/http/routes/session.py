@@ -38,7 +38,10 @@ _MAX_BODY = 4096
         }
     },
     responses={
-        204: {"description": "The cookie is the session.", "headers": headers("Set-Cookie", "Cache-Control")},
+        204: {
+            "description": "Signed in; the cookie is the session.",
+            "headers": headers("Set-Cookie", "Cache-Control"),
+        },
         **problems(
             UnknownKeyError,
             CrossOriginError,
@@ -60,10 +63,10 @@ async def sign_in(request: Request, context: ContextDep) -> Response:
     """
     check_origin(request, required=False)
     check_media_type(request, "application/json")
-    wanted = SignIn.model_validate(await read_json(request, context.settings, _MAX_BODY))
+    sign_in = SignIn.model_validate(await read_json(request, context.settings, _MAX_BODY))
     address = request.client.host if request.client else ""
     context.sign_ins.check(address)
-    key = await asyncio.to_thread(context.store.keys.find, wanted.key)
+    key = await asyncio.to_thread(context.store.keys.find, sign_in.key)
     if key is None:
         context.sign_ins.failed(address)
         raise UnknownKeyError
@@ -88,7 +91,7 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     response_class=Response,
     operation_id="sign_out",
     responses={
-        204: {"description": "The session is over.", "headers": headers("Set-Cookie", "Cache-Control")},
+        204: {"description": "The session has ended.", "headers": headers("Set-Cookie", "Cache-Control")},
         **problems(CrossOriginError, key=False),
     },
 )

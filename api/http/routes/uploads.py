@@ -62,21 +62,23 @@ class EmptyFileError(BadRequestError):
     message = "The file is empty. Give its size as Upload-Length."
 
 
-UploadId = Annotated[str, Path(description="Of an upload.", examples=[UPLOAD_ID])]
+UploadId = Annotated[str, Path(description="ID of an upload.", examples=[UPLOAD_ID])]
 Tus = Annotated[
     str,
     Header(
         alias="Tus-Resumable",
-        description="The protocol's version. A request without it is refused.",
+        description="Protocol version. Requests without it are rejected.",
         examples=[VERSION],
         json_schema_extra={"const": VERSION},
     ),
 ]
 LengthHeader = Annotated[
-    Digits, Header(alias="Upload-Length", ge=0, lt=2**60, description="Bytes of the whole file.", examples=[42301])
+    Digits,
+    Header(alias="Upload-Length", ge=0, lt=2**60, description="Size of the whole file in bytes.", examples=[42301]),
 ]
 OffsetHeader = Annotated[
-    Digits, Header(alias="Upload-Offset", ge=0, lt=2**60, description="Where these bytes begin.", examples=[16384])
+    Digits,
+    Header(alias="Upload-Offset", ge=0, lt=2**60, description="Offset of these bytes in the file.", examples=[16384]),
 ]
 
 
@@ -90,7 +92,7 @@ def check_version(tus: Tus = "") -> None:
         raise WrongVersionError(tus)
 
 
-_SPEAKS_TUS = [Depends(check_version)]
+_REQUIRES_TUS = [Depends(check_version)]
 
 
 def _following_operations(**parameters: str) -> dict[str, Any]:
@@ -104,7 +106,7 @@ def _following_operations(**parameters: str) -> dict[str, Any]:
     status_code=204,
     responses={
         204: {
-            "description": "All in headers.",
+            "description": "The answer is in the headers.",
             "headers": headers(
                 "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Checksum-Algorithm", "Tus-Max-Size"
             ),
@@ -128,12 +130,12 @@ def describe_uploads(context: ContextDep) -> Response:
 @router.post(
     "",
     status_code=201,
-    dependencies=_SPEAKS_TUS,
+    dependencies=_REQUIRES_TUS,
     response_model=UploadView,
     operation_id="create_upload",
     responses={
         201: {
-            "description": "Its bytes can be sent to the `Location`.",
+            "description": "The upload is created; send its bytes to the `Location`.",
             "headers": headers("Location", "Tus-Resumable", "Upload-Expires", "Cache-Control"),
             "links": _following_operations(upload_id="$response.body#/id"),
         },
@@ -190,10 +192,10 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
 
 @router.head(
     "/{upload_id}",
-    dependencies=_SPEAKS_TUS,
+    dependencies=_REQUIRES_TUS,
     responses={
         200: {
-            "description": "All in headers.",
+            "description": "The answer is in the headers.",
             "headers": headers(
                 "Upload-Offset",
                 "Upload-Length",
@@ -238,10 +240,10 @@ _PATCH_BODY = {
 @router.patch(
     "/{upload_id}",
     status_code=204,
-    dependencies=_SPEAKS_TUS,
+    dependencies=_REQUIRES_TUS,
     responses={
         204: {
-            "description": "It is kept; `Upload-Offset` is where the next part begins.",
+            "description": "The part is stored; `Upload-Offset` is where the next part starts.",
             "headers": headers("Upload-Offset", "Upload-Expires", "Tus-Resumable", "Cache-Control"),
         },
         **problems(
@@ -278,9 +280,9 @@ async def append_upload(
         ),
     ] = None,
 ) -> Response:
-    """Send the next part. If the connection breaks, received bytes are kept unless a checksum was announced."""
+    """Send the next part. If the connection breaks, received bytes are stored unless a checksum was announced."""
     check_media_type(request, _PART_TYPE)
-    wanted = parse_checksum(checksum) if checksum else None
+    expected = parse_checksum(checksum) if checksum else None
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     if row.sha256 is not None and offset != row.length:
         raise ConflictError(f"The upload is complete with {row.length} bytes.", offset=row.length)
@@ -289,7 +291,7 @@ async def append_upload(
     if row.sha256 is None and row.offset == row.length:  # the service died before it recorded the upload as complete
         await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
     elif row.sha256 is None:
-        expires = await append_body(request, context, row, wanted)
+        expires = await append_body(request, context, row, expected)
     else:
         async for _ in body_blocks(request, context.settings):
             raise LongerThanDeclaredError(row.length)
@@ -303,9 +305,9 @@ async def append_upload(
 @router.delete(
     "/{upload_id}",
     status_code=204,
-    dependencies=_SPEAKS_TUS,
+    dependencies=_REQUIRES_TUS,
     responses={
-        204: {"description": "It is gone.", "headers": headers("Tus-Resumable", "Cache-Control")},
+        204: {"description": "The upload is deleted.", "headers": headers("Tus-Resumable", "Cache-Control")},
         **problems(NoUploadError, WrongVersionError("")),
     },
     operation_id="delete_upload",
