@@ -27,8 +27,8 @@ from sqlalchemy.engine import URL
 
 from service.errors import ServiceError
 from service.files.blobs import BLOBS
-from service.files.names import CHECKPOINT
 from service.files.objects import ObjectStore
+from service.files.staging import CHECKPOINT
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.tables import ArtifactRow, BlobRow, JobRow, UploadPartRow

@@ -17,8 +17,8 @@ from sqlalchemy import delete, exists, select
 
 from service.files.artifacts import Artifacts
 from service.files.blobs import BLOBS, UPLOADS
-from service.files.names import CHECKPOINT
 from service.files.objects import ObjectStore
+from service.files.staging import CHECKPOINT
 from service.files.stored_blobs import open_blobs
 from service.scheduling.housekeeping import strays_of_job
 from service.settings import ServiceSettings

@@ -24,7 +24,7 @@ def main() -> int:
     """Run the check and return the exit status: 0 if the process is healthy."""
     match sys.argv[1:]:
         case ["api"]:
-            return 0 if _answers(f"http://127.0.0.1:{os.environ.get('SGSST_PORT', '8000')}/livez") else 1
+            return 0 if _responds(f"http://127.0.0.1:{os.environ.get('SGSST_PORT', '8000')}/livez") else 1
         case ["dispatcher"]:
             from service.settings import ServiceSettings
             from service.store import Store
@@ -34,7 +34,7 @@ def main() -> int:
     return 2
 
 
-def _answers(url: str) -> bool:
+def _responds(url: str) -> bool:
     try:
         with urllib.request.urlopen(url, timeout=_SECONDS) as answer:
             return bool(answer.status == 200)

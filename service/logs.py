@@ -9,7 +9,7 @@ import sys
 import textwrap
 import time
 
-_OWN = ("job", "attempt", "method", "path", "status", "seconds", "owner")
+_FIELDS = ("job", "attempt", "method", "path", "status", "seconds", "owner")
 
 
 class JsonFormatter(logging.Formatter):
@@ -23,7 +23,7 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        entry |= {name: getattr(record, name) for name in _OWN if hasattr(record, name)}
+        entry |= {name: getattr(record, name) for name in _FIELDS if hasattr(record, name)}
         if record.exc_info:
             entry["exception"] = self.formatException(record.exc_info)
         return json.dumps(entry)
@@ -38,7 +38,7 @@ class TextFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the record as a line of text, followed by the indented traceback if there is one."""
-        own = " ".join(f"{name}={_value(getattr(record, name))}" for name in _OWN if hasattr(record, name))
+        own = " ".join(f"{name}={_value(getattr(record, name))}" for name in _FIELDS if hasattr(record, name))
         line = f"{self.formatTime(record, '%H:%M:%S')} {record.levelname.lower():<7} {record.getMessage()}"
         line = _printable(f"{line}  {own}" if own else line)
         if record.exc_info:
@@ -58,10 +58,10 @@ def _printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
-def set_up(form: str) -> None:
+def set_up(log_format: str) -> None:
     """Log records of level INFO and above to stderr in the format "json" or "text"."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
+    handler.setFormatter(JsonFormatter() if log_format == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
     for noisy in ("httpx", "httpcore", "alembic", "botocore", "uvicorn.access"):
         logging.getLogger(noisy).setLevel(logging.WARNING)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from service.files.names import RESULT
-from service.files.staging import Staged, clean_name, region_styles
+from service.files.staging import RESULT, Staged, clean_name, region_styles
 from service.parameters import JobParameters
 from worker.region_requests import RegionRequest
 from worker.request import SceneRequest, StylizeRequest

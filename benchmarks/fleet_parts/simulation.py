@@ -21,7 +21,7 @@ from typing import Any
 from sqlalchemy import event, select
 
 from benchmarks.fleet_parts.demand import SimulatedJob
-from service.files.names import CHECKPOINT
+from service.files.staging import CHECKPOINT
 from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.machine import Machine
 from service.scheduling.packing import Capacity, Grant

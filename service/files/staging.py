@@ -15,6 +15,10 @@ from sgsst_core.files.formats import format_of_name
 from worker.region_requests import MOST_REGIONS, RegionRequest
 from worker.styles import MOST_PICTURES
 
+#: Name of the stylized scene; the names of a job's other files are derived from it.
+RESULT = "stylized.ply"
+#: Name of the checkpoint that an unfinished job resumes from; the leading dot hides it from users.
+CHECKPOINT = ".checkpoint"
 ROLES = ("scene", "style", "cameras", "photos")
 #: Maximum number of style images: those that belong to no region, plus one for each region.
 MOST_STYLES = MOST_PICTURES + MOST_REGIONS
@@ -174,19 +178,19 @@ def _check_folders(photos: Sequence[Mapping[str, Any]]) -> None:
     """Reject photos if the name of one is also the folder of another."""
     names = {entry["name"] for entry in photos}
     for name in names:
-        above = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in names), None)
-        if above:
-            raise RefusedInputError(f"The photo {above!r} is also the folder of {name!r}.", "invalid-request")
+        parent = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in names), None)
+        if parent:
+            raise RefusedInputError(f"The photo {parent!r} is also the folder of {name!r}.", "invalid-request")
 
 
 def _check_camera_files(names: Sequence[str]) -> None:
     if len(names) > MAX_CAMERA_FILES:
         raise RefusedInputError(f"There are {len(names)} camera files; a COLMAP model has three.", "invalid-cameras")
-    odd = next((name for name in names if PurePosixPath(name).suffix.lower() not in _CAMERA_SUFFIXES), None)
-    if odd is not None:
+    unsupported = next((name for name in names if PurePosixPath(name).suffix.lower() not in _CAMERA_SUFFIXES), None)
+    if unsupported is not None:
         raise RefusedInputError(
-            f"The camera file {odd!r} is none of *.json, *.bin and *.txt.{advice_for_name(odd)} Send a cameras.json, a "
-            "transforms.json, or the files of a COLMAP model, with their own names.",
+            f"The camera file {unsupported!r} is none of *.json, *.bin and *.txt.{advice_for_name(unsupported)} Send a "
+            "cameras.json, a transforms.json, or the files of a COLMAP model, with their own names.",
             "invalid-cameras",
             input="cameras",
         )

@@ -18,8 +18,7 @@ from typing import Any
 from service.errors import NoArtifactError, NotFoundError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
-from service.files.names import RESULT
-from service.files.staging import Staged, stage
+from service.files.staging import RESULT, Staged, stage
 from service.inspection.inspector import LEFTOVER_SECONDS, MEMORY_PER_BYTE, InspectionProcess, findings_of
 from service.parameters import stored_parameters
 from service.settings import ServiceSettings

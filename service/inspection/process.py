@@ -305,7 +305,7 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
     child = os.fork()
     if child == 0:
         os.close(reading)
-        _be_child(request, writing)
+        _run_child(request, writing)
     os.close(writing)
     answer = None
     try:
@@ -328,7 +328,7 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
     yield json.dumps(answer).encode()
 
 
-def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
+def _run_child(request: dict[str, Any], writing: int) -> NoReturn:
     """Process a request in the forked child and exit, without running cleanup code of the parent."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
@@ -336,7 +336,7 @@ def _be_child(request: dict[str, Any], writing: int) -> NoReturn:
         _close_descriptors(writing)
         if request["threads"] > 1:  # the parent has no other threads, which a fork would not copy
             torch.set_num_threads(request["threads"])
-        _die_first()
+        _prefer_oom_kill()
         # threads that wait for each other use CPU time too
         _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _memory_besides_reading(request))
         with os.fdopen(writing, "w") as file:
@@ -410,7 +410,7 @@ def _compile_kernels() -> None:
         os._exit(0)
 
 
-def _die_first() -> None:
+def _prefer_oom_kill() -> None:
     """Make the kernel kill this process rather than a job if the machine runs out of memory."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500")
@@ -446,12 +446,12 @@ def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
                 answer = json.loads(line)
             except (ValueError, RecursionError):
                 return
-            if not _is_answer(answer):
+            if not _is_response(answer):
                 return
             yield answer
 
 
-def _is_answer(answer: Any) -> bool:
+def _is_response(answer: Any) -> bool:
     """Return whether the message of an untrusted child has the format that the calling process accepts."""
     if not isinstance(answer, dict) or not answer.keys() & {"planning", "found", "error"}:
         return False

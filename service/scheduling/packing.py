@@ -69,7 +69,7 @@ class Grant:
     scene: int = 0
 
     @property
-    def beside_gpus(self) -> int:
+    def host_bytes(self) -> int:
         """Host memory in bytes that is reserved for a job on GPUs; 0 without GPUs."""
         return memory_beside_gpus(self.ranks, self.scene) if self.gpus else 0
 
@@ -131,7 +131,7 @@ class Capacity:
         grant = Grant(ranks, tuple(free[:ranks]), scene=_scene_bytes(job))
         if not held or self._machine.cluster:  # a job that runs alone is started even if memory may be short
             return grant
-        together = sum(each.beside_gpus for each in (grant, *held))
+        together = sum(each.host_bytes for each in (grant, *held))
         return grant if together <= _MEMORY_FRACTION * self._machine.memory else None
 
     def _on_cores(self, job: QueuedJob, ranks: int, free: int) -> Grant | None:

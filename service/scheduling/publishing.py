@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 
 from service.errors import StoreError
 from service.files.artifacts import Artifacts
-from service.files.names import CHECKPOINT, RESULT
+from service.files.staging import CHECKPOINT, RESULT
 from service.store import Store
 from service.store.leases import Lease, Published
 

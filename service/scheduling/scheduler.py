@@ -25,7 +25,7 @@ from service.scheduling.packing import Capacity, Grant, QueuedJob
 #: Safety factor on the estimated duration: jobs of equal size differ by a third (standard deviation).
 _CAUTION = 1.5
 #: Minimum gap in seconds that is worth backfilling: no job starts, plans and ends in less time.
-_LEAST_GAP = 20.0
+_MIN_GAP = 20.0
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def backfill(queue: Sequence[QueuedJob], forecast: Forecast, pace: float, snapsh
         snapshot: State of the machine.
     """
     gap = forecast.starts - snapshot.now
-    if gap < _LEAST_GAP:
+    if gap < _MIN_GAP:
         return Decision(Reason.STARTS_SOON, reserved_for=forecast.job_id, forecast=forecast)
     for job in queue:
         if (grant := snapshot.grant(job)) is not None and _cautious_seconds(job, grant, pace) <= gap:

@@ -8,8 +8,7 @@ from pathlib import Path
 from service.errors import DamagedFileError, LostFileError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BLOBS, Blobs
-from service.files.names import CHECKPOINT, RESULT
-from service.files.staging import Staged, layout, stage
+from service.files.staging import CHECKPOINT, RESULT, Staged, layout, stage
 from service.parameters import JobParameters
 from service.scheduling.attempt_process import Task
 from service.scheduling.packing import Grant

@@ -19,7 +19,7 @@ from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, observe, upsert
 from service.store.history import add_point
-from service.store.queue import LOST, WAITING, mine, next_job, next_jobs, reserve
+from service.store.queue import LOST, WAITING, next_job, next_jobs, reserve, reserved_by
 from service.store.quotas import count_gpu_seconds
 from service.store.retries import FailureCount, RetryPolicy, Verdict
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
@@ -169,7 +169,9 @@ class Leases:
         attempt.started_at = now
         session.add(attempt)
         of_job = ReservationRow.job_id == job.id
-        session.execute(delete(ReservationRow).where(of_job if keep_reservation else or_(mine(dispatcher), of_job)))
+        session.execute(
+            delete(ReservationRow).where(of_job if keep_reservation else or_(reserved_by(dispatcher), of_job))
+        )
         served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
         turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
         session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
@@ -211,7 +213,7 @@ class Leases:
         with self._database.writing() as session:
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
             session.execute(update(JobRow).where(held).values(lease_expires_at=EXPIRED))
-            session.execute(delete(ReservationRow).where(mine(dispatcher)))
+            session.execute(delete(ReservationRow).where(reserved_by(dispatcher)))
 
     def hold_gpus(self, lease: Lease, gpus: int) -> None:
         """Set the number of GPUs that the attempt holds, and charge its usage so far to the job's owner."""
@@ -241,8 +243,8 @@ class Leases:
         data = {**progress, "updated_at": now}
         held = and_(JobRow.lease_epoch == lease.epoch, JobRow.lease_owner == lease.dispatcher)
         with self._database.writing() as session:
-            mine = update(JobRow).where(JobRow.id == lease.job_id, held, JobRow.status.in_(ACTIVE))
-            changed: Any = session.execute(mine.values(progress=data))
+            change = update(JobRow).where(JobRow.id == lease.job_id, held, JobRow.status.in_(ACTIVE))
+            changed: Any = session.execute(change.values(progress=data))
             if not changed.rowcount:
                 raise _lost(lease)
             add_event(session, lease.job_id, "progress", data, now)
@@ -373,9 +375,9 @@ class Leases:
 
 def _delete_old_progress() -> Delete:
     """Return the statement that deletes all but the last progress events of a job."""
-    mine = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
-    newest = select(EventRow.id).where(mine).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
-    return delete(EventRow).where(mine, EventRow.id <= newest.scalar_subquery())
+    of_job = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
+    newest = select(EventRow.id).where(of_job).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
+    return delete(EventRow).where(of_job, EventRow.id <= newest.scalar_subquery())
 
 
 _DELETE_OLD_PROGRESS = _delete_old_progress()

@@ -67,7 +67,7 @@ _NOW: BindParameter[float] = bindparam("now", type_=Float)
 WAITING, LOST = _count(queued_now(_NOW)), _count(expired(_NOW))
 
 
-def mine(dispatcher: str | BindParameter[str]) -> ColumnElement[bool]:
+def reserved_by(dispatcher: str | BindParameter[str]) -> ColumnElement[bool]:
     """Return the condition for a dispatcher's reservations."""
     return ReservationRow.dispatcher == dispatcher
 
@@ -101,7 +101,7 @@ def _candidates() -> Select[Any] | CompoundSelect[Any]:
     dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
     skipped = bindparam("skipped", type_=String, expanding=True)
     lost = select(JobRow.id).where(expired(now), JobRow.id.not_in(skipped))
-    reserved = select(ReservationRow.job_id).where(mine(dispatcher), ReservationRow.job_id.not_in(skipped))
+    reserved = select(ReservationRow.job_id).where(reserved_by(dispatcher), ReservationRow.job_id.not_in(skipped))
     return union_all(_first_of_each_owner(now, skipped), lost, reserved)
 
 
@@ -110,7 +110,7 @@ def _first() -> Select[JobRow]:
     """Return the query for the first candidates, up to `most`."""
     dispatcher, now = bindparam("dispatcher", type_=String), bindparam("now", type_=Float)
     turn = case((TurnRow.served.is_(None), 0), else_=TurnRow.served)
-    not_reserved = case((mine(dispatcher), 0), else_=1)
+    not_reserved = case((reserved_by(dispatcher), 0), else_=1)
     query = (
         select(JobRow)
         .outerjoin(TurnRow, TurnRow.owner == JobRow.owner)
@@ -151,7 +151,7 @@ def reserve(session: Session, job_id: str, dispatcher: str, now: float, seconds:
     if row is not None and row.dispatcher != dispatcher and row.until >= now:
         return False
     if row is None or row.dispatcher != dispatcher or row.until < now + _RENEW_FRACTION * seconds:
-        session.execute(delete(ReservationRow).where(mine(dispatcher), ReservationRow.job_id != job_id))
+        session.execute(delete(ReservationRow).where(reserved_by(dispatcher), ReservationRow.job_id != job_id))
         values = {"dispatcher": dispatcher, "until": now + seconds}
         insert = upsert(session)(ReservationRow).values(job_id=job_id, **values)
         session.execute(insert.on_conflict_do_update(index_elements=["job_id"], set_=values))

@@ -55,9 +55,9 @@ class Marker:
         if number >= marked:
             return
         message = (
-            f"{self._database} has lost what was committed last: its newest event is {number}, and was {marked}. Files "
-            f"that it does not know are kept; `sgsst fsck` lists them. Restore a backup, or delete {self.note} to have "
-            "them collected."
+            f"database was rolled back: path={self._database} newest_event={number} expected={marked}. Files without "
+            f"rows are not deleted; `sgsst fsck` lists them. Restore a backup, or delete {self.note} to have them "
+            "deleted."
         )
         _log.error("%s", message)
         with self.note.open("a") as file:

@@ -37,7 +37,7 @@ from service.errors import (
     StoreError,
 )
 from service.files.artifacts import media_type
-from service.files.names import RESULT
+from service.files.staging import RESULT
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import EXTRA_FORMATS, RESULT_FORMATS, ResultName, by_name, listed, result_name

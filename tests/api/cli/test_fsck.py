@@ -18,8 +18,8 @@ from api.cli.main import main
 from service import fsck
 from service.errors import LostFileError
 from service.files.artifacts import Artifacts
-from service.files.names import CHECKPOINT
 from service.files.objects import ObjectStore
+from service.files.staging import CHECKPOINT
 from service.files.stored_blobs import open_blobs
 from service.settings import ServiceSettings
 from service.store import Store, open_store

@@ -106,7 +106,7 @@ def test_damaged_result_is_not_sent(
     logged = service.log.stat().st_size
     for headers in ({}, {"Range": "bytes=0-9"}, {"Range": "bytes=10-", "If-Range": sent.headers["etag"]}):
         refused(client.get(where, headers=headers), "file-damaged")
-    assert f"{path.name} in " in service.log.read_text()[logged:]
+    assert f"/{path.name} sha256=" in service.log.read_text()[logged:]
     path.unlink()
     refused(client.get(where), "file-lost")
 

@@ -14,7 +14,7 @@ from api.http.sign_ins import MOST_FAILURES, WITHIN_SECONDS, SignIns, TooManyTri
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from service.store.sessions import MOST_SESSIONS
+from service.store.keys import MOST_SESSIONS
 from tests.api.service import Service, check_documented
 
 COOKIE = "sgsst_session"

@@ -285,16 +285,16 @@ def test_gpu_jobs_wait_for_host_memory() -> None:
     capacity = Capacity(machine(8), None)
     alone = capacity.grant(job(200 * GB, workers=1), [], 1)
     assert alone is not None, "were it too big: it may try"
-    assert alone.beside_gpus == 3 * GB + 400 * GB
+    assert alone.host_bytes == 3 * GB + 400 * GB
     first = capacity.grant(job(20 * GB, workers=4), [], 9)
     assert first is not None
-    assert first.beside_gpus == 4 * 3 * GB + 40 * GB
+    assert first.host_bytes == 4 * 3 * GB + 40 * GB
     assert capacity.grant(job(15 * GB, workers=1), [first], 9) is None, "52 + 33 GB are more than four fifths of 100 GB"
     second = capacity.grant(job(10 * GB, workers=1), [first], 9)
     assert second is not None
     assert second.gpus == ("gpu4",)
     fewer = replace(first, ranks=1, gpus=first.gpus[:1])
-    assert fewer.beside_gpus == 3 * GB + 40 * GB, "what the plan does without counts no more"
+    assert fewer.host_bytes == 3 * GB + 40 * GB, "what the plan does without counts no more"
 
 
 @given(st.lists(st.tuples(st.integers(1, 60 * GB), st.integers(1, 8)), max_size=12))
@@ -306,7 +306,7 @@ def test_gpu_jobs_never_exceed_host_memory(jobs: list[tuple[int, int]]) -> None:
         if grant is not None:
             held.append(grant)
     assert bool(held) == bool(jobs), "the first one always runs, were it too big"
-    assert len(held) < 2 or sum(grant.beside_gpus for grant in held) <= 80 * GB
+    assert len(held) < 2 or sum(grant.host_bytes for grant in held) <= 80 * GB
 
 
 def test_one_job_at_a_time_runs_without_gpus(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from safetensors.numpy import save_file
 from service.errors import LostFileError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.cache import file_digest
-from service.files.names import CHECKPOINT
+from service.files.staging import CHECKPOINT
 from service.scheduling import publishing, store_workplace
 from service.scheduling.store_workplace import StoredFile, StoreWorkplace, store_weights
 from service.store.leases import Published
