@@ -20,6 +20,7 @@ from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
 from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
 from sgsst_core.files.stylized_ply import check_sh_attenuation
+from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
@@ -29,6 +30,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import choose_axes, read_capture
@@ -188,13 +190,13 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
 
     Args:
         source: Scene, and cameras for the comparison; without cameras, views are those of an orbit.
-        out: File to write; meta.json for an unpacked SOG.
+        out: File to write: a scene, the meta.json of an unpacked SOG, or a USD file, which cannot be compared.
         compare: Whether to read the file back and compare renders.
 
     Raises:
         InvalidInputError: If scene, cameras or output cannot be used.
     """
-    format = None if out.name == META_NAME else result_format(out)
+    _check_target(out, compare)
     check_is_not_scene(out, source.scene)
     check_folder(out.parent)
     if compare and source.cameras is None:
@@ -207,10 +209,27 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
         capture = read_capture(source, scene).checked(scene, source.near)
         cameras, decisions = capture.cameras, [*decisions, *capture.decisions]
     out.parent.mkdir(parents=True, exist_ok=True)
-    if format is not None:
-        write_scene(out, scene, format)
-        size = out.stat().st_size
-    else:
-        size = write_sog_folder(out.parent, scene)
+    size = _write_as(out, scene)
     loss = replace(measure_compression(out, scene, cameras, near=source.near), size=size) if compare else None
     return Converted(len(scene), file.notes, tuple(decisions), loss)
+
+
+def _check_target(out: Path, compare: bool) -> None:
+    """Check that the name of a file determines a format that can be written and, if requested, compared."""
+    if out.suffix.lower() in USD_SUFFIXES and not out.is_dir():
+        check_usd(out)
+        if compare:
+            raise OutputError(f"{out}: USD can only be written, so it cannot be compared. Omit --compare.")
+    elif out.name != META_NAME:
+        result_format(out)
+
+
+def _write_as(out: Path, scene: Scene) -> int:
+    """Write a scene in the format that the name of a file determines. Return the bytes that it takes."""
+    if out.name == META_NAME:
+        return write_sog_folder(out.parent, scene)
+    if out.suffix.lower() in USD_SUFFIXES:
+        write_usd(out, scene)
+    else:
+        write_scene(out, scene, result_format(out))
+    return out.stat().st_size

@@ -26,7 +26,7 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
 from sgsst_core.files.formats.render_tag import UNTAGGED, RenderTag
-from sgsst_core.files.formats.scene_format import SceneFormat, SceneHeader
+from sgsst_core.files.formats.scene_format import Arrays, SceneFormat, SceneHeader
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.scene_columns import SceneColumns
@@ -262,11 +262,15 @@ def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Pa
     assert format.write is not None
     if format is not PLY:
         scene = scene.without_zero_bands()
-    arrays = {name: held(getattr(scene, name)).detach().cpu().float().numpy() for name in TENSORS}
     try:
-        format.write(output, arrays, scene.rendering)
+        format.write(output, arrays_of(scene), scene.rendering)
     except OutputError as error:
         raise OutputError(f"{target}: {error}") from error
+
+
+def arrays_of(scene: Scene) -> Arrays:
+    """Return the arrays of a scene for a writer, which share memory with its tensors."""
+    return {name: held(getattr(scene, name)).detach().cpu().float().numpy() for name in TENSORS}
 
 
 def _row_layout(path: Path, header: PlyHeader, stamp: tuple[int, int], offset: int) -> RowLayout:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from sgsst_core.constants import SH_C1, SH_C2, SH_C3
 from sgsst_core.files.formats.scene_format import Arrays
 
+#: Rotation by 180 degrees about z, [4, 4], which converts between a PLY and axes with y up and z forward, as of glTF.
+Y_UP = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: Number of directions from which the matrices of spherical harmonics are computed; 15 determine degree 3.
 _DIRECTIONS = 64
 #: Decimals of a matrix of spherical harmonics: float64 leaves more, and a rotation by 180 degrees gets exact signs.

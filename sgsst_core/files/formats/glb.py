@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.formats.frame import Frame
+from sgsst_core.files.formats.frame import Y_UP, Frame
 from sgsst_core.files.formats.quantized import SH_C0
 from sgsst_core.files.formats.render_tag import extras_of, extras_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
@@ -61,8 +61,6 @@ _ATTRIBUTES = {
     "sh_dc": (f"{_EXTENSION}:SH_DEGREE_0_COEF_0", "VEC3"),
 }
 _HARMONICS = [f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3) for i in range(2 * degree + 1)]
-#: Rotation by 180 degrees about z, which converts between the axes of glTF and of a PLY.
-_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 #: Range of written log scales, within that of float32, and largest written opacity, the last one below 1.
 _LOG_SCALES = (-87.0, 88.0)
@@ -202,7 +200,7 @@ def _parsed(
         coefficients,
         {name: accessor(*attribute) for name, attribute in _ATTRIBUTES.items()},
         [accessor(name, "VEC3") for name in _HARMONICS[:coefficients]],
-        Frame.of(_AXES @ _node_matrix(document, mesh)),
+        Frame.of(Y_UP @ _node_matrix(document, mesh)),
         tag=extras_tag(primitive.get("extras"), "the extras of the GLB"),
     )
 
@@ -307,7 +305,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
         OutputError: If the file would exceed 4 GB.
     """
     arrays = {name: array.copy() for name, array in arrays.items()}
-    Frame.of(_AXES).apply(arrays)
+    Frame.of(Y_UP).apply(arrays)
     columns = _columns(arrays)
     data_bytes = sum(column.nbytes for _, column in columns)
     document = _document(columns, data_bytes, extras_of(rendering))

@@ -15,7 +15,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
 from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.scene.gaussians import TENSORS
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -898,8 +899,8 @@ def test_convert_writes_what_it_reads(files: Files, capsys: pytest.CaptureFixtur
     assert main(["convert", str(written), str(back)]) == 0
     one, other = (read_scene(path) for path in (written, back))
     assert (one.format, other.format) == (name, "ply")
-    for field in fields(one.scene):
-        assert torch.equal(getattr(one.scene, field.name), getattr(other.scene, field.name)), field.name
+    for field in TENSORS:
+        assert torch.equal(getattr(one.scene, field), getattr(other.scene, field)), field
 
 
 def test_convert_writes_an_unpacked_sog(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
@@ -912,6 +913,15 @@ def test_convert_writes_an_unpacked_sog(files: Files, capsys: pytest.CaptureFixt
         assert {name: found.read(name) for name in found.namelist()} == {
             path.name: path.read_bytes() for path in meta.parent.iterdir()
         }
+
+
+def test_convert_writes_usd(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    out = files.out.with_name("scene.usdc")
+    assert main(["convert", str(files.ply), str(out), "--compare"]) == 2
+    assert "Omit --compare" in capsys.readouterr().err
+    assert main(["convert", str(files.ply), str(out)]) == 0
+    assert [path.name for path in out.parent.iterdir()] == ["scene.usdc"]
 
 
 def test_convert_compares_in_an_orbit(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
