@@ -47,7 +47,7 @@ def test_no_class_has_more_than_15_attributes(package: str) -> None:
     assert {name: count for name, count in found.items() if count > MOST_ATTRIBUTES} == {}
 
 
-def test_attributes_that_any_method_sets_are_counted_once() -> None:
+def test_attributes_set_by_several_methods_are_counted_once() -> None:
     source = """
         class Counter:
             step: int = 0

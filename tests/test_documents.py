@@ -32,32 +32,32 @@ each_document_of_today = pytest.mark.parametrize(
 
 
 @each_document
-def test_lines_are_no_longer_than_those_of_code(document: Path) -> None:
+def test_lines_have_at_most_120_columns(document: Path) -> None:
     lines = document.read_text().splitlines()
     assert [line for line in lines if len(line) > COLUMNS and not line.startswith("|")] == []
 
 
 @each_document
-def test_links_lead_to_files(document: Path) -> None:
+def test_link_targets_exist(document: Path) -> None:
     targets = re.findall(r"\]\(([^)#]+)", document.read_text())
     files = [target for target in targets if "://" not in target]
     assert [file for file in files if not (document.parent / file).exists()] == []
 
 
 @each_document_of_today
-def test_files_that_are_named_exist(document: Path) -> None:
+def test_cited_files_exist(document: Path) -> None:
     named = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[^` ]*)`", document.read_text())
     assert [path for path in named if not list(ROOT.glob(path))] == []
 
 
 @each_document_of_today
-def test_modules_that_are_named_exist(document: Path) -> None:
+def test_cited_modules_exist(document: Path) -> None:
     named = re.findall(rf"(?:python -m|from) ((?:{'|'.join(FOLDERS)})[\w.]*)", document.read_text())
     assert [name for name in named if importlib.util.find_spec(name) is None] == []
 
 
 @each_document_of_today
-def test_tests_that_are_named_exist(document: Path) -> None:
+def test_cited_tests_exist(document: Path) -> None:
     named = set(re.findall(r"`(?:[\w/]+\.py::)?(test_\w+|Test\w+)`", document.read_text()))
     sources = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
     assert {name for name in named if not re.search(rf"(?:def |class |^){name}\b", sources, re.M)} == set()

@@ -103,7 +103,7 @@ def assert_same(found: Scene, expected: Scene, tolerance: float = 1e-4, opacitie
 
 
 @pytest.mark.parametrize("name", READ_BY_SPLAT_TRANSFORM)
-def test_splat_transform_reads_what_is_written(modules: Path, scene: Scene, tmp_path: Path, name: str) -> None:
+def test_splat_transform_reads_written_scenes(modules: Path, scene: Scene, tmp_path: Path, name: str) -> None:
     ours, ply = tmp_path / f"ours.{name}", tmp_path / "theirs.ply"
     write_scene(ours, scene, by_name(name))
     splat_transform(modules, ours, ply)
@@ -120,7 +120,7 @@ def test_splat_transform_reads_what_is_written(modules: Path, scene: Scene, tmp_
         ("meta.json", ()),
     ],
 )
-def test_what_splat_transform_writes_is_read(
+def test_scenes_of_splat_transform_are_read(
     modules: Path, scene: Scene, tmp_path: Path, name: str, options: tuple[str, ...]
 ) -> None:
     ours, theirs, back = tmp_path / "ours.ply", tmp_path / name, tmp_path / "back.ply"
@@ -130,7 +130,7 @@ def test_what_splat_transform_writes_is_read(
     assert_same(read_scene(theirs).scene, read_scene(back).scene, 0.02 if "compressed" in name else 1e-4)
 
 
-def test_glb_is_that_of_splat_transform(modules: Path, scene: Scene, tmp_path: Path) -> None:
+def test_glb_matches_splat_transform(modules: Path, scene: Scene, tmp_path: Path) -> None:
     """All attributes have the same values, up to the last bit of normalized quaternions, and those of the PLY."""
     ply, ours, theirs = (tmp_path / name for name in ("ours.ply", "ours.glb", "theirs.glb"))
     unit = replace(scene, quats=torch.nn.functional.normalize(scene.quats, dim=1))
@@ -160,7 +160,7 @@ def test_glb_is_valid(modules: Path, scene: Scene, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_ksplat_of_its_own_program_is_read(modules: Path, scene: Scene, tmp_path: Path, level: int) -> None:
+def test_ksplat_of_reference_writer_is_read(modules: Path, scene: Scene, tmp_path: Path, level: int) -> None:
     """The values are those that splat-transform reads and, within the format's rounding, those of the PLY."""
     ply, theirs, back = (tmp_path / name for name in ("ours.ply", "theirs.ksplat", "back.ply"))
     within = replace(scene, sh_dc=scene.sh_dc.clamp(-1.7, 1.7), opacities=scene.opacities.clamp(-5, 5))
@@ -196,7 +196,7 @@ def attributes_of(path: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["ply", "compressed.ply", "spz", "v4.spz", "sog"])
-def test_gaussforge_reads_what_is_written(scene: Scene, tmp_path: Path, name: str) -> None:
+def test_gaussforge_reads_written_scenes(scene: Scene, tmp_path: Path, name: str) -> None:
     ours = tmp_path / f"ours.{name}"
     write_scene(ours, scene, by_name(name))
     answer = gaussforge.GaussForge().read(ours.read_bytes(), name.removeprefix("v4."))
@@ -216,6 +216,6 @@ def test_gaussforge_reads_what_is_written(scene: Scene, tmp_path: Path, name: st
         torch.testing.assert_close(found, values, rtol=1e-5, atol=1e-5, msg=key)
 
 
-def test_no_format_is_forgotten() -> None:
+def test_every_result_format_is_tested() -> None:
     """A new format is added to the lists above, or here if no other program reads it."""
     assert {each.name for each in RESULT_FORMATS} == {*READ_BY_SPLAT_TRANSFORM, "glb"}

@@ -21,7 +21,7 @@ PRIVATE = re.compile(
 )
 
 
-def test_only_these_modules_use_private_names() -> None:
+def test_only_listed_modules_use_private_names() -> None:
     files = [path for package in ("sgsst_core", "worker", "service", "api") for path in (ROOT / package).rglob("*.py")]
     found = {path.relative_to(ROOT).as_posix() for path in files if PRIVATE.search(path.read_text())}
     assert found == {"worker/ranks/cluster.py", "worker/ranks/process_group.py"}, (
@@ -41,7 +41,7 @@ def ray_worker() -> str:
     return (Path(spec.origin).parent / "_private" / "worker.py").read_text()
 
 
-def test_ray_prints_by_a_function_that_can_be_replaced() -> None:
+def test_ray_print_function_is_replaceable() -> None:
     assert "\ndef print_to_stdstream(" in ray_worker(), (
         "Ray's driver prints the errors of its processes by another function now. Find what writes them to standard "
         "output, and replace that one in worker/ranks/cluster.py."
@@ -49,7 +49,7 @@ def test_ray_prints_by_a_function_that_can_be_replaced() -> None:
 
 
 @pytest.mark.parametrize("option", ["_temp_dir", "_node_ip_address"])
-def test_ray_starts_in_a_folder_and_on_an_address_of_our_own(option: str) -> None:
+def test_ray_init_accepts_folder_and_address(option: str) -> None:
     assert f'"{option}"' in ray_worker(), (
         f"ray.init no longer knows {option}. Find what took its place, and change worker/ranks/cluster.py: "
         "without a folder of its own, what a killed Ray leaves behind cannot be swept away; without 127.0.0.1, Ray "
@@ -57,7 +57,7 @@ def test_ray_starts_in_a_folder_and_on_an_address_of_our_own(option: str) -> Non
     )
 
 
-def test_numba_keeps_kernels_by_a_method_that_can_be_replaced() -> None:
+def test_numba_cache_save_method_is_replaceable() -> None:
     import numba.core.caching
 
     assert list(inspect.signature(numba.core.caching.Cache.save_overload).parameters) == ["self", "sig", "data"], (
@@ -66,7 +66,7 @@ def test_numba_keeps_kernels_by_a_method_that_can_be_replaced() -> None:
     )
 
 
-def test_ray_binds_to_loopback_where_it_is_no_part_of_a_cluster() -> None:
+def test_ray_can_keep_the_loopback_address() -> None:
     spec = importlib.util.find_spec("ray")
     assert spec is not None
     assert spec.origin is not None
@@ -81,7 +81,7 @@ def test_ray_binds_to_loopback_where_it_is_no_part_of_a_cluster() -> None:
     )
 
 
-def test_the_store_of_ranks_takes_a_socket() -> None:
+def test_tcp_store_accepts_a_listening_socket() -> None:
     import torch.distributed as dist
 
     store: Any = dist.TCPStore  # type: ignore[attr-defined]
@@ -92,7 +92,7 @@ def test_the_store_of_ranks_takes_a_socket() -> None:
     )
 
 
-def test_a_process_group_forgets_its_device() -> None:
+def test_process_group_device_can_be_reset() -> None:
     import torch.distributed as dist
 
     assert isinstance(getattr(dist.ProcessGroup, "bound_device_id", None), property), (
@@ -101,7 +101,7 @@ def test_a_process_group_forgets_its_device() -> None:
     )
 
 
-def test_a_process_group_can_be_told_how_long_to_wait() -> None:
+def test_process_group_timeout_can_be_set() -> None:
     from torch.distributed import distributed_c10d
 
     set_timeout = getattr(distributed_c10d, "_set_pg_timeout", None)
@@ -127,7 +127,7 @@ def test_a_process_group_can_be_told_how_long_to_wait() -> None:
         "send_400_response",
     ],
 )
-def test_methods_that_the_bounded_connection_overrides(method: str) -> None:
+def test_overridden_connection_methods_exist(method: str) -> None:
     from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
     from api.http.connection import Connection
@@ -142,7 +142,7 @@ def test_methods_that_the_bounded_connection_overrides(method: str) -> None:
 @pytest.mark.parametrize(
     "attribute", ["loop", "transport", "flow", "connections", "pipeline", "scope", "headers", "cycle"]
 )
-def test_attributes_that_the_bounded_connection_reads(attribute: str) -> None:
+def test_connection_attributes_exist(attribute: str) -> None:
     from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
     assert f"self.{attribute}" in inspect.getsource(HttpToolsProtocol.__init__), (
@@ -151,7 +151,7 @@ def test_attributes_that_the_bounded_connection_reads(attribute: str) -> None:
 
 
 @pytest.mark.parametrize("attribute", ["body", "response_started", "response_complete"])
-def test_attributes_of_an_answer_that_the_bounded_connection_reads(attribute: str) -> None:
+def test_response_attributes_exist(attribute: str) -> None:
     from uvicorn.protocols.http.httptools_impl import RequestResponseCycle
 
     assert f"self.{attribute}" in inspect.getsource(RequestResponseCycle.__init__), (

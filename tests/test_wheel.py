@@ -102,7 +102,7 @@ def run(command: list[str | Path], folder: Path, **variables: str) -> str:
     return done.stdout
 
 
-def test_every_file_of_the_packages_is_in_the_wheel(wheel: Path) -> None:
+def test_wheel_contains_every_package_file(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         packed = {name for name in archive.namelist() if not name.split("/")[0].endswith(".dist-info")}
     paths = [path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()]
@@ -110,21 +110,23 @@ def test_every_file_of_the_packages_is_in_the_wheel(wheel: Path) -> None:
     assert {f"{name}/py.typed" for name in PACKAGES} <= packed
 
 
-def test_the_installed_packages_are_those_of_the_wheel(installed: Path, tmp_path: Path) -> None:
+def test_packages_are_imported_from_the_wheel(installed: Path, tmp_path: Path) -> None:
     code = f"import {', '.join(PACKAGES)}; print(*(package.__file__ for package in ({', '.join(PACKAGES)})))"
     files = run([installed / "python", "-c", code], tmp_path).split()
     assert all(Path(file).is_relative_to(installed.parent) for file in files), files
     assert run([installed / "sgsst", "--version"], tmp_path).strip()
 
 
-def test_the_page_and_what_it_loads_are_installed(installed: Path, tmp_path: Path) -> None:
+def test_web_page_and_its_assets_are_installed(installed: Path, tmp_path: Path) -> None:
     code = "from api.http.static import static_files as found; print(found().digest, *found().pages, *found().files)"
     digest, *names = run([installed / "python", "-c", code], tmp_path).split()
     assert digest == static_files().digest, "another byte"
     assert {"index.html", "docs.html", "vendor/swagger-ui/swagger-ui-bundle.js"} <= set(names)
 
 
-def test_a_scene_is_stylized_and_reported(installed: Path, vgg16_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_installed_command_stylizes_and_reports(
+    installed: Path, vgg16_weights: BackboneWeights, tmp_path: Path
+) -> None:
     ply, cameras, style = write_files(tmp_path, wall())
     out = tmp_path / "new" / "stylized.ply"
     options: list[str | Path] = ["--cameras", cameras, "--style", style, "--out", out, "--backbone", "vgg16"]
@@ -136,7 +138,7 @@ def test_a_scene_is_stylized_and_reported(installed: Path, vgg16_weights: Backbo
 SERVICE = ("ray", "fastapi", "sqlalchemy", "alembic", "uvicorn", "prometheus_client", "pydantic_settings")
 
 
-def test_core_has_no_packages_of_the_service(core: Path, tmp_path: Path) -> None:
+def test_core_installs_no_service_packages(core: Path, tmp_path: Path) -> None:
     code = f"from importlib.util import find_spec; print(*(name for name in {SERVICE} if find_spec(name)))"
     assert run([core / "python", "-c", code], tmp_path).split() == []
 
@@ -159,7 +161,7 @@ save("library.ply", result)
 
 
 @pytest.mark.parametrize("arguments", ["serve", "fsck", "keys list", "stylize --workers 2"])
-def test_core_names_the_extra_that_a_command_needs(core: Path, tmp_path: Path, arguments: str) -> None:
+def test_core_commands_name_the_missing_extra(core: Path, tmp_path: Path, arguments: str) -> None:
     command: list[str | Path] = [core / "sgsst", *arguments.split()]
     if "stylize" in arguments:
         ply, cameras, style = write_files(tmp_path, wall())
@@ -171,12 +173,12 @@ def test_core_names_the_extra_that_a_command_needs(core: Path, tmp_path: Path, a
     assert not (tmp_path / "out").exists()
 
 
-def test_core_has_the_client(core: Path, tmp_path: Path) -> None:
+def test_core_includes_the_client(core: Path, tmp_path: Path) -> None:
     done = subprocess.run([core / "sgsst", "submit", "missing.ply", "--style", "a.jpg"], capture_output=True, text=True)
     assert "missing.ply: is not a file" in done.stderr
 
 
-def test_a_database_is_made_by_the_migrations(installed: Path, tmp_path: Path) -> None:
+def test_migrations_create_the_database(installed: Path, tmp_path: Path) -> None:
     arguments = ["--data", str(tmp_path / "data"), "--json"]
     run([installed / "sgsst", "keys", "create", "alice", *arguments], tmp_path)
     listed = json.loads(run([installed / "sgsst", "keys", "list", *arguments], tmp_path))

@@ -14,11 +14,11 @@ from service.store.states import JobStatus
 
 
 def job(at: float, owner: str, factor: float = 1.0, **parameters: Any) -> SimulatedJob:
-    told = {"preset": "paper", "resolution": 980, **parameters}
-    return SimulatedJob(at, owner, "paper", told, 248_000_000, factor)
+    options = {"preset": "paper", "resolution": 980, **parameters}
+    return SimulatedJob(at, owner, "paper", options, 248_000_000, factor)
 
 
-def test_the_demand_makes_the_load_and_is_the_same_for_a_seed() -> None:
+def test_demand_matches_load_and_is_reproducible() -> None:
     demand = Demand(1000, load=0.9)
     jobs = demand.jobs(2.0, seed=3)
     assert jobs == demand.jobs(2.0, seed=3)
@@ -29,7 +29,7 @@ def test_the_demand_makes_the_load_and_is_the_same_for_a_seed() -> None:
     assert sum(each.owner == "key_000" for each in jobs) == round(0.05 * len(jobs))
 
 
-def test_a_small_fleet_does_all_that_it_is_asked_for() -> None:
+def test_small_fleet_serves_its_demand_reproducibly() -> None:
     found = simulate(Demand(16, load=0.8, keys=20), hours=0.5, host_days=1000, seed=1)
     assert found["jobs"] == found["attempts"] == round(200_000 * 0.016 / 48)
     assert found["ended"] > 0.7 * found["jobs"]
@@ -41,7 +41,7 @@ def test_a_small_fleet_does_all_that_it_is_asked_for() -> None:
     assert again == found
 
 
-def test_hosts_that_fail_lose_time_and_no_job(tmp_path: Path) -> None:
+def test_failing_hosts_lose_time_but_no_jobs(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path, hosts=3, gpus_each=2, host_days=0.02, seed=2)
     fleet.run([job(10.0 * number, f"key_{number % 3}") for number in range(12)], 40_000.0, 0.0)
     records = fleet.records.values()
@@ -53,7 +53,7 @@ def test_hosts_that_fail_lose_time_and_no_job(tmp_path: Path) -> None:
     fleet.store.close()
 
 
-def test_one_that_wants_a_whole_host_gets_it_and_the_others_work_on(tmp_path: Path) -> None:
+def test_whole_host_job_is_not_starved_and_others_run(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path, hosts=3, gpus_each=4, host_days=1e9, seed=0)
     small = [job(float(number), "many", 0.2 + number % 5 / 2, workers=1) for number in range(60)]
     fleet.run([*small, job(5.5, "one", workers=4)], 20_000.0, 0.0)

@@ -22,14 +22,14 @@ FLOP = 2 * 9 * (
 )  # fmt: skip
 
 
-def test_vgg19_takes_0_72_million_operations_a_pixel_either_way() -> None:
+def test_vgg19_takes_0_72_million_operations_per_pixel_and_pass() -> None:
     forward, backward = Passes(make_loss("float32"), SMALL.size, [0]).network()
     assert FLOP == 722_304
     for works in (forward, backward):
         assert sum(work.operations for work in works) / (96 * 128) == FLOP
 
 
-def test_what_does_not_fit_goes_forward_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_activations_beyond_memory_are_recomputed(monkeypatch: pytest.MonkeyPatch) -> None:
     loss = make_loss("float32")
     passes = Passes(loss, SMALL.size, [0])
     passes.kept = [False]
@@ -50,27 +50,27 @@ def test_launches_are_counted_with_their_bytes() -> None:
     assert last == Work(0, 2 * 5 * 2)
 
 
-def test_the_slower_of_unit_and_memory_counts() -> None:
+def test_slower_of_compute_and_memory_determines_time() -> None:
     rates = {"convolution": 100.0, "matrix": 10.0, "bytes": 50.0}
     assert Work(200, 50).seconds(rates) == 2
     assert Work(200, 500).seconds(rates) == 10
     assert Work(200, 500, "matrix").seconds(rates) == 20
 
 
-def test_statistics_are_made_of_the_upper_pairs() -> None:
+def test_statistics_use_upper_triangle_of_channel_pairs() -> None:
     assert statistics(64, 1000, 4).operations == 2 * 64**2 * 1000
     assert statistics(512, 1000, 4).operations == 2 * 512**2 * 1000 * 36 / 64
     large = statistics(512, 10**6, 2)
     assert large.bytes > 8 * 512 * 10**6 * 2  # eight passes, since it does not fit into the cache
 
 
-def test_features_decide_how_products_are_rounded() -> None:
+def test_feature_precision_determines_matrix_product_rate() -> None:
     rates = {name: SHARES["likely"].rates(name)["matrix"] for name in forecast.PRECISIONS}
     assert rates["tf32"] == rates["float32"] == forecast.PEAKS["float32"] * SHARES["likely"].matrix["ieee"]
     assert rates["bfloat16"] == forecast.PEAKS["tf32"] * SHARES["likely"].matrix["tf32"]
 
 
-def test_device_and_host_work_at_the_same_time() -> None:
+def test_device_and_host_times_overlap() -> None:
     shares = SHARES["likely"]
     parts = {
         "a": Part([Work(0, 4.8e12 * shares.bandwidth)] * 3),
@@ -91,7 +91,7 @@ def test_cached_values_are_not_recomputed() -> None:
     assert [parts[name].visits for name in parts if name.endswith("recomputed")] == [0.0] * 3
 
 
-def test_the_range_holds_the_likely_figure() -> None:
+def test_forecast_range_contains_likely_value() -> None:
     found = forecast.forecast(SMALL, "tf32", LAUNCHES)
     for kind in ("sos", "coarse"):
         low, mid, high = (found[kind][name]["total"] for name in ("optimistic", "likely", "pessimistic"))

@@ -56,7 +56,7 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     assert found["tests"]["failed"] == {}
 
 
-def test_a_part_that_fails_says_why_while_others_go_on(tmp_path: Path) -> None:
+def test_failed_part_reports_reason_and_others_continue(tmp_path: Path) -> None:
     status, written = benchmark(tmp_path, "--only", "raster", "network", "--gaussians", "0")
     assert status == 1
     assert written["parts"]["raster"]["status"] == "failed"

@@ -13,7 +13,7 @@ from sgsst_core.bench.stability import situations
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_a_number_is_always_the_same_job() -> None:
+def test_job_number_determines_job() -> None:
     first, second = drawn(7), drawn(7)
     assert first.settings == second.settings
     assert torch.equal(first.style, second.style)
@@ -21,7 +21,7 @@ def test_a_number_is_always_the_same_job() -> None:
     assert drawn(8).settings != first.settings
 
 
-def test_a_search_says_how_jobs_ended() -> None:
+def test_search_counts_outcomes() -> None:
     ended, found = search(0.0, 3)
     assert sum(ended.values()) == 1
     assert not found
@@ -47,11 +47,11 @@ def test_a_search_says_how_jobs_ended() -> None:
         (6575, "within its bounds"),  # a black image and a black style
     ],
 )
-def test_what_it_found_stays_mended(number: int, how: str) -> None:
+def test_earlier_findings_stay_fixed(number: int, how: str) -> None:
     assert outcome(drawn(number)) == (how, None)
 
 
-def test_what_breaks_a_bound_or_ends_in_any_other_way_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_violated_bounds_and_unexpected_errors_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = {"steps_coarse": 0, "steps_sos": 1, "content_weight": 0}  # content has a bound of its own
     style = torch.rand(30, 26, 3, generator=torch.Generator().manual_seed(1))
     job = situations.Situation(situations.crowd(20), style, settings)

@@ -29,7 +29,7 @@ def numbers() -> Tensor:
     return torch.arange(6.0).reshape(2, 3).to("cuda")
 
 
-def test_tensors_are_made_moved_and_computed_there(counts: Counts) -> None:
+def test_tensors_are_created_moved_and_computed_on_device(counts: Counts) -> None:
     there = numbers()
     made = (torch.zeros(2, device="cuda"), torch.tensor([1.0], device="cuda"), there.new_ones(2), there + 1, there[0])
     assert all(str(tensor.device) == "cuda:0" for tensor in made)
@@ -40,7 +40,7 @@ def test_tensors_are_made_moved_and_computed_there(counts: Counts) -> None:
     assert there.tolist() == [[14.0] * 3, [6.0, 8.0, 10.0]]
 
 
-def test_what_cuda_refuses_is_refused(counts: Counts) -> None:
+def test_operations_that_cuda_rejects_are_rejected(counts: Counts) -> None:
     there = numbers()
     with pytest.raises(RuntimeError, match="same device"):
         there + torch.ones(2, 3)
@@ -74,7 +74,7 @@ def test_what_cuda_refuses_is_refused(counts: Counts) -> None:
         (lambda x: x[:, 1:].T.contiguous() @ x[:, :1], 0),
     ],
 )
-def test_waits_of_the_host_are_counted(counts: Counts, asked: Callable[[Tensor], object], waits: int) -> None:
+def test_host_synchronizations_are_counted(counts: Counts, asked: Callable[[Tensor], object], waits: int) -> None:
     there = numbers()
     counts.clear()
     asked(there)
@@ -93,7 +93,7 @@ def test_launches_and_bytes_are_counted(counts: Counts) -> None:
     assert counts.copies.total() == 0
 
 
-def test_events_tell_times_only_where_they_were_asked_to(counts: Counts) -> None:
+def test_events_measure_time_only_with_timing_enabled(counts: Counts) -> None:
     begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     begin.record()
     with pytest.raises(RuntimeError, match="must be recorded"):
@@ -104,7 +104,7 @@ def test_events_tell_times_only_where_they_were_asked_to(counts: Counts) -> None
         begin.elapsed_time(torch.cuda.Event())
 
 
-def test_threads_that_begin_meanwhile_see_it_too(counts: Counts) -> None:
+def test_new_threads_use_the_simulated_device(counts: Counts) -> None:
     found: list[str] = []
     thread = threading.Thread(target=lambda: found.append(str(torch.zeros(2, device="cuda").device)))
     thread.start()
@@ -112,7 +112,7 @@ def test_threads_that_begin_meanwhile_see_it_too(counts: Counts) -> None:
     assert found == ["cuda:0"]
 
 
-def test_afterwards_it_is_gone() -> None:
+def test_device_is_removed_after_the_block() -> None:
     with pretend_cuda():
         assert torch.cuda.is_available()
     assert not torch.cuda.is_available()

@@ -53,7 +53,7 @@ def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 3
     )
 
 
-def go_on(job: Job, steps: int | None = None) -> Result:
+def run_job(job: Job, steps: int | None = None) -> Result:
     """Run a job; if `steps` is given, interrupt it after that many steps."""
     return execute(
         job,
@@ -72,16 +72,18 @@ def go_on(job: Job, steps: int | None = None) -> Result:
         pytest.param("paper", False, {"position_weights": "off", "cached_weights": "half"}, marks=pytest.mark.slow),
     ],
 )
-def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, settings: dict[str, Any]) -> None:
+def test_job_runs_resumes_and_reports(
+    counts: Counts, tmp_path: Path, preset: str, scan: bool, settings: dict[str, Any]
+) -> None:
     """Run survey, plan, both phases, measurements, a checkpoint, a resumed job and the report."""
     asked = request_(tmp_path, scan=scan, preset=preset, **settings)
     first = prepare(asked)
     plan = first.stylizer.job.plan
     assert (plan.device, plan.uncached, plan.weighted) == ("cuda", "triton", scan)
-    assert go_on(first, steps=1).stopped == "interrupted"
+    assert run_job(first, steps=1).stopped == "interrupted"
     second = prepare(asked, resume=Resume(True))
     assert second.stylizer.job.plan.rasterizer == plan.rasterizer
-    result = go_on(second)
+    result = run_job(second)
     assert (result.stopped, result.step, result.report_error) == ("finished", 4, None)
     assert result.bought is not None
     before, after = (read_scene(path).scene for path in (asked.source.scene, asked.out))
@@ -92,7 +94,7 @@ def test_a_whole_job(counts: Counts, tmp_path: Path, preset: str, scan: bool, se
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scan", [False, True])
-def test_a_steady_step_waits_once_and_copies_scalars(counts: Counts, tmp_path: Path, scan: bool) -> None:
+def test_steady_step_synchronizes_once_and_copies_scalars(counts: Counts, tmp_path: Path, scan: bool) -> None:
     """The first step of a view has one more wait, because it builds the tile intersections."""
     settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}
     stylizer = prepare(request_(tmp_path, scan=scan, size=(64, 48), **settings)).stylizer
@@ -118,7 +120,7 @@ def in_regions(asked: StylizeRequest) -> StylizeRequest:
 
 
 @pytest.mark.slow
-def test_regions_wait_for_nothing_more(counts: Counts, tmp_path: Path) -> None:
+def test_regions_need_no_additional_synchronization(counts: Counts, tmp_path: Path) -> None:
     stylizer = prepare(in_regions(request_(tmp_path, size=(64, 48), steps_coarse=2, steps_sos=4))).stylizer
     assert stylizer.job.plan.device == "cuda"
     assert stylizer.job.regions is not None
@@ -137,7 +139,7 @@ def test_regions_wait_for_nothing_more(counts: Counts, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_losses_of_regions_are_those_of_the_cpu(tmp_path: Path) -> None:
+def test_region_losses_match_cpu(tmp_path: Path) -> None:
     asked = in_regions(request_(tmp_path, size=(64, 48)))
     expected = prepare(asked).stylizer
     with pretend_cuda():
@@ -148,7 +150,7 @@ def test_losses_of_regions_are_those_of_the_cpu(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scan", [False, True])
-def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> None:
+def test_step_launches_fewer_than_500_kernels(counts: Counts, scan: bool) -> None:
     """The larger network, VGG19, takes fewer than 500 launches on three scales, for views of any size.
 
     A random training background would need another forward pass for the content features.
@@ -167,7 +169,7 @@ def test_a_step_launches_less_than_500_kernels(counts: Counts, scan: bool) -> No
 
 
 @pytest.mark.slow
-def test_losses_are_those_of_the_cpu(tmp_path: Path) -> None:
+def test_losses_match_cpu(tmp_path: Path) -> None:
     """Equal losses show that all kernels run in the right order with the right arguments."""
     asked = request_(tmp_path, scan=True, size=(64, 48))
     expected = prepare(asked).stylizer
@@ -181,7 +183,7 @@ def test_losses_are_those_of_the_cpu(tmp_path: Path) -> None:
     assert expected.job.plan.device == "cpu"
 
 
-def test_a_gradient_that_cannot_be_squared_changes_nothing(counts: Counts, tmp_path: Path) -> None:
+def test_gradient_with_overflowing_square_changes_nothing(counts: Counts, tmp_path: Path) -> None:
     stylizer = prepare(request_(tmp_path, learning_rate=0.5)).stylizer
     stylizer.run_step()
     before = stylizer.state()

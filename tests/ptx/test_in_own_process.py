@@ -27,11 +27,11 @@ def run(*arguments: str) -> None:
     assert ended.returncode == 0, ended.stdout[-5000:] + ended.stderr[-2000:]
 
 
-def test_kernels() -> None:
+def test_compiled_kernel_tests_pass() -> None:
     run("tests/ptx", "-m", "not slow")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", ["sm_80", "sm_90"])
-def test_all_kernels_agree_with_their_references(target: str) -> None:
+def test_kernel_comparisons_pass_on_target(target: str) -> None:
     run(f"--ptx-target={target}", "-k", f"not ({OTHERS})", "tests/ptx", *COMPARISONS)

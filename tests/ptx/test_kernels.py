@@ -57,7 +57,7 @@ def sparse(shape: tuple[int, ...], strides: tuple[int, ...], dtype: torch.dtype)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_offsets_beyond_32_bits(dtype: torch.dtype) -> None:
+def test_offsets_beyond_32_bits_are_correct(dtype: torch.dtype) -> None:
     """The last row begins after 2.5e9 values."""
     generator = torch.Generator().manual_seed(0)
     small = (2 + torch.randn((6, 9, 16), generator=generator)).to(dtype)
@@ -116,7 +116,7 @@ def test_shifted_masks_are_reported() -> None:
     assert reported >= 3
 
 
-def test_faults_of_memory_are_reported() -> None:
+def test_memory_faults_are_reported() -> None:
     scene, camera = ball(60), cameras(1, 33, 17)[0]
     with compiled_kernels(80) as driver:
         rasterizer = make_rasterizer("triton", scene)

@@ -20,7 +20,7 @@ def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 
 
-def test_the_cut_offs_are_met_to_the_ulp() -> None:
+def test_opacity_cutoff_is_exact_to_one_ulp() -> None:
     """The fast projection and the reference both skip an opacity one ulp below 1/255, and draw one an ulp above."""
     scene = gaussians._opacities_at_the_cutoff()
     for index, visible in ((0, 0), (2, 1), (3, 1)):
@@ -29,7 +29,7 @@ def test_the_cut_offs_are_met_to_the_ulp() -> None:
         assert len(splat(one, camera()).gaussians) == visible
 
 
-def test_what_has_no_projection_is_counted() -> None:
+def test_gaussians_without_projection_are_counted() -> None:
     outcomes = project(gaussians._scales(), camera()).outcomes
     assert outcomes[Outcome.INVALID] == 3
     assert outcomes[Outcome.VISIBLE] == 5

@@ -19,13 +19,13 @@ def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 
 
-def test_results_that_are_not_finite_do_not_pass() -> None:
+def test_non_finite_errors_do_not_pass() -> None:
     assert CaseResult(1e-6, 1e-6).passed
     for error in (math.nan, math.inf, 2e-6):
         assert not CaseResult(error, 1e-6).passed
 
 
-def test_every_case_has_a_name_of_its_own() -> None:
+def test_case_names_are_unique() -> None:
     names = [case.name for case in all_cases()]
     assert len(names) == len(set(names))
     assert {case.group for case in all_cases()} == set(get_args(Group))

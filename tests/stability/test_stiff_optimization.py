@@ -26,7 +26,7 @@ def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 
 
-def test_hardly_seen_gaussians_move_as_fast_as_well_seen_ones() -> None:
+def test_barely_visible_gaussians_move_as_fast_as_others() -> None:
     """Adam's steps do not depend on the magnitude of the gradient, which is why such colors diverge."""
     stylizer = optimization._stylizer(
         optimization._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5)), 3, learning_rate=0.05, bounded=False
@@ -39,7 +39,7 @@ def test_hardly_seen_gaussians_move_as_fast_as_well_seen_ones() -> None:
     assert change[weights < 1e-2].tolist() == pytest.approx([0.05] * int((weights < 1e-2).sum()), rel=1e-3)
 
 
-def test_a_diverged_run_says_what_to_do_and_keeps_its_colors() -> None:
+def test_diverged_step_gives_advice_and_leaves_colors_unchanged() -> None:
     stylizer = optimization._stylizer(optimization._walls((2.0, 5)), 3)
     with torch.no_grad():
         stylizer.sh_dc.copy_(stylizer.sh_dc.abs() * 1e8)

@@ -16,7 +16,7 @@ def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 
 
-def test_the_one_pass_variance_fails_where_ours_does_not() -> None:
+def test_one_pass_variance_fails_on_a_hard_case() -> None:
     """Show that the case is hard: the usual one-pass formula gives NaN where ours stays within its bound."""
     result = images._ratio(4, False)
     assert result.passed

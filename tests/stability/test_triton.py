@@ -78,6 +78,6 @@ def test_stays_within_its_bound(hard_case: Case) -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_stays_within_its_bound_in_a_smaller_size(name: str) -> None:
+def test_smaller_case_stays_within_its_bound(name: str) -> None:
     result = compare_rasterizers(among_ordinary(SCENES[name]()), camera())
     assert result.passed, f"{result.error:.3g}, bound {result.bound:.3g}. {result.note}"

@@ -16,7 +16,7 @@ def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 
 
-def test_a_refusal_names_the_view_and_what_to_do() -> None:
+def test_too_many_intersections_error_names_view_and_remedy() -> None:
     result = next(case for case in views.cases() if "2^31" in case.name).run(False)
     for expected in ("'hard case' (16384x16384)", "2,202,009,600 times", "lower resolution"):
         assert expected in result.note

@@ -131,17 +131,17 @@ def spz(folder: Path, scene: Scene) -> SceneRequest:
     return SceneRequest(scene=path, cameras=write_files(folder)[1])
 
 
-def turned(scene: Scene) -> Scene:
+def rotated(scene: Scene) -> Scene:
     """Return a scene whose positions are rotated by 180 degrees about x."""
     return replace(scene, means=scene.means * torch.tensor([1.0, -1.0, -1.0]))
 
 
-def test_cameras_choose_the_axes_of_an_spz_scene_that_states_none(tmp_path: Path) -> None:
+def test_cameras_determine_axes_of_spz_without_stated_axes(tmp_path: Path) -> None:
     upright, other = tmp_path / "upright", tmp_path / "turned"
-    for folder, scene in ((upright, SCENE), (other, turned(SCENE))):
+    for folder, scene in ((upright, SCENE), (other, rotated(SCENE))):
         folder.mkdir()
         source = spz(folder, scene)
-        unstated(source.scene)
+        remove_axes(source.scene)
         axes, about = choose_axes(source)
         read = read_scene(source.scene, spz_axes=axes).scene
         assert torch.allclose(read.means, SCENE.means, atol=1e-3)
@@ -151,19 +151,19 @@ def test_cameras_choose_the_axes_of_an_spz_scene_that_states_none(tmp_path: Path
     assert choose_axes(source.model_copy(update={"cameras": None, "orbit": 3}))[1] == []
 
 
-def unstated(path: Path) -> None:
+def remove_axes(path: Path) -> None:
     """Remove the extension with the axes from an SPZ file of version 3."""
     data = bytearray(gzip.decompress(path.read_bytes()))
     data[14] &= ~2
     path.write_bytes(gzip.compress(bytes(data)))
 
 
-def test_axes_that_a_file_states_are_kept(tmp_path: Path) -> None:
-    source = spz(tmp_path, turned(SCENE))
+def test_stated_axes_are_used(tmp_path: Path) -> None:
+    source = spz(tmp_path, rotated(SCENE))
     assert choose_axes(source) == ("auto", [])
 
 
-def test_plan_names_the_render_mode_and_doubts_in_it(tmp_path: Path) -> None:
+def test_plan_names_render_mode_and_warnings(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     write_scene(path, ball())
     assert about_rendering(read_scene(path)) == []
@@ -183,7 +183,7 @@ def test_plan_names_the_render_mode_and_doubts_in_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["auto", "classic", "antialiased"])
-def test_job_is_drawn_in_the_requested_mode(tmp_path: Path, mode: RenderMode) -> None:
+def test_job_is_rendered_in_requested_mode(tmp_path: Path, mode: RenderMode) -> None:
     path, cameras, _ = write_files(tmp_path, replace(ball(), rendering=Rendering("antialiased", 0.2)))
     source = SceneRequest(scene=path, cameras=cameras, render_mode=mode)
     file, _ = read_scene_and_capture(source)

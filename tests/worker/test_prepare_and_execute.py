@@ -27,7 +27,7 @@ from worker.request import Resume, StylizeRequest
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
 
-def go_on(
+def run_job(
     job: Job, steps: int | None = None, checkpoint_seconds: float = 60.0, warnings: list[str] | None = None
 ) -> Result:
     """Run a job; if `steps` is given, interrupt it after that many steps."""
@@ -52,34 +52,32 @@ def request_(tmp_path: Path) -> StylizeRequest:
     return small_request(tmp_path, 8)
 
 
-def test_planning_is_shown_and_a_resumed_job_follows_the_plan_of_the_first(
-    request_: StylizeRequest, tmp_path: Path
-) -> None:
+def test_planning_is_shown_and_resume_reuses_the_plan(request_: StylizeRequest, tmp_path: Path) -> None:
     whole = small_request(tmp_path / "whole", 8)
-    go_on(prepare(whole))
+    run_job(prepare(whole))
     planned: list[PlanningProgress] = []
     first = prepare(request_, show_planning=planned.append)
     assert [(now.done, now.total) for now in planned] == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert [now.seconds_left is None for now in planned] == [True, False, False, False]
     assert planned[-1].fraction == 1.0
     assert planned[-1].seconds_left == 0.0
-    assert go_on(first, steps=3).stopped == "interrupted"
+    assert run_job(first, steps=3).stopped == "interrupted"
     second = prepare(request_, resume=Resume(True), show_planning=planned.append)
     assert len(planned) == 4, "nothing is looked at again"
     assert second.resumed is not None
     assert second.resumed.state.step == 3
     assert second.stylizer.job.plan == second.resumed.plan
     assert second.stylizer.job.plan.prediction == first.stylizer.job.plan.prediction
-    assert go_on(second).stopped == "finished"
+    assert run_job(second).stopped == "finished"
     assert request_.out.read_bytes() == whole.out.read_bytes()
     assert not Path(request_.out).with_name("s.checkpoint.safetensors").exists()
     assert not Path(request_.out).with_name("s.checkpoint.previous.safetensors").exists()
 
 
-def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: StylizeRequest) -> None:
+def test_plan_for_another_device_reuses_the_survey(request_: StylizeRequest) -> None:
     """The checkpoint is that of a job on a GPU that no longer exists."""
     first = prepare(request_)
-    go_on(first, steps=3)
+    run_job(first, steps=3)
     kept = load_checkpoint(first.outputs.checkpoint, first.fingerprint)
     plan = replace(kept.plan, device="cuda", rasterizer="cuda")
     save_checkpoint(first.outputs.checkpoint, replace(kept, plan=plan), first.fingerprint)
@@ -90,11 +88,11 @@ def test_a_plan_of_another_device_is_made_anew_from_its_survey(request_: Stylize
     )
     assert second.resumed is not None
     assert second.stylizer.job.plan.survey is second.resumed.plan.survey
-    assert go_on(second).stopped == "finished"
+    assert run_job(second).stopped == "finished"
 
 
 @pytest.mark.parametrize("form", ["ply", "spz", pytest.param("compressed.ply", marks=pytest.mark.slow)])
-def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_path: Path, form: str) -> None:
+def test_resume_refines_identically_and_writes_all_gaussians(tmp_path: Path, form: str) -> None:
     jobs = []
     for name in ("whole", "resumed"):
         request = small_request(tmp_path / name, 6, refine=3.0)
@@ -107,12 +105,12 @@ def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_pat
             request = replace(request, source=request.source.model_copy(update={"scene": source}), out=out)
         jobs.append(request)
     whole, resumed = jobs
-    go_on(prepare(whole))
-    assert go_on(prepare(resumed), steps=3).stopped == "interrupted"
+    run_job(prepare(whole))
+    assert run_job(prepare(resumed), steps=3).stopped == "interrupted"
     second = prepare(resumed, resume=Resume(True))
     assert second.resumed is not None
     assert second.resumed.state.step == 3
-    assert go_on(second).stopped == "finished"
+    assert run_job(second).stopped == "finished"
     written = resumed.out.with_name("s.ply")
     assert written.read_bytes() == whole.out.with_name("s.ply").read_bytes()
     report = json.loads(resumed.out.with_name("s.report.json").read_text())
@@ -126,32 +124,32 @@ def test_a_refined_scene_is_the_same_after_a_resume_and_comes_back_whole(tmp_pat
 
 
 def test_planning_is_shown(request_: StylizeRequest) -> None:
-    told: list[PlanningProgress] = []
-    job = prepare(request_, show_planning=told.append)
+    reports: list[PlanningProgress] = []
+    job = prepare(request_, show_planning=reports.append)
     views = len(job.stylizer.job.views)
-    assert [progress.done for progress in told] == list(range(views + 1))
+    assert [progress.done for progress in reports] == list(range(views + 1))
 
 
-def test_the_report_tells_the_parts_before_the_first_step(request_: StylizeRequest) -> None:
+def test_report_has_seconds_before_the_first_step(request_: StylizeRequest) -> None:
     names = ("reading", "survey", "planning", "preparing")
     first = prepare(request_)
     before = dict(first.stylizer.seconds_by_part)
     assert sorted(before) == sorted(names)
     assert all(before[name] > 0 for name in names)
-    assert go_on(first, steps=3).stopped == "interrupted"
+    assert run_job(first, steps=3).stopped == "interrupted"
     second = prepare(request_, resume=Resume(True))
     own = dict(second.stylizer.seconds_by_part)
     assert sorted(own) == ["preparing", "reading"], "the plan is the checkpoint's"
-    assert go_on(second).stopped == "finished"
+    assert run_job(second).stopped == "finished"
     report = json.loads(Path(request_.out).with_name("s.report.json").read_text())
     for name in names:
         assert report["seconds_by_part"][name] == pytest.approx(before[name] + own.get(name, 0.0), abs=0.002)
     assert "survey of the views, before the steps" in Path(request_.out).with_name("s.report.html").read_text()
 
 
-def test_a_damaged_checkpoint_costs_what_came_after_the_one_before(request_: StylizeRequest) -> None:
+def test_damaged_checkpoint_falls_back_to_previous(request_: StylizeRequest) -> None:
     job = prepare(request_)
-    go_on(job, steps=4, checkpoint_seconds=0)
+    run_job(job, steps=4, checkpoint_seconds=0)
     job.outputs.checkpoint.write_bytes(job.outputs.checkpoint.read_bytes()[:-100])
     warnings: list[str] = []
     again = prepare(request_, resume=Resume(True), warn=warnings.append)
@@ -162,12 +160,12 @@ def test_a_damaged_checkpoint_costs_what_came_after_the_one_before(request_: Sty
     assert "not a readable checkpoint" in warnings[0]
 
 
-def test_a_rasterizer_that_does_not_work_here_is_planned_anew(request_: StylizeRequest) -> None:
+def test_unusable_rasterizer_in_checkpoint_is_replanned(request_: StylizeRequest) -> None:
     """The checkpoint is that of a machine with another GPU, or with a compiler."""
     if drawing_problem("cuda") is None:
         pytest.skip("it works")
     job = prepare(request_)
-    go_on(job, steps=3)
+    run_job(job, steps=3)
     path = request_.out.with_name("s.checkpoint.safetensors")
     saved = load_checkpoint(path, job.fingerprint)
     unusable = replace(saved.plan, rasterizer="cuda", uncached="cuda")
@@ -176,23 +174,21 @@ def test_a_rasterizer_that_does_not_work_here_is_planned_anew(request_: StylizeR
     assert again.resumed is not None
     assert again.resumed.plan.rasterizer == "cuda"
     assert again.stylizer.job.plan.rasterizer == saved.plan.rasterizer
-    assert go_on(again).stopped == "finished"
+    assert run_job(again).stopped == "finished"
 
 
-def test_what_may_start_anew_does_so_without_a_checkpoint(request_: StylizeRequest) -> None:
+def test_optional_resume_starts_without_checkpoint(request_: StylizeRequest) -> None:
     with pytest.raises(CheckpointError, match="no checkpoint to resume from"):
         prepare(request_, resume=Resume(True))
     assert prepare(request_, resume=Resume(True, required=False)).resumed is None
-    go_on(prepare(request_), steps=2)
+    run_job(prepare(request_), steps=2)
     assert prepare(request_, resume=Resume(True, required=False, run="another run")).resumed is None
     found = prepare(request_, resume=Resume(True, required=False, run="run")).resumed
     assert found is not None
     assert found.state.step == 2
 
 
-def test_a_disk_that_is_full_for_a_while_is_a_warning(
-    request_: StylizeRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_temporarily_full_disk_is_a_warning(request_: StylizeRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     from sgsst_core.stylizing import checkpoint
 
     monkeypatch.setattr(checkpoint, "_write", checkpoint._write)  # undone after the test, unlike the fault's own change
@@ -200,7 +196,7 @@ def test_a_disk_that_is_full_for_a_while_is_a_warning(
     fault.write(request_)
     fault.arm(request_)
     warnings: list[str] = []
-    assert go_on(prepare(request_), checkpoint_seconds=0, warnings=warnings).stopped == "finished"
+    assert run_job(prepare(request_), checkpoint_seconds=0, warnings=warnings).stopped == "finished"
     assert len(warnings) == 1
     assert "The checkpoint could not be written" in warnings[0]
     assert len(read_scene(request_.out).scene) == 616
@@ -218,9 +214,9 @@ def with_scene(request: StylizeRequest, scene: Scene, **options: object) -> Styl
     return replace(request, source=request.source.model_copy(update=options), colors=True)
 
 
-def test_colors_alone_are_those_of_the_result(request_: StylizeRequest, tmp_path: Path) -> None:
+def test_colors_file_matches_the_result(request_: StylizeRequest, tmp_path: Path) -> None:
     for request in (with_scene(request_, wall(sh_degree=1)), small_request(tmp_path / "not", 1)):
-        go_on(prepare(request))
+        run_job(prepare(request))
         alone = request.out.with_name("s.colors.f16")
         assert alone.exists() == request.colors
         if request.colors:
@@ -230,9 +226,9 @@ def test_colors_alone_are_those_of_the_result(request_: StylizeRequest, tmp_path
             assert np.array_equal(found, exact.numpy().astype(np.float16))
 
 
-@pytest.mark.parametrize("why", ["cut", "dropped", "attenuated"])
-def test_colors_alone_are_not_written_where_more_than_colors_changes(tmp_path: Path, why: str) -> None:
-    if why == "cut":
+@pytest.mark.parametrize("why", ["split", "dropped", "attenuated"])
+def test_colors_file_is_omitted_if_more_than_colors_change(tmp_path: Path, why: str) -> None:
+    if why == "split":
         request = with_scene(small_request(tmp_path, 1, refine=3.0), large_wall())
     elif why == "dropped":
         scene = wall(sh_degree=1)
@@ -240,7 +236,7 @@ def test_colors_alone_are_not_written_where_more_than_colors_changes(tmp_path: P
         request = with_scene(small_request(tmp_path, 1), scene, drop_invalid=True)
     else:
         request = with_scene(small_request(tmp_path, 1, sh_attenuation=0.5), wall(sh_degree=1))
-    result = go_on(prepare(request))
+    result = run_job(prepare(request))
     assert result.report_error is None
     assert request.out.exists()
     assert not request.out.with_name("s.colors.f16").exists()

@@ -16,9 +16,7 @@ from tests.small_scenes import cameras, wall
 from worker.previews import Previews
 
 
-def test_the_first_preview_shows_the_colors_of_a_warm_start_before_any_step(
-    tiny_weights: BackboneWeights, tmp_path: Path
-) -> None:
+def test_first_preview_shows_warm_start_colors(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
     settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
     style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.5, 0.1])
     scene = wall()

@@ -19,12 +19,12 @@ from worker.styles import MOST_PICTURES, StyleFile
         ("half-space= 0, 1 ,0,-2", "half-space", (0, 1, 0, -2)),
     ],
 )
-def test_places(text: str, kind: str, numbers: tuple[float, ...]) -> None:
+def test_geometric_selections_are_parsed(text: str, kind: str, numbers: tuple[float, ...]) -> None:
     found = parse_selection(text, "region a")
     assert (found.kind, found.numbers, found.text) == (kind, numbers, text)
 
 
-def test_properties_and_masks() -> None:
+def test_property_and_mask_selections_are_parsed() -> None:
     found = parse_selection("property=f_rest_0<=-0.5", "region a")
     assert (found.name, found.sign, found.numbers) == ("f_rest_0", "<=", (-0.5,))
     assert parse_selection("mask=a=b.npy", "region a").path == Path("a=b.npy")
@@ -48,12 +48,12 @@ def test_properties_and_masks() -> None:
         ("property=>1", "is not a comparison"),
     ],
 )
-def test_what_selects_nothing(text: str, message: str) -> None:
+def test_invalid_selections_are_refused(text: str, message: str) -> None:
     with pytest.raises(SettingsError, match=f"^region a: .*{message}"):
         parse_selection(text, "region a")
 
 
-def test_the_command_lines_texts_come_together(tmp_path: Path) -> None:
+def test_command_line_options_are_combined(tmp_path: Path) -> None:
     odd = tmp_path / "b:2"
     odd.touch()
     options = region_options(
@@ -96,12 +96,12 @@ def test_the_command_lines_texts_come_together(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_texts_that_make_no_sense(texts: tuple[list[str], list[str], list[str], list[str]], message: str) -> None:
+def test_invalid_options_are_refused(texts: tuple[list[str], list[str], list[str], list[str]], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         region_requests(region_options(*texts))
 
 
-def test_a_region_of_json_needs_a_selection() -> None:
+def test_json_regions_need_selections_and_unique_names() -> None:
     with pytest.raises(SettingsError, match="needs a SPEC"):
         region_requests([RegionOptions(name="a")])
     with pytest.raises(SettingsError, match="two regions 'rest'"):

@@ -49,7 +49,7 @@ def with_property(path: Path, values: np.ndarray, *, text: bool = False, order: 
     PlyData([PlyElement.describe(more, "vertex")], text=text, byte_order=order).write(path)
 
 
-def test_the_later_region_has_what_both_select(file: SceneFile) -> None:
+def test_later_region_wins_overlaps(file: SceneFile) -> None:
     wide, narrow = region("a", "half-space=1,0,0,-1"), region("b", "half-space=1,0,0,1")
     x = file.scene.means[:, 0]
     assert labels_of(file, wide, narrow) == [0 if v < -1 else 1 if v < 1 else 2 for v in x.tolist()]
@@ -61,7 +61,7 @@ def test_the_later_region_has_what_both_select(file: SceneFile) -> None:
 
 @pytest.mark.parametrize("kind", ["i4", "u1", "f8", "f4"])
 @pytest.mark.parametrize(("text", "order"), [(True, "="), (False, "<"), (False, ">")])
-def test_any_property_of_the_file(tmp_path: Path, kind: str, text: bool, order: str) -> None:
+def test_extra_properties_are_selectable(tmp_path: Path, kind: str, text: bool, order: str) -> None:
     path = write_files(tmp_path, wall(6, 4))[0]
     values = np.arange(24).astype(kind)
     with_property(path, values, text=text, order=order)
@@ -70,7 +70,7 @@ def test_any_property_of_the_file(tmp_path: Path, kind: str, text: bool, order: 
     assert int(select(parse_selection("property=extra=7", "a"), read_scene(path), cameras(), 0.2).sum()) == 1
 
 
-def test_properties_of_all_scenes_are_there_in_any_form(tmp_path: Path, file: SceneFile) -> None:
+def test_standard_properties_are_selectable_in_every_format(tmp_path: Path, file: SceneFile) -> None:
     packed = tmp_path / "wall.spz"
     write_scene(packed, file.scene, SPZ)
     for source in (file, read_scene(packed)):
@@ -81,13 +81,13 @@ def test_properties_of_all_scenes_are_there_in_any_form(tmp_path: Path, file: Sc
 
 
 @pytest.mark.parametrize("kind", [bool, np.uint8, np.float64])
-def test_a_mask_of_the_gaussians(tmp_path: Path, file: SceneFile, kind: type) -> None:
+def test_gaussian_mask_selects_its_rows(tmp_path: Path, file: SceneFile, kind: type) -> None:
     wanted = np.arange(24) % 3 == 0
     np.save(tmp_path / "m.npy", wanted.astype(kind))
     assert labels_of(file, region("a", f"mask={tmp_path}/m.npy")) == wanted.astype(int).tolist()
 
 
-def test_rows_that_were_dropped_are_dropped_of_masks_and_properties_too(tmp_path: Path) -> None:
+def test_dropped_rows_are_dropped_from_masks_and_properties(tmp_path: Path) -> None:
     scene = wall(6, 4)
     scene.means[3, 0] = torch.nan
     path = write_files(tmp_path, wall(6, 4))[0]
@@ -118,7 +118,7 @@ def test_rows_that_were_dropped_are_dropped_of_masks_and_properties_too(tmp_path
         (None, "cannot be read as .npy"),
     ],
 )
-def test_masks_that_cannot_be_used(tmp_path: Path, file: SceneFile, array: Any, message: str) -> None:
+def test_invalid_masks_are_refused(tmp_path: Path, file: SceneFile, array: Any, message: str) -> None:
     path = tmp_path / "m.npy"
     if isinstance(array, bytes):
         path.write_bytes(array)
@@ -128,7 +128,7 @@ def test_masks_that_cannot_be_used(tmp_path: Path, file: SceneFile, array: Any, 
         labels_of(file, region("a", f"mask={path}"))
 
 
-def test_masks_of_some_views(tmp_path: Path) -> None:
+def test_image_masks_of_some_views_select_gaussians(tmp_path: Path) -> None:
     """The masks are white where the right half of the scene is drawn. One of the views has no mask."""
     scene: Scene = wall()
     file = read_scene(write_files(tmp_path, scene)[0])
@@ -142,7 +142,7 @@ def test_masks_of_some_views(tmp_path: Path) -> None:
     assert torch.equal(found[clear], scene.means[clear, 0] > 0)
 
 
-def test_folders_of_masks_that_cannot_be_used(tmp_path: Path, file: SceneFile) -> None:
+def test_invalid_mask_folders_are_refused(tmp_path: Path, file: SceneFile) -> None:
     views, empty = cameras(), tmp_path / "none"
     empty.mkdir()
     for folder, message in ((tmp_path / "nowhere", "not a folder of masks"), (empty, "no mask for any of 3 views")):
@@ -153,14 +153,14 @@ def test_folders_of_masks_that_cannot_be_used(tmp_path: Path, file: SceneFile) -
         labels_of(file, region("a", f"masks={empty}"))
 
 
-def test_nothing_left_to_do(file: SceneFile) -> None:
+def test_freezing_every_gaussian_is_refused(file: SceneFile) -> None:
     everything = region("a", "half-space=1,0,0,-100", freeze=True)
     with pytest.raises(SettingsError, match=r"Every Gaussian is frozen \(a\)"):
         labels_of(file, everything)
     assert select_regions((), file, cameras(), 0.2, load_styles) is None
 
 
-def test_styles_are_read(tmp_path: Path, file: SceneFile) -> None:
+def test_region_styles_are_loaded(tmp_path: Path, file: SceneFile) -> None:
     from worker.styles import StyleFile
 
     save_png(tmp_path / "s.png", torch.full((8, 8, 3), 0.5))

@@ -21,11 +21,11 @@ from worker.styles import MOST_PICTURES, StyleFile, parse_style, parse_styles
         (":3", ":3", 1.0),
     ],
 )
-def test_only_a_number_at_the_end_is_a_weight(text: str, path: str, weight: float) -> None:
+def test_only_a_trailing_number_is_a_weight(text: str, path: str, weight: float) -> None:
     assert parse_style(text) == StyleFile(Path(path), weight)
 
 
-def test_a_file_of_the_whole_name_wins(tmp_path: Path) -> None:
+def test_existing_file_with_colon_takes_precedence(tmp_path: Path) -> None:
     odd = tmp_path / "poster:2"
     odd.touch()
     assert parse_style(str(odd)) == StyleFile(odd)
@@ -33,12 +33,12 @@ def test_a_file_of_the_whole_name_wins(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("weight", ["0", "-1", "1e999"])
-def test_weights_that_cannot_be(weight: str) -> None:
+def test_invalid_weights_are_refused(weight: str) -> None:
     with pytest.raises(SettingsError, match=f"the weight {weight} is not a finite number greater than 0"):
         parse_style(f"a.jpg:{weight}")
 
 
-def test_how_many_there_may_be() -> None:
+def test_number_of_styles_is_limited() -> None:
     assert len(parse_styles(["a.jpg"] * MOST_PICTURES)) == MOST_PICTURES
     for count in (0, MOST_PICTURES + 1):
         with pytest.raises(SettingsError, match=f"There are {count} style images"):

@@ -54,7 +54,7 @@ def cluster() -> Iterator[Cluster]:
 
 
 @dataclass
-class Heard:
+class EventRecorder:
     """Recorder of a job's events, which stops the job at step `stop_at`."""
 
     stop_at: int | None = None
@@ -84,7 +84,11 @@ class Heard:
 
 
 def run(
-    request: StylizeRequest, cluster: Cluster, heard: Heard | None = None, fault: Fault | None = None, workers: int = 2
+    request: StylizeRequest,
+    cluster: Cluster,
+    heard: EventRecorder | None = None,
+    fault: Fault | None = None,
+    workers: int = 2,
 ) -> RanksResult:
     """Run a job on ranks, optionally with a fault, with a checkpoint after almost every step."""
     if fault is not None:
@@ -96,7 +100,7 @@ def run(
         preview_seconds=0.1,
         actor=FaultyRank,
     )
-    return stylize_on_ranks(request, workers, (heard or Heard()).listener(), options=options, cluster=cluster)
+    return stylize_on_ranks(request, workers, (heard or EventRecorder()).listener(), options=options, cluster=cluster)
 
 
 def loss_of(ended: RanksResult) -> float:
@@ -109,7 +113,7 @@ def loss_of(ended: RanksResult) -> float:
 def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> tuple[float, bytes]:
     """Return the final loss and the result file of a run on two ranks without a fault."""
     request = small_request(tmp_path_factory.mktemp("undisturbed"), STEPS)
-    heard = Heard()
+    heard = EventRecorder()
     ended = run(request, cluster, heard)
     assert ended.attempts == []
     assert heard.planned[-1] == 1.0
@@ -126,7 +130,7 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
 
 
 @pytest.mark.slow
-def test_two_ranks_end_where_one_does(undisturbed: tuple[float, bytes], tmp_path: Path) -> None:
+def test_two_ranks_reach_the_loss_of_one_rank(undisturbed: tuple[float, bytes], tmp_path: Path) -> None:
     job = prepare(small_request(tmp_path, STEPS))
     alone = execute(job, progress=lambda step: None, stop=lambda: False, warn=pytest.fail)
     assert undisturbed[0] == pytest.approx(mean_loss(alone.after), rel=TOLERANCE)
@@ -141,10 +145,10 @@ def test_two_ranks_end_where_one_does(undisturbed: tuple[float, bytes], tmp_path
         (Fault(1, "render", 25, "SIGSTOP"), "not answered"),
     ],
 )
-def test_a_lost_rank_costs_no_more_than_a_checkpoint_interval(
+def test_lost_rank_costs_at_most_a_checkpoint_interval(
     fault: Fault, reason: str, undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path
 ) -> None:
-    request, heard = small_request(tmp_path, STEPS), Heard()
+    request, heard = small_request(tmp_path, STEPS), EventRecorder()
     ended = run(request, cluster, heard, fault)
     assert fired(request) is not None
     assert [reason in attempt.reason for attempt in ended.attempts] == [True]
@@ -163,8 +167,8 @@ def test_a_lost_rank_costs_no_more_than_a_checkpoint_interval(
 
 
 @pytest.mark.slow
-def test_ray_itself_may_be_killed(undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path) -> None:
-    request, heard = small_request(tmp_path, STEPS), Heard()
+def test_job_survives_killed_raylet(undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path) -> None:
+    request, heard = small_request(tmp_path, STEPS), EventRecorder()
     killed: list[int] = []
 
     def stop() -> bool:
@@ -182,10 +186,10 @@ def test_ray_itself_may_be_killed(undisturbed: tuple[float, bytes], cluster: Clu
 
 
 @pytest.mark.slow
-def test_a_full_disk_costs_a_checkpoint_and_a_cancelled_job_goes_on(
+def test_full_disk_skips_checkpoint_and_canceled_job_resumes(
     undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path
 ) -> None:
-    request, heard = small_request(tmp_path, STEPS), Heard(stop_at=8)
+    request, heard = small_request(tmp_path, STEPS), EventRecorder(stop_at=8)
     ended = run(request, cluster, heard, Fault(0, "checkpoint", 1, "full"))
     assert ["The checkpoint could not be written" in line for line in heard.warnings] == [True]
     assert ended.interrupted
@@ -193,15 +197,15 @@ def test_a_full_disk_costs_a_checkpoint_and_a_cancelled_job_goes_on(
     assert 8 <= ended.step < STEPS
     assert ended.saved == ended.step
     assert not request.out.exists()
-    heard = Heard()
+    heard = EventRecorder()
     ended = run(replace(request, resume=True), cluster, heard)
     assert heard.prepared[0].step > 0
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
 
 
 @pytest.mark.slow
-def test_a_bad_input_is_told_at_once_and_not_tried_again(cluster: Cluster, tmp_path: Path) -> None:
-    request, heard = small_request(tmp_path, STEPS), Heard()
+def test_bad_input_is_reported_at_once_and_not_retried(cluster: Cluster, tmp_path: Path) -> None:
+    request, heard = small_request(tmp_path, STEPS), EventRecorder()
     request.source.scene.write_bytes(request.source.scene.read_bytes()[:-1000])
     with pytest.raises(SceneError, match="truncated"):
         run(request, cluster, heard)
@@ -239,15 +243,15 @@ def start(arguments: list[str]) -> subprocess.Popen[str]:
     raise AssertionError(process.communicate()[1])
 
 
-def left_of(process: psutil.Process) -> list[psutil.Process]:
+def processes_below(process: psutil.Process) -> list[psutil.Process]:
     """Return all running descendants of a process."""
     return [child for child in process.children(recursive=True) if child.is_running()]
 
 
 @pytest.mark.slow
-def test_a_killed_driver_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_killed_driver_leaves_no_processes_or_files(tmp_path: Path) -> None:
     process = start(command(small_request(tmp_path, STEPS)))
-    family = left_of(psutil.Process(process.pid))
+    family = processes_below(psutil.Process(process.pid))
     used = folders(family)
     assert any("FaultyRank" in child.name() or "RankProcess" in child.name() for child in family)
     assert used
@@ -266,7 +270,7 @@ def test_a_killed_driver_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_and_the_command_that_it_prints_goes_on(tmp_path: Path) -> None:
+def test_ctrl_c_saves_and_printed_command_resumes(tmp_path: Path) -> None:
     request = small_request(tmp_path, STEPS)
     arguments = command(request, "--max-seconds", "3")
     process = start(arguments)
@@ -275,9 +279,9 @@ def test_ctrl_c_saves_and_the_command_that_it_prints_goes_on(tmp_path: Path) -> 
     assert process.returncode == 130, error
     assert "Traceback" not in error
     assert f"saved in {request.out.with_name('s.checkpoint.safetensors')}" in error
-    go_on = shlex.split(error.strip().splitlines()[-1])
-    assert go_on == ["sgsst", *arguments, "--resume"]
-    process = start(go_on[1:])
+    resume_command = shlex.split(error.strip().splitlines()[-1])
+    assert resume_command == ["sgsst", *arguments, "--resume"]
+    process = start(resume_command[1:])
     shown, error = process.communicate(timeout=240)
     assert process.returncode == 0, error
     assert "Reached --max-seconds" in shown

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
         ),
     ],
 )
-def test_ranks_end_where_one_rank_ends(scene: Scene, values: dict[str, Any]) -> None:
+def test_several_ranks_match_one_rank(scene: Scene, values: dict[str, Any]) -> None:
     values = {"steps_coarse": 2, "steps_sos": 4, "learning_rate": 0.01} | values
     expected = stylize(ALONE, scene, 3, values)
     for ranks in (2, 3):

@@ -102,7 +102,7 @@ def gradient(
         (4, 17, 15, None, wall()),  # a single work unit
     ],
 )
-def test_gradient_is_that_of_one_rank(
+def test_gradient_matches_one_rank(
     dtype: torch.dtype, ranks: int, width: int, height: int, tile_size: int | None, scene: Scene
 ) -> None:
     camera = cameras(1, width, height)[0]
@@ -114,7 +114,7 @@ def test_gradient_is_that_of_one_rank(
         assert torch.equal(found, results[0][0])
 
 
-def test_ranks_of_different_speed_get_different_shares_of_the_same_gradient() -> None:
+def test_division_by_speed_preserves_the_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, None)
     for found, found_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
@@ -123,7 +123,7 @@ def test_ranks_of_different_speed_get_different_shares_of_the_same_gradient() ->
 
 
 @pytest.mark.parametrize("style_loss", ["sos", "mixed"])
-def test_regions_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> None:
+def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> None:
     """Some of the three ranks have no pixel of a region, and one region is frozen."""
     scene, camera = wall(), cameras(1, 128, 96)[0]
     other = Style.of(picture(64, 80, seed=5, dtype=torch.float64))
@@ -137,7 +137,7 @@ def test_regions_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> Non
         assert found_loss == pytest.approx(loss, rel=1e-9)
 
 
-def test_ranks_that_keep_only_some_activations_give_the_same_gradient() -> None:
+def test_partly_cached_activations_preserve_the_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, 48)
     memory = int(30_000 * FeatureNetwork(tiny_weights(), dtype=torch.float64).held_bytes_per_pixel())
@@ -149,7 +149,7 @@ def test_ranks_that_keep_only_some_activations_give_the_same_gradient() -> None:
 
 
 @pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
-def test_matched_features_give_the_gradient_of_one_rank(style_loss: StyleLossName) -> None:
+def test_gradient_of_matched_features_matches_one_rank(style_loss: StyleLossName) -> None:
     """One of the three ranks has almost no features to match."""
     scene, camera = ball(), cameras(1, 128, 96)[0]
     arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss
@@ -181,7 +181,7 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
     [pytest.param(wall(sh_degree=1), id="wall"), pytest.param(ball(), id="ball")],
 )
 @pytest.mark.slow
-def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(scene: Scene) -> None:
+def test_fifty_steps_match_one_rank_and_are_reproducible(scene: Scene) -> None:
     """The learning rate is small: at that of `standard`, thirty steps amplify rounding errors by 1e4."""
     values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False, "learning_rate": 0.01}
     alone = stylize(ALONE, scene, 3, values)
@@ -197,7 +197,7 @@ def test_fifty_steps_end_where_one_rank_ends_and_can_be_repeated_bit_for_bit(sce
     assert again["losses"] == first["losses"]
 
 
-def test_ranks_refine_a_scene_as_one_does() -> None:
+def test_refinement_matches_one_rank() -> None:
     alone = on_a_rank(ALONE, 2.0)
     assert alone is not None
     assert alone.split > 0
@@ -207,7 +207,7 @@ def test_ranks_refine_a_scene_as_one_does() -> None:
 
 
 @pytest.mark.parametrize(("ranks", "views_per_step"), [(1, 2), (2, 2), (4, 2), (3, 2), (2, 4)])
-def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, views_per_step: int) -> None:
+def test_several_views_per_step_do_not_depend_on_rank_count(ranks: int, views_per_step: int) -> None:
     scene = wall()
     values = {"steps_coarse": 2, "steps_sos": 4, "views_per_step": views_per_step, "learning_rate": 0.01}
     expected = stylize(ALONE, scene, 5, values)
@@ -219,7 +219,7 @@ def test_several_views_a_step_do_not_depend_on_the_number_of_ranks(ranks: int, v
     assert expected["losses"] != stylize(ALONE, scene, 5, {**values, "views_per_step": 1})["losses"]
 
 
-def test_ranks_draw_the_same_colors_behind_a_scan() -> None:
+def test_ranks_use_the_same_background_colors() -> None:
     """Background colors equal those of a run on one rank, however the ranks are grouped."""
     values = {
         "steps_coarse": 2,
@@ -236,7 +236,7 @@ def test_ranks_draw_the_same_colors_behind_a_scan() -> None:
     assert expected["losses"] != stylize(ALONE, ball(), 3, {**values, "training_background": "random"})["losses"]
 
 
-def one_view_a_step_by_hand(views: list[int]) -> Tensor:
+def mean_gradient_by_hand(views: list[int]) -> Tensor:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40)
     stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
@@ -244,7 +244,7 @@ def one_view_a_step_by_hand(views: list[int]) -> Tensor:
     return torch.stack(gradients).mean(dim=0)
 
 
-def test_gradients_of_a_steps_views_are_averaged() -> None:
+def test_gradients_of_views_in_a_step_are_averaged() -> None:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40, views_per_step=3)
     stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
@@ -252,10 +252,10 @@ def test_gradients_of_a_steps_views_are_averaged() -> None:
     views = [order._order.next_view() for _ in range(3)]
     stylizer.run_step()
     assert stylizer.sh_dc.grad is not None
-    assert relative_error(stylizer.sh_dc.grad, one_view_a_step_by_hand(views)) < 1e-6
+    assert relative_error(stylizer.sh_dc.grad, mean_gradient_by_hand(views)) < 1e-6
 
 
-def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
+def run_with_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
     settings = make_settings("standard", steps_coarse=0, steps_sos=20, keep=("ranks",), rebalance=rebalance)
     stylizer = Stylizer.planned(
         wall(), cameras(2, 192, 144), style(), settings, weights=tiny_weights(), collectives=collectives
@@ -280,15 +280,15 @@ def run_beside_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[st
     return {"speeds": speeds, "before": before, "after": stylizer.gradient(0, [0])[0]}
 
 
-def test_a_slow_rank_gets_less_to_do_and_the_gradient_stays() -> None:
-    first, second = on_ranks(2, run_beside_a_slow_rank, True)
+def test_slow_rank_gets_less_work_and_gradient_is_unchanged() -> None:
+    first, second = on_ranks(2, run_with_a_slow_rank, True)
     assert first["speeds"] == second["speeds"]
     assert first["speeds"][0] > 1.3 * first["speeds"][1]
     assert relative_error(first["after"], first["before"]) < 1e-5
     assert torch.equal(first["after"], second["after"])
 
 
-def test_work_is_not_shared_out_anew_where_that_is_not_wanted() -> None:
-    first, _ = on_ranks(2, run_beside_a_slow_rank, False)
+def test_work_is_not_redistributed_without_rebalance() -> None:
+    first, _ = on_ranks(2, run_with_a_slow_rank, False)
     assert first["speeds"] == (1.0, 1.0)
     assert torch.equal(first["after"], first["before"])

@@ -29,25 +29,25 @@ def raised(error: Exception) -> Failure:
     return failure_of(error, "Worker 0 on here")
 
 
-def test_an_error_of_the_job_is_raised_at_once() -> None:
+def test_job_error_is_raised_at_once() -> None:
     error = SceneError("scene.ply: is truncated.")
     assert decide([failed(raised(error))]) == RaiseError(error)
     assert decide([failed(), failed(raised(error), 7, progressed=True)]) == RaiseError(error)
 
 
-def test_ranks_that_drifted_are_tried_again() -> None:
+def test_drifted_ranks_are_retried() -> None:
     failure = raised(RanksDriftedError("Rank 1 has other colors."))
     assert failure.kind == "loss"
     assert decide([failed(failure, 5)]) == TryAgain("Worker 0 on here failed: Rank 1 has other colors, after step 5.")
 
 
 @pytest.mark.parametrize("progressed", [True, False])
-def test_a_first_loss_is_tried_again(progressed: bool) -> None:
+def test_first_lost_rank_is_retried(progressed: bool) -> None:
     expected = TryAgain("Worker 1 on here was lost: its process was killed, after step 8.")
     assert decide([failed(last_step=8, progressed=progressed)]) == expected
 
 
-def test_losses_are_tried_again_as_long_as_attempts_come_further() -> None:
+def test_lost_ranks_are_retried_while_attempts_progress() -> None:
     attempts = [failed(last_step=step, progressed=True) for step in range(0, 200, 10)]
     assert isinstance(decide(attempts), TryAgain)
     in_vain = [failed(last_step=190)] * (MOST_ATTEMPTS - 1)
@@ -55,7 +55,7 @@ def test_losses_are_tried_again_as_long_as_attempts_come_further() -> None:
     assert isinstance(decide([*attempts, *in_vain, failed(last_step=200, progressed=True)]), TryAgain)
 
 
-def test_too_many_attempts_in_vain_are_given_up() -> None:
+def test_too_many_attempts_without_progress_give_up() -> None:
     decision = decide([failed(last_step=30, progressed=True), *[failed(last_step=20)] * MOST_ATTEMPTS])
     assert decision == GiveUp(
         "3 attempts in a row came no further than step 30. The last one: Worker 1 on here was lost: its process was "
@@ -71,15 +71,15 @@ def twice(error: Exception, second: Exception | None = None, steps: tuple[int, i
 @pytest.mark.parametrize(
     "error", [RuntimeError("CUDA error"), MemoryError("can't allocate"), RanksDriftedError("Rank 1 drifted.")]
 )
-def test_the_same_error_at_the_same_step_is_raised_the_second_time(error: Exception) -> None:
+def test_repeated_error_at_same_step_is_raised(error: Exception) -> None:
     assert twice(error) == RaiseError(error)
 
 
-def test_the_same_error_of_another_kind_is_told_in_a_sentence() -> None:
+def test_repeated_error_of_other_type_gives_up_with_a_sentence() -> None:
     assert twice(KeyError("a")) == GiveUp("Worker 0 on here failed: 'a'; the same happened twice at step 4.")
 
 
-def test_another_error_another_step_or_progress_is_tried_again() -> None:
+def test_different_error_step_or_progress_is_retried() -> None:
     error = RuntimeError("CUDA error")
     assert isinstance(twice(error, RuntimeError("NCCL error")), TryAgain)
     assert isinstance(twice(error, steps=(4, 5)), TryAgain)
@@ -87,10 +87,10 @@ def test_another_error_another_step_or_progress_is_tried_again() -> None:
     assert isinstance(decide(attempts), TryAgain)
 
 
-def test_a_loss_without_an_error_is_not_raised() -> None:
+def test_lost_ranks_without_an_error_are_retried() -> None:
     assert isinstance(decide([failed(), failed()]), TryAgain)
 
 
-def test_an_error_in_a_few_words() -> None:
+def test_error_summary_is_first_line_or_type() -> None:
     assert first_line(RuntimeError("  It broke.\nAt length.")) == "It broke"
     assert first_line(RuntimeError()) == "RuntimeError"

@@ -60,7 +60,7 @@ def shared(collectives: Collectives, path: Path, drop: bool) -> tuple[str, bool,
 
 @linux
 @pytest.mark.parametrize("drop", [False, True])
-def test_one_rank_reads_and_all_have_the_same(tmp_path: Path, drop: bool) -> None:
+def test_one_rank_reads_and_shares_the_scene(tmp_path: Path, drop: bool) -> None:
     scene = wall(sh_degree=1)
     if drop:
         scene.opacities[7] = float("nan")
@@ -76,7 +76,7 @@ def test_one_rank_reads_and_all_have_the_same(tmp_path: Path, drop: bool) -> Non
 
 @linux
 @pytest.mark.parametrize("format", EXTRA_FORMATS)
-def test_a_packed_scene_is_read_once_too(tmp_path: Path, format: SceneFormat) -> None:
+def test_compressed_scene_is_read_once(tmp_path: Path, format: SceneFormat) -> None:
     path = tmp_path / "scene"
     write_scene(path, wall(sh_degree=1), format)
     found = on_ranks(2, shared, path, False)
@@ -84,7 +84,7 @@ def test_a_packed_scene_is_read_once_too(tmp_path: Path, format: SceneFormat) ->
     assert [rank[1] for rank in found] == [True, False]
 
 
-def test_the_room_that_a_packed_scene_needs_is_that_of_its_floats(tmp_path: Path) -> None:
+def test_compressed_scene_needs_memory_of_its_floats(tmp_path: Path) -> None:
     """The requirement follows from the header, before the scene is decompressed."""
     path = tmp_path / "scene"
     for format in EXTRA_FORMATS:
@@ -104,7 +104,7 @@ def shared_colors(collectives: Collectives, path: Path, drop: bool) -> tuple[boo
 
 @linux
 @pytest.mark.parametrize("drop", [False, True])
-def test_harmonics_in_the_file_are_read_there_by_every_rank(tmp_path: Path, drop: bool) -> None:
+def test_every_rank_reads_stored_harmonics_from_the_file(tmp_path: Path, drop: bool) -> None:
     scene = wall(sh_degree=2)
     if drop:
         scene.opacities[7] = float("nan")
@@ -124,7 +124,7 @@ def refused(collectives: Collectives, path: Path) -> str:
     return str(caught.value)
 
 
-def test_what_the_reader_refuses_is_refused_everywhere(tmp_path: Path) -> None:
+def test_invalid_scene_is_refused_on_every_rank(tmp_path: Path) -> None:
     scene = wall()
     scene.scales[3, 1] = float("nan")
     write_scene(tmp_path / "scene.ply", scene)
@@ -133,7 +133,7 @@ def test_what_the_reader_refuses_is_refused_everywhere(tmp_path: Path) -> None:
     assert "scale_1" in messages[0]
 
 
-def test_a_scene_that_no_memory_holds_is_refused_with_figures(tmp_path: Path) -> None:
+def test_scene_beyond_memory_is_refused_with_figures(tmp_path: Path) -> None:
     """The file is sparse, with the size of a billion Gaussians, none of which is stored."""
     path = tmp_path / "scene.ply"
     write_scene(path, wall(sh_degree=3))
@@ -149,7 +149,7 @@ def test_a_scene_that_no_memory_holds_is_refused_with_figures(tmp_path: Path) ->
         read_shared_scene(path, ALONE)
 
 
-def test_alone_nothing_is_copied(tmp_path: Path) -> None:
+def test_single_rank_copies_nothing(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene.ply", wall())
     file, reader = read_shared_scene(tmp_path / "scene.ply", ALONE)
     assert reader

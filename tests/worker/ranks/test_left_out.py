@@ -26,26 +26,24 @@ ROOT = Path(__file__).resolve().parents[3]
 STEPS = 16
 
 
-def ranks_that_run() -> int:
+def running_ranks() -> int:
     """Return the number of running ranks among the descendants of this process."""
     children = psutil.Process().children(recursive=True)
     return sum("FaultyRank" in " ".join(child.cmdline()) for child in children if child.is_running())
 
 
 @pytest.mark.slow
-def test_a_worker_that_the_plan_does_without_ends_before_the_work_begins(tmp_path: Path) -> None:
+def test_unneeded_worker_exits_before_the_steps(tmp_path: Path) -> None:
     request = small_request(tmp_path, STEPS, keep=())  # views are too small to be divided between ranks
     ranks_alive: list[int] = []
-    listener = Listener(progress=lambda now: ranks_alive.append(ranks_that_run()))
+    listener = Listener(progress=lambda now: ranks_alive.append(running_ranks()))
     ended = stylize_on_ranks(request, 2, listener, options=WorkerOptions(actor=FaultyRank))
     assert ended.step == STEPS
     assert ranks_alive[-1] == 1
 
 
 @pytest.mark.slow
-def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gpus_of_unneeded_ranks_are_released_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray is configured with two GPUs that do not exist. It assigns them, and ranks compute on the CPU."""
     monkeypatch.setenv("RAY_AUTH_MODE", "token")  # Ray reads it at import, which is earlier here than in a job
     monkeypatch.setenv("RAY_AUTH_TOKEN", cluster._SECRET)
@@ -72,7 +70,7 @@ def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
 
     def progress(now: Progress) -> None:
         if given_back:
-            ranks_alive.append(ranks_that_run())
+            ranks_alive.append(running_ranks())
 
     options = WorkerOptions(checkpoint_seconds=0.2, actor=FaultyRank)
     listener = Listener(progress=progress, left_out=left_out, happened=happened.append)
@@ -83,13 +81,13 @@ def test_gpus_that_the_plan_does_without_are_free_at_once_and_for_good(
     assert ended.step == STEPS
     assert ranks_alive
     assert max(ranks_alive) == 1
-    assert len(given_back) == 1, "told once: the second attempt has no rank too many"
+    assert len(given_back) == 1, "reported once: the second attempt has no rank too many"
     assert {*given_back, os.environ["CUDA_VISIBLE_DEVICES"]} == {"5", "7"}
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("joined")
-def test_a_cluster_has_them_back_before_the_job_ends(tmp_path: Path) -> None:
+def test_unneeded_gpus_return_to_cluster_during_the_job(tmp_path: Path) -> None:
     import ray
 
     request = small_request(tmp_path, STEPS, keep=())

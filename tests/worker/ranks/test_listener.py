@@ -14,7 +14,7 @@ from worker.ranks.listener import Listener, Relay
 from worker.ranks.rank import RankStatus
 
 
-class Told:
+class EventRecorder:
     """Recorder of all events of a listener, in order."""
 
     def __init__(self) -> None:
@@ -47,48 +47,48 @@ def step(number: int) -> Progress:
     return Progress("sos", number, 10, 1.0, 1.0, 1.0)
 
 
-def test_planning_is_told_as_it_goes_on_and_no_more_when_it_is_done() -> None:
-    told = Told()
-    assert told.after(RankStatus(), planned(0), planned(1), planned(1), planned(4)) == [
+def test_planning_progress_is_relayed_until_prepared() -> None:
+    recorder = EventRecorder()
+    assert recorder.after(RankStatus(), planned(0), planned(1), planned(1), planned(4)) == [
         ("planning", 0.0),
         ("planning", 0.25),
         ("planning", 1.0),
     ]
     done = replace(planned(4), prepared=Prepared([], 0, 10))
-    assert told.after(done, done, replace(done, progress=step(1))) == [
+    assert recorder.after(done, done, replace(done, progress=step(1))) == [
         ("prepared", 0),
         ("resumed", None),
         ("step", 1),
     ]
 
 
-def test_an_attempt_that_plans_again_tells_it_again() -> None:
-    told = Told()
-    told.after(planned(3))
-    told.relay.begin_attempt()
-    assert told.after(planned(3)) == [("planning", 0.75)]
+def test_new_attempt_relays_planning_again() -> None:
+    recorder = EventRecorder()
+    recorder.after(planned(3))
+    recorder.relay.begin_attempt()
+    assert recorder.after(planned(3)) == [("planning", 0.75)]
 
 
-def test_an_attempt_that_goes_on_from_a_checkpoint_is_prepared_silently() -> None:
-    told = Told()
-    told.after(RankStatus(prepared=Prepared([], 0, 10), progress=step(5), saved=4))
-    assert told.relay.farthest == (5, 4)
-    told.relay.begin_attempt()
-    assert (told.relay.first_step, told.relay.last_step) == (None, 4)
+def test_resumed_attempt_relays_no_preparation() -> None:
+    recorder = EventRecorder()
+    recorder.after(RankStatus(prepared=Prepared([], 0, 10), progress=step(5), saved=4))
+    assert recorder.relay.farthest == (5, 4)
+    recorder.relay.begin_attempt()
+    assert (recorder.relay.first_step, recorder.relay.last_step) == (None, 4)
     again = RankStatus(prepared=Prepared([], 4, 10))
-    assert told.after(again, replace(again, progress=step(5))) == [("resumed", None), ("step", 5)]
-    assert told.relay.first_step == 4
-    assert told.relay.farthest == (5, 4)
+    assert recorder.after(again, replace(again, progress=step(5))) == [("resumed", None), ("step", 5)]
+    assert recorder.relay.first_step == 4
+    assert recorder.relay.farthest == (5, 4)
 
 
 @pytest.mark.parametrize("again", [False, True])
-def test_warnings_and_pictures_are_told_once(again: bool) -> None:
-    told = Told()
+def test_warnings_and_previews_are_relayed_once_per_attempt(again: bool) -> None:
+    recorder = EventRecorder()
     first = RankStatus(warnings=("a",), previews=(Path("out/1.jpg"),))
-    told.after(first)
+    recorder.after(first)
     status = replace(first, warnings=("a", "b"), previews=(Path("out/1.jpg"), Path("out/2.jpg")))
     if again:
-        told.relay.begin_attempt()  # its ranks report all events again
-        assert len(told.after(status)) == 4
+        recorder.relay.begin_attempt()  # its ranks report all events again
+        assert len(recorder.after(status)) == 4
     else:
-        assert told.after(status) == [("warning", "b"), ("preview", "2.jpg")]
+        assert recorder.after(status) == [("warning", "b"), ("preview", "2.jpg")]

@@ -51,19 +51,19 @@ VALUES = [
 
 
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
-def test_values_come_out_as_they_went_in(value: Any) -> None:
+def test_values_round_trip(value: Any) -> None:
     found = decode(encode(value))
     assert found == value
     assert repr(found) == repr(value)  # distinguishes -0.0 from 0.0, tuples from lists, and True from 1
 
 
-def test_not_a_number_stays_one() -> None:
+def test_nan_round_trips() -> None:
     assert math.isnan(decode(encode(math.nan)))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.int64, torch.uint8, torch.bool])
 @pytest.mark.parametrize("shape", [(), (0, 3), (5, 3)])
-def test_tensors_keep_their_bits(dtype: torch.dtype, shape: tuple[int, ...]) -> None:
+def test_tensors_round_trip_bit_identical(dtype: torch.dtype, shape: tuple[int, ...]) -> None:
     tensor = (torch.randn(shape, generator=torch.Generator().manual_seed(0)) * 100).to(dtype)
     found = decode(encode({"tensor": tensor, "part": tensor.expand(2, *shape)}))
     for name, expected in (("tensor", tensor), ("part", tensor.expand(2, *shape))):
@@ -72,7 +72,7 @@ def test_tensors_keep_their_bits(dtype: torch.dtype, shape: tuple[int, ...]) -> 
         assert torch.equal(found[name], expected)
 
 
-def test_arrays_and_dataclasses_of_tensors() -> None:
+def test_arrays_and_dataclasses_of_tensors_round_trip() -> None:
     camera = Camera("a.jpg", 8, 6, 5.0, 5.0, 4.0, 3.0, torch.eye(4, dtype=torch.float64))
     found, kept = decode(encode((camera, np.array([True, False]))))
     assert isinstance(found, Camera)
@@ -90,7 +90,7 @@ def test_errors_keep_their_type() -> None:
 @pytest.mark.parametrize(
     "value", [object(), {1}, ValueError("no"), Path, len, np.float32(1)], ids=lambda value: type(value).__name__
 )
-def test_what_no_message_can_hold_is_refused(value: Any) -> None:
+def test_unsupported_values_are_refused(value: Any) -> None:
     with pytest.raises(TypeError, match=r"A message between ranks cannot hold a|is not a class of"):
         encode(value)
 
@@ -120,12 +120,12 @@ def message(value: Any) -> Tensor:
     ],
     ids=str,
 )
-def test_a_message_names_nothing_else(value: Any) -> None:
+def test_messages_cannot_name_other_classes_or_functions(value: Any) -> None:
     with pytest.raises(ValueError, match="not a message of this program"):
         decode(message(value))
 
 
 @pytest.mark.parametrize("data", [b"", b"\x80\x05N.", struct.pack("<Q", 2**60) + b"{}", b"\x00" * 64])
-def test_bytes_that_are_no_message(data: bytes) -> None:
+def test_invalid_bytes_are_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match="not a message of this program"):
         decode(torch.tensor(list(data), dtype=torch.uint8))

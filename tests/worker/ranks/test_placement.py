@@ -14,30 +14,30 @@ from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 GB = 1_000_000_000
 
 
-def test_a_scene_is_counted_as_it_will_be_read() -> None:
+def test_scene_memory_is_its_decompressed_size() -> None:
     assert scene_bytes("room.ply", GB) == GB
     assert scene_bytes("ROOM.SPZ", 25_000_000) == 248_000_000
     assert scene_bytes("room.compressed.ply", 61_000_000) == 248_000_000
     assert memory_beside_gpus(4, 5 * GB) == 22 * GB, "ranks of a machine share the scene"
 
 
-def test_ranks_of_a_machine_share_the_scene_and_ask_for_memory() -> None:
+def test_ranks_of_a_machine_request_memory_for_a_shared_scene() -> None:
     nodes = [{"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}, {"CPU": 64.0, "memory": 500.0 * GB}]
     assert _bundle(nodes, 1, 8, 5 * GB) == {"CPU": 8, "GPU": 1, "memory": 13 * GB}
     assert _bundle(nodes, 2, 8, 5 * GB) == {"CPU": 8, "GPU": 1, "memory": 8 * GB}
     assert _bundle([*nodes, nodes[0]], 8, 8, 5 * GB)["memory"] == 5.5 * GB, "four on each machine"
 
 
-def test_a_scene_for_which_no_machine_has_enough_asks_for_all_of_one() -> None:
+def test_oversized_scene_requests_a_whole_machines_memory() -> None:
     nodes = [{"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}]
     assert _bundle(nodes, 1, 8, 200 * GB)["memory"] == 100 * GB
     assert _bundle(nodes, 4, 8, 200 * GB)["memory"] == 25 * GB
 
 
-def test_without_gpus_cores_alone_are_asked_for() -> None:
+def test_only_cores_are_requested_without_gpus() -> None:
     """Without GPUs, plans already limit their memory to a fraction of the machine's, so only cores are requested."""
     assert _bundle([{"CPU": 32.0, "memory": 100.0 * GB}], 2, 8, 5 * GB) == {"CPU": 8}
-    assert _bundle([{"CPU": 32.0, "GPU": 4.0}], 2, 8, 5 * GB) == {"CPU": 8, "GPU": 1}, "Ray was told of none"
+    assert _bundle([{"CPU": 32.0, "GPU": 4.0}], 2, 8, 5 * GB) == {"CPU": 8, "GPU": 1}, "Ray knows of no memory"
 
 
 @contextmanager
@@ -54,7 +54,7 @@ def taken(memory: int) -> Iterator[None]:
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent")
 @pytest.mark.usefixtures("joined")
-def test_ray_gives_no_gpus_on_a_machine_whose_memory_is_taken() -> None:
+def test_ray_grants_no_gpus_without_free_memory() -> None:
     """The cluster has two GPUs and 10 GB; a scene of 2 GB needs 10 GB with two ranks and 7 GB with one."""
     with Cluster(2):
         reserved = reserve(2, 2 * GB)

@@ -33,10 +33,10 @@ HEIGHT = 70
     ("gpus", "expected", "sharing"),
     [((0, 1), "cuda", 1), ((3, 3), "cuda", 2), ((0, None), "cpu", 1), ((None, None), "cpu", 1)],
 )
-def test_ranks_meet_on_gpus_if_each_has_one(
+def test_gpus_are_used_if_each_rank_has_one(
     gpus: tuple[int | None, int | None], expected: str, sharing: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ranks on one GPU, or on MIG slices of it, find each other by its place on the bus."""
+    """Ranks on one GPU, or on MIG slices of it, recognize each other by its PCI address."""
 
     def properties(device: torch.device) -> SimpleNamespace:
         return SimpleNamespace(pci_domain_id=0, pci_bus_id=16 + (device.index or 0), pci_device_id=0)
@@ -50,7 +50,7 @@ def test_ranks_meet_on_gpus_if_each_has_one(
     assert [(device.type, shared) for device, shared, _ in found] == [(expected, sharing)] * 2
 
 
-def test_nccl_is_used_between_gpus_of_one_rank_each(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nccl_requires_one_rank_per_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     for there, expected in ((True, "cpu:gloo,cuda:nccl"), (False, "gloo")):
         monkeypatch.setattr(dist, "is_nccl_available", lambda there=there: there)
         assert _backend(torch.device("cuda", 0), 1) == expected
@@ -99,7 +99,7 @@ def merge(collectives: Collectives, empty: int | None) -> list[tuple[LayerStatis
 
 
 @pytest.mark.parametrize("empty", [None, 0, 2])
-def test_statistics_are_merged_as_if_all_positions_were_on_one_rank(empty: int | None) -> None:
+def test_merged_statistics_match_one_rank(empty: int | None) -> None:
     present = [features(rank).reshape(-1, 5) for rank in range(3) if rank != empty]
     expected = layer_statistics_reference(torch.cat(present)[None])
     for result in on_ranks(3, merge, empty):
@@ -113,13 +113,13 @@ def test_statistics_are_merged_as_if_all_positions_were_on_one_rank(empty: int |
             assert float(found.std()[3]) == 0.0
 
 
-def test_nothing_at_all_stays_nothing() -> None:
-    for statistics in on_ranks(2, merge_nothing):
+def test_merged_empty_statistics_are_empty() -> None:
+    for statistics in on_ranks(2, merge_empty):
         assert statistics.empty
         assert not statistics.centered.any()
 
 
-def merge_nothing(collectives: Collectives) -> LayerStatistics:
+def merge_empty(collectives: Collectives) -> LayerStatistics:
     return collectives.all_reduce_statistics([LayerStatistics.zero(4)], numbers(0.0))()[0][0]
 
 
@@ -138,7 +138,7 @@ def values(collectives: Collectives) -> dict[str, Any]:
     }
 
 
-def test_values_and_groups() -> None:
+def test_collectives_and_groups_follow_their_definitions() -> None:
     results = on_ranks(4, values)
     for rank, found in enumerate(results):
         assert found["all_gather"] == [0, 1, 2, 3]
@@ -161,7 +161,7 @@ def fail_on_first(collectives: Collectives) -> str:
         return str(error)
 
 
-def test_an_error_of_the_first_rank_is_raised_on_all() -> None:
+def test_error_of_first_rank_is_raised_on_all_ranks() -> None:
     assert on_ranks(2, fail_on_first) == ["scene.ply: is empty."] * 2
 
 
@@ -178,7 +178,7 @@ def drift(collectives: Collectives) -> str:
     return ""
 
 
-def test_ranks_that_drift_apart_are_found() -> None:
+def test_drifting_ranks_are_detected() -> None:
     for message in on_ranks(2, drift):
         assert message.startswith("Step 50: the ranks' colors are no longer the same.")
 
@@ -198,7 +198,7 @@ def leave_out(collectives: Collectives) -> str | int:
     return stylizer.job.collectives.size
 
 
-def test_ranks_that_would_only_add_communication_are_left_out() -> None:
+def test_ranks_that_only_add_communication_are_excluded() -> None:
     """In a view of 32 x 24 pixels, all tiles consist of halo only."""
     results = on_ranks(4, leave_out)
     taking_part = [result for result in results if result != "left out"]
@@ -206,7 +206,7 @@ def test_ranks_that_would_only_add_communication_are_left_out() -> None:
     assert taking_part == [len(taking_part)] * len(taking_part)
 
 
-def test_one_rank_has_nobody_to_tell() -> None:
+def test_single_rank_collectives_return_their_input() -> None:
     band = image(0)
     assert ALONE.all_gather_rows(band, [(0, HEIGHT)]) is band
     assert ALONE.reduce_scatter_rows(band, [(0, HEIGHT)]) is band
@@ -231,5 +231,5 @@ def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
 @pytest.mark.parametrize(
     ("expected", "patient"), [(None, True), (20.0, True), (0.1, False)], ids=["preparing", "slow", "quick"]
 )
-def test_ranks_wait_as_long_as_an_iteration_may_take(expected: float | None, patient: bool) -> None:
+def test_timeout_follows_expected_iteration_time(expected: float | None, patient: bool) -> None:
     assert on_ranks(2, keep_waiting, expected, timeout=1.0)[1] is patient

@@ -37,7 +37,7 @@ print(os.environ["OMP_NUM_THREADS"])
 """
 
 
-def test_threads_can_be_told_after_kernels_have_run() -> None:
+def test_thread_count_can_be_set_after_kernels_ran() -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ended = subprocess.run(
         [sys.executable, "-c", COLD_CACHE], env=environment, capture_output=True, text=True, check=False
@@ -46,7 +46,7 @@ def test_threads_can_be_told_after_kernels_have_run() -> None:
     assert int(ended.stdout) > 1
 
 
-def test_a_gpu_has_its_number_before_it_is_made_the_current_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_get_an_index(monkeypatch: pytest.MonkeyPatch) -> None:
     """PyTorch refuses a device without an index, and does so before it looks for a GPU."""
     with pytest.raises(ValueError, match="index"):
         torch.cuda.set_device(torch.device("cuda"))
@@ -56,7 +56,7 @@ def test_a_gpu_has_its_number_before_it_is_made_the_current_one(monkeypatch: pyt
     assert with_index("cpu") == torch.device("cpu")
 
 
-def test_an_error_of_the_store_is_one_of_an_exchange() -> None:
+def test_store_error_is_an_echo_of_a_lost_rank() -> None:
     """Such an error occurs if a rank is lost while the other ranks form their process group."""
     assert _failure(dist.DistStoreError("wait timeout")).echo
     assert not _failure(RuntimeError("wait timeout")).echo

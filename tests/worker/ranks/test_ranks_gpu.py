@@ -52,7 +52,7 @@ def run_rank(rank: int, size: int, address: str, name: str, folder: str) -> None
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA GPUs")
 @pytest.mark.parametrize("name", ["wall", "ball"])
-def test_nccl_ranks_give_the_gradient_of_one(name: str, tmp_path: Path, exact_convolutions: None) -> None:
+def test_nccl_gradient_matches_one_rank(name: str, tmp_path: Path, exact_convolutions: None) -> None:
     expected = gradient(ALONE, name)
     size = min(torch.cuda.device_count(), 4)
     address = f"127.0.0.1:{free_port()}"
@@ -65,7 +65,7 @@ def test_nccl_ranks_give_the_gradient_of_one(name: str, tmp_path: Path, exact_co
     assert relative_error(found[0], expected) < 1e-5
 
 
-def merge_beside_other_work(rank: int, size: int, address: str, folder: str) -> None:
+def merge_during_other_work(rank: int, size: int, address: str, folder: str) -> None:
     """Merge statistics of three scales concurrently, while the main stream reuses freed memory."""
     with process_group(rank, size, address, device=f"cuda:{rank}", timeout=timedelta(seconds=60)) as collectives:
         waiting = []
@@ -89,10 +89,10 @@ def features(seed: int) -> Tensor:
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA GPUs")
-def test_statistics_are_merged_beside_other_work(tmp_path: Path) -> None:
+def test_statistics_merge_concurrently_with_other_work(tmp_path: Path) -> None:
     address = f"127.0.0.1:{free_port()}"
     multiprocessing.spawn(  # type: ignore[attr-defined]
-        merge_beside_other_work, (2, address, str(tmp_path)), nprocs=2
+        merge_during_other_work, (2, address, str(tmp_path)), nprocs=2
     )
     first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
     for turn, (own, other) in enumerate(zip(first, second, strict=True)):
@@ -106,9 +106,7 @@ def test_statistics_are_merged_beside_other_work(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")
 @pytest.mark.parametrize("name", ["wall", "ball"])
-def test_one_gpu_gives_the_gradient_of_the_cpu(
-    name: str, exact_convolutions: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gpu_gradient_matches_cpu(name: str, exact_convolutions: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Devices add in different orders, so near-ties of max pooling may be resolved differently."""
     on_gpu = gradient(ALONE, name)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

@@ -38,7 +38,7 @@ def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int],
 
 
 @pytest.mark.slow
-def test_two_ranks_make_the_steps_of_one_and_wait_once_in_each() -> None:
+def test_two_ranks_match_one_and_synchronize_once_per_step() -> None:
     """Communication is not counted as host synchronization, because the library waits for other ranks anyway."""
     expected, losses, _, _ = run_steps(ALONE)
     first, second = on_ranks(2, run_steps, device="cuda")
@@ -59,7 +59,7 @@ def merge_three(collectives: Collectives) -> list[tuple[Tensor, Tensor]]:
     return [(found[0].gram().cpu(), added.cpu()) for found, added in (wait() for wait in waiting)]
 
 
-def test_statistics_merge_on_a_stream_of_their_own() -> None:
+def test_statistics_merge_on_their_own_stream() -> None:
     every = torch.cat(
         [torch.randn(9 + rank, 7, 16, generator=torch.Generator().manual_seed(rank)) for rank in range(2)]
     )

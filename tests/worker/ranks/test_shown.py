@@ -77,7 +77,7 @@ def upper(scene: Scene) -> Scene:
         pytest.param(wall(), 15, id="no rows for one rank"),
     ],
 )
-def test_what_the_view_shows_gives_the_bits_of_the_whole_gradient(scene: Scene, height: int) -> None:
+def test_exchange_of_shown_gaussians_is_bit_identical_to_all(scene: Scene, height: int) -> None:
     camera = cameras(1, WIDTH, height)[0]
     shown = int(shown_of(scene, camera).sum())
     assert 0 < shown < 0.7 * len(scene)
@@ -91,7 +91,7 @@ def test_what_the_view_shows_gives_the_bits_of_the_whole_gradient(scene: Scene, 
         assert [sent["gradient"] for sent in found["bytes shown"]] == [len(scene) + 12 * shown, 12 * shown]
 
 
-def test_a_band_that_shows_nothing_is_one() -> None:
+def test_lower_band_shows_no_gaussians() -> None:
     """Check the assumption of the second test case above."""
     scene, camera = upper(wall()), cameras(1, WIDTH, HEIGHT)[0]
     first, second = divide_rows(HEIGHT, 2)
@@ -100,7 +100,7 @@ def test_a_band_that_shows_nothing_is_one() -> None:
     assert not rasterizer.coverage(camera, second).any()
 
 
-def test_rings_of_more_ranks_add_in_other_orders() -> None:
+def test_four_ranks_differ_by_rounding_only() -> None:
     """The index of a value determines the rank at which the ring starts to add, so only the rounding differs."""
     scene, camera = wall(), cameras(1, WIDTH, HEIGHT)[0]
     results = on_ranks(4, both_ways, scene, camera)
@@ -111,7 +111,7 @@ def test_rings_of_more_ranks_add_in_other_orders() -> None:
             assert torch.equal(packed == 0, whole == 0)
 
 
-def test_the_whole_gradient_travels_where_nearly_all_is_shown() -> None:
+def test_whole_gradient_is_sent_if_nearly_all_is_shown() -> None:
     camera = cameras(1, WIDTH, HEIGHT)[0]
     scene = wall().subset(shown_of(wall(), camera))
     for found in on_ranks(2, both_ways, scene, camera):
@@ -132,7 +132,7 @@ def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
     return dict(collectives.sent)
 
 
-def test_bytes_are_counted_as_rings_move_them() -> None:
+def test_sent_bytes_follow_ring_algorithms() -> None:
     for rank, sent in enumerate(on_ranks(4, exchange_everything)):
         bands = divide_rows(HEIGHT, 4)
         rows = [stop - start for start, stop in bands]
@@ -158,7 +158,7 @@ def run_two_steps(collectives: Collectives) -> dict[str, Any]:
     }
 
 
-def test_a_step_says_what_it_sent() -> None:
+def test_step_record_has_sent_bytes() -> None:
     """Each of two ranks sends twice half of what they add, and twice its half of the image."""
     layer = CHANNELS + 1 + CHANNELS * (CHANNELS + 1) // 2
     statistics = 8 * (len(STYLE_LAYERS) * layer + len(TERMS))

@@ -37,7 +37,7 @@ def listening(process: psutil.Process) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_job_of_one_machine_listens_on_loopback_only(tmp_path: Path, tiny_installed: Path) -> None:
+def test_single_machine_job_listens_on_loopback_only(tmp_path: Path, tiny_installed: Path) -> None:
     process = start(command(small_request(tmp_path, 400)))
     try:
         driver = psutil.Process(process.pid)
@@ -65,7 +65,7 @@ def own_sockets(collectives: Collectives) -> list[str]:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2"])
-def test_ranks_listen_on_the_address_of_their_job_alone(host: str) -> None:
+def test_ranks_listen_only_on_the_address_of_their_job(host: str) -> None:
     """In this test, 127.0.0.2 represents the address of a cluster's network interface."""
     first, second = on_ranks(2, own_sockets, host=host)
     assert host in first, "the ranks' store"
@@ -109,7 +109,7 @@ def receive(collectives: Collectives, path: Path, broadcast: bool) -> str:
 
 
 @pytest.mark.parametrize("broadcast", [False, True], ids=["all_gather", "broadcast"])
-def test_a_pickle_from_another_rank_is_not_opened(tmp_path: Path, broadcast: bool) -> None:
+def test_pickle_from_another_rank_is_not_loaded(tmp_path: Path, broadcast: bool) -> None:
     answers = on_ranks(2, receive, tmp_path / "made", broadcast)
     assert not (tmp_path / "made").exists()
     assert "not a message of this program" in answers[1 if broadcast else 0]

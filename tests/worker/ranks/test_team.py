@@ -31,7 +31,7 @@ def drift(collectives: Collectives) -> list[str]:
     return [str(raised.value)]
 
 
-def test_drift_is_found_on_every_rank() -> None:
+def test_drift_is_detected_on_every_rank() -> None:
     for said in on_ranks(2, drift):
         assert said[0].startswith(f"Step {2 * DRIFT_STEPS}: the ranks' colors are no longer the same.")
 
@@ -48,15 +48,13 @@ def speeds(collectives: Collectives, slower: float, rebalance: bool) -> list[tup
 @pytest.mark.parametrize(
     ("slower", "rebalance", "expected"), [(2.0, True, (500.0, 250.0)), (1.1, True, None), (2.0, False, None)]
 )
-def test_speeds_are_told_once_where_they_differ(
-    slower: float, rebalance: bool, expected: tuple[float, ...] | None
-) -> None:
-    for told in on_ranks(2, speeds, slower, rebalance):
-        assert told[BALANCE_STEPS - 1] == expected
-        assert all(value is None for step, value in enumerate(told) if step != BALANCE_STEPS - 1)
+def test_differing_speeds_are_reported_once(slower: float, rebalance: bool, expected: tuple[float, ...] | None) -> None:
+    for reported in on_ranks(2, speeds, slower, rebalance):
+        assert reported[BALANCE_STEPS - 1] == expected
+        assert all(value is None for step, value in enumerate(reported) if step != BALANCE_STEPS - 1)
 
 
-def place(collectives: Collectives, ranks: int, views_per_step: int) -> tuple[int, int, int] | None:
+def group_of_rank(collectives: Collectives, ranks: int, views_per_step: int) -> tuple[int, int, int] | None:
     try:
         team = Team(plan(ranks), make_settings(views_per_step=views_per_step), collectives)
     except RankLeftOut:
@@ -64,6 +62,6 @@ def place(collectives: Collectives, ranks: int, views_per_step: int) -> tuple[in
     return team.everybody.size, team.groups, team.own_group
 
 
-def test_ranks_form_groups_and_those_that_are_not_needed_leave() -> None:
-    assert on_ranks(4, place, 4, 2) == [(4, 2, 0), (4, 2, 0), (4, 2, 1), (4, 2, 1)]
-    assert on_ranks(4, place, 2, 1) == [(2, 1, 0), (2, 1, 0), None, None]
+def test_ranks_form_groups_and_unneeded_ranks_leave() -> None:
+    assert on_ranks(4, group_of_rank, 4, 2) == [(4, 2, 0), (4, 2, 0), (4, 2, 1), (4, 2, 1)]
+    assert on_ranks(4, group_of_rank, 2, 1) == [(2, 1, 0), (2, 1, 0), None, None]
