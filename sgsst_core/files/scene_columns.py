@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,14 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.ply import PROPERTIES, RGB
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS
+from sgsst_core.files.formats.render_tag import FILTER_3D, is_flat
+from sgsst_core.files.mip_filter import apply_filter
 from sgsst_core.scene.stored_harmonics import RowLayout
 
 #: Order of the properties in messages; f_rest_* follow.
 _ORDER = (*itertools.chain(*PROPERTIES.values()), "opacity")
+#: Log scale of the missing axis of flat Gaussians. In any scene, their thickness is far below rounding errors.
+FLAT = -40.0
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class SceneColumns:
         stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
         stored_coefficients: Number of SH coefficients per color channel in the rows; None for `coefficients`.
         sources: Properties in the rows by the name of the usual property that they replace; see `PlySceneHeader`.
+        names: Properties in the rows, which may lack scale_2 and have the 3D filter of Mip-Splatting.
 
     Attributes:
         arrays: float32 arrays by the names of the scene's tensors.
@@ -61,6 +67,7 @@ class SceneColumns:
         stored: RowLayout | None,
         stored_coefficients: int | None = None,
         sources: dict[str, str] | None = None,
+        names: Collection[str] = (),
     ) -> None:
         self._stored = stored
         self._sources = sources or {}
@@ -76,6 +83,9 @@ class SceneColumns:
         stride = coefficients if stored_coefficients is None else stored_coefficients
         for channel, i in itertools.product(range(3), range(coefficients)):
             self._targets[f"f_rest_{channel * stride + i}"] = self.arrays["sh_rest"][:, i, channel]
+        self._filtered = FILTER_3D in names
+        if is_flat(names) and "scale_2" not in self._sources:
+            self._targets.pop("scale_2")[:] = FLAT
         self.flaws: list[_Flaws] = []
         self.clamped: list[int] = []
 
@@ -86,6 +96,8 @@ class SceneColumns:
             for name, target in self._targets.items():
                 source = self._sources.get(name, name)
                 target[block] = (rows[source] / 255 - COLOR_OFFSET) / SH_C0 if source in RGB else rows[source]
+        if self._filtered:
+            apply_filter(self.arrays["scales"][block], self.arrays["opacities"][block], rows[FILTER_3D])
         self.check(start, len(rows), rows)
 
     def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:

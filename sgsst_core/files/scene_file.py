@@ -25,7 +25,7 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
-from sgsst_core.files.formats.render_tag import UNTAGGED, RenderTag
+from sgsst_core.files.formats.render_tag import FILTER_3D, UNTAGGED, RenderTag
 from sgsst_core.files.formats.scene_format import Arrays, SceneFormat, SceneHeader
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
@@ -55,7 +55,7 @@ _STANDARD = {
 }
 
 #: Properties that differ between the pieces of a split Gaussian.
-_SHAPE = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"])
+_SHAPE = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"], FILTER_3D)
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class SceneFile:
             raise SceneError(f"{self.path}: its Gaussians are split already. Save the result, and load it again.")
         if self.header is not None:
             kinds = {prop.name: prop.kind for prop in self.header.vertex.properties}
-            integers = [name for name in _SHAPE if kinds[name][0] != "f"]
+            integers = [name for name in _SHAPE if kinds.get(name, "f")[0] != "f"]
             if integers:
                 raise SceneError(
                     f"{self.path}: {', '.join(integers)} are stored as integers; smaller Gaussians need float or "
@@ -185,7 +185,8 @@ def _columns(header: SceneHeader, stored: RowLayout | None) -> SceneColumns:
     """Return the arrays to read a scene into."""
     coefficients = 0 if stored else header.coefficients
     if isinstance(header, PlySceneHeader):
-        return SceneColumns(header.count, coefficients, stored, header.stored_coefficients, header.sources)
+        names = [prop.name for prop in header.ply.vertex.properties]
+        return SceneColumns(header.count, coefficients, stored, header.stored_coefficients, header.sources, names)
     return SceneColumns(header.count, coefficients, stored)
 
 

@@ -23,7 +23,7 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats.ply import PROPERTIES, RGB
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
-from sgsst_core.files.formats.render_tag import retagged
+from sgsst_core.files.formats.render_tag import FILTER_3D, retagged
 from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, file_stamp, write_scene
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import changed
@@ -70,7 +70,7 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
         return
     check_sh_attenuation(source, sh_attenuation)
     attenuation = _ShAttenuation.of(source.header, sh_attenuation)
-    columns = _new_columns(source, sh_dc.detach().to("cpu", torch.float32))
+    columns = _new_columns(source, source.header, sh_dc.detach().to("cpu", torch.float32))
     with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
         output.write(_header_for(source, source.header))
         if source.header.text:
@@ -155,7 +155,7 @@ def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
 _NewColumns = dict[str, NDArray[np.float32]]
 
 
-def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
+def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> _NewColumns:
     """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes.
 
     Colors that the file also has with 8 bits are among them.
@@ -169,7 +169,9 @@ def _new_columns(source: SceneFile, colors: Tensor) -> _NewColumns:
         columns["opacity"] = source.scene.opacities.numpy()
         for names, values in ((PROPERTIES["means"], source.scene.means), (PROPERTIES["scales"], source.scene.scales)):
             columns |= dict(zip(names, values.numpy().T, strict=True))
-    return columns
+        columns[FILTER_3D] = np.zeros(len(source.scene), np.float32)  # the shapes are those after the filter
+    present = {prop.name for prop in header.vertex.properties}
+    return {name: values for name, values in columns.items() if name in present}
 
 
 def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:

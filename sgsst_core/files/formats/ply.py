@@ -18,7 +18,7 @@ import numpy as np
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.ply_header import PlyHeader, check_length, read_header
-from sgsst_core.files.formats.render_tag import comment_lines, ply_tag
+from sgsst_core.files.formats.render_tag import comment_lines, is_flat, ply_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, SceneFormat, SceneHeader
 from sgsst_core.scene.rendering import Rendering
 
@@ -94,7 +94,7 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
     vertex = header.vertex if "vertex" in header.names else None
     kinds = {prop.name: prop.kind for prop in vertex.properties if not prop.length_kind} if vertex else {}
     sources = _sources(kinds)
-    known = {*kinds, *sources}
+    known = {*kinds, *sources, *(["scale_2"] if is_flat(kinds) else [])}
     missing = [name for names in (*PROPERTIES.values(), ("opacity",)) for name in names if name not in known]
     if vertex is None or missing:
         raise SceneError(f"{path}: is not a 3DGS scene but {_likely_content(header)}; missing: {', '.join(missing)}.")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,13 +70,18 @@ def ply_tag(header: PlyHeader) -> RenderTag:
     if mode is None and FILTER_3D in names:
         mode = "antialiased"
         reasons.append(f"the property {FILTER_3D} of Mip-Splatting")
-    if "scale_0" in names and "scale_2" not in names:
+    if is_flat(names):
         mode = "2dgs"
         reasons.append("the missing property scale_2")
     usual = _MIP_EPS2D if FILTER_3D in names or "Exported from Brush" in header.comments else EPS2D
     if eps2d is None:
         eps2d = usual if mode == "antialiased" else EPS2D
     return stated(mode or "classic", ", ".join(reasons), eps2d, tuple(warnings))
+
+
+def is_flat(names: Collection[str]) -> bool:
+    """Return whether properties are those of 2D Gaussian Splatting, whose Gaussians have no third axis."""
+    return "scale_1" in names and "scale_2" not in names and "scale" not in names
 
 
 def stated(mode: str, reason: str, eps2d: float | None = None, warnings: tuple[tuple[str, str], ...] = ()) -> RenderTag:

@@ -424,8 +424,8 @@ GAUSSIAN = [f"property float {name}" for name in BASE]
         ),
         (header("element vertex 1", "property uint packed_position"), "not a readable compressed PLY"),
         (
-            header("element vertex 1", *(line for line in GAUSSIAN if "scale_2" not in line)),
-            "something else; missing: scale_2",
+            header("element vertex 1", *(line for line in GAUSSIAN if "rot_2" not in line)),
+            "something else; missing: rot_2",
         ),
     ],
 )
