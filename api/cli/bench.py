@@ -27,7 +27,7 @@ from sgsst_core.scene.camera import Camera
 from worker.inputs import read_scene_and_capture
 from worker.request import SceneRequest, check_choice, check_folder
 
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class _Inputs:
         ensure_writable_folder(request.out)
         return _Inputs(file, capture.cameras, style, weights, variants)
 
-    def run(self, measure: Callable[..., Found], request: VariantsRequest, progress: Any) -> Found:
+    def run(self, measure: Callable[..., Result], request: VariantsRequest, progress: Any) -> Result:
         """Call `measure` with the arguments of `error_time`, and return its result."""
         arguments = (self.file.scene, self.cameras, self.style, self.variants, request.seconds)
         return measure(*arguments, weights=self.weights, progress=progress, **request.settings)
@@ -157,7 +157,7 @@ def quality_table(quality: Quality) -> Table:
             f"{one.color_distance:.0f}",
             *(f"{value:.3f}" for value in (one.content, one.features, one.background_sensitivity)),
             f"{one.saturated:.1%}",
-            *(_number(found.rmse if found else None) for found in (outcome.short, outcome.long)),
+            *(_number(drift.rmse if drift else None) for drift in (outcome.short, outcome.long)),
             _number(outcome.loss),
             str(outcome.steps or "-"),
         )
@@ -210,21 +210,21 @@ def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> li
         if out.is_dir() or out.suffix.lower() != ".json":
             raise OutputError(f"{out}: not the name of a JSON file. Give one, such as stability.json.")
         check_folder(out.parent)
-    found = []
+    measurements = []
     for case in chosen:
         progress(case)
-        found.append((case, measure(case, full=not quick)))
+        measurements.append((case, measure(case, full=not quick)))
     if out is not None:
         values = {"version": 1, "full": not quick, "machine": machine(torch.device("cpu"))}
-        write_json(out, {**values, "cases": [_stability_row(*pair) for pair in found]})
-    return found
+        write_json(out, {**values, "cases": [_stability_row(*pair) for pair in measurements]})
+    return measurements
 
 
-def stability_table(found: Sequence[tuple[Case, Measurement]]) -> Table:
+def stability_table(measurements: Sequence[tuple[Case, Measurement]]) -> Table:
     """Return a table of the error of each case."""
     result = Table("case", "measure", "error", "bound", "", "note", title="Numerical stability")
     group = ""
-    for case, measured in found:
+    for case, measured in measurements:
         if case.group != group:
             group = case.group
             result.add_section()

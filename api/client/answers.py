@@ -14,7 +14,7 @@ from sgsst_core.errors import InvalidInputError, SgsstError
 
 _ENDED = ("succeeded", "failed", "canceled", "expired")
 #: Statuses of temporary failures: locked by another request, damaged in transit, overloaded, starting.
-_PASSING = (423, 460, 502, 503, 504)
+_TEMPORARY = (423, 460, 502, 503, 504)
 
 
 class ApiError(SgsstError):
@@ -69,9 +69,9 @@ class Event:
     data: Mapping[str, Any]
 
     @staticmethod
-    def of(sent: ServerSentEvent) -> Event:
+    def of(event: ServerSentEvent) -> Event:
         """Return the event from the service's stream."""
-        return Event(int(sent.id or 0), sent.event, json.loads(sent.data))
+        return Event(int(event.id or 0), event.event, json.loads(event.data))
 
 
 def checked(response: httpx.Response) -> httpx.Response:
@@ -96,9 +96,9 @@ def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
     return (RequestError if status < 500 else ApiError)(message, status, problem)
 
 
-def is_passing(error: Exception) -> bool:
+def is_temporary(error: Exception) -> bool:
     """Return whether the same request may succeed later: there was no response, or it reports a temporary failure."""
-    return isinstance(error, httpx.TransportError) or (isinstance(error, ApiError) and error.status in _PASSING)
+    return isinstance(error, httpx.TransportError) or (isinstance(error, ApiError) and error.status in _TEMPORARY)
 
 
 def unreachable(base: str, error: Exception) -> ApiError:

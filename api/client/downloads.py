@@ -80,7 +80,7 @@ class Download:
         self._stamp.unlink(missing_ok=True)
         if self._sha256() != expected.strip('"'):
             self._part.unlink()
-            raise ApiError(f"{self.path}: what arrived is not what was sent. Try again.", 460)
+            raise ApiError(f"{self.path}: the download was damaged in transit. Try again.", 460)
         self._part.replace(self._target)
 
     def _sha256(self) -> str:

@@ -27,14 +27,14 @@ def input_files(scene: Path, styles: Sequence[Path], cameras: Path | None, photo
     Raises:
         RequestError: If a file is missing.
     """
-    found = [("scene", scene, scene.name)]
-    found += [("style", path, name) for path, name in zip(styles, different_names(styles), strict=True)]
-    found += [("cameras", path, path.name) for path in (camera_files(cameras) if cameras else [])]
-    found += [("photos", path, name) for path, name in (photo_files(photos) if photos else [])]
-    for _, path, _ in found:
+    files = [("scene", scene, scene.name)]
+    files += [("style", path, name) for path, name in zip(styles, different_names(styles), strict=True)]
+    files += [("cameras", path, path.name) for path in (camera_files(cameras) if cameras else [])]
+    files += [("photos", path, name) for path, name in (photo_files(photos) if photos else [])]
+    for _, path, _ in files:
         if not path.is_file():
-            raise RequestError(f"{path}: is not a file. Check the path.")
-    return [InputFile(role, path, name, path.stat().st_size) for role, path, name in found]
+            raise RequestError(f"{path}: not a file. Check the path.")
+    return [InputFile(role, path, name, path.stat().st_size) for role, path, name in files]
 
 
 def different_names(paths: Sequence[Path]) -> list[str]:
@@ -66,7 +66,7 @@ def camera_files(path: Path) -> list[Path]:
     for name in ("transforms.json", "cameras.json"):
         if (folder / name).is_file() and path.is_dir():
             return camera_files(folder / name)
-    raise RequestError(f"{path}: holds no cameras. Give a cameras.json, a COLMAP model or a transforms.json.")
+    raise RequestError(f"{path}: contains no cameras. Give a cameras.json, a COLMAP model or a transforms.json.")
 
 
 def photo_files(folder: Path) -> list[tuple[Path, str]]:
@@ -75,7 +75,7 @@ def photo_files(folder: Path) -> list[tuple[Path, str]]:
     Raises:
         RequestError: If there are none.
     """
-    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
-    if not found:
-        raise RequestError(f"{folder}: holds no photos.")
-    return [(path, path.relative_to(folder).as_posix()) for path in found]
+    photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
+    if not photos:
+        raise RequestError(f"{folder}: contains no photos. Give a folder of image files.")
+    return [(path, path.relative_to(folder).as_posix()) for path in photos]

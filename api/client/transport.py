@@ -11,7 +11,7 @@ import httpx
 import stamina
 from httpx_sse import ServerSentEvent, aconnect_sse
 
-from api.client.answers import checked, is_passing, unreachable
+from api.client.answers import checked, is_temporary, unreachable
 from api.client.downloads import BLOCK, Download
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -49,7 +49,7 @@ class Transport:
             wait_max=2.0 ** (TRIES - 2),
             wait_jitter=0.0,
             wait_exp_base=2,
-        ).on(is_passing)
+        ).on(is_temporary)
 
     async def call(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send a request, and return its complete response.

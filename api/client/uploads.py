@@ -58,7 +58,7 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
         file.seek(offset)
         part = file.read(PART_BYTES)
     if not part:
-        raise RequestError(f"{path}: has become shorter while it was sent. Send it again.")
+        raise RequestError(f"{path}: was truncated during the upload. Send it again.")
     digest = base64.b64encode(hashlib.sha256(part).digest()).decode()
     return part, {
         **_TUS,
@@ -117,7 +117,7 @@ async def plan_job(
     if response is not None:
         plan = response.json()
     if not plan:  # the service was stopped, or a proxy cut the response off
-        raise ApiError("The connection ended before the plan had come. Try again.", 502)
+        raise ApiError("The connection ended before the plan arrived. Try again.", 502)
     return plan
 
 

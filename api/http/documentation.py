@@ -108,8 +108,8 @@ def problems(*errors: type[ServiceError] | ServiceError, key: bool = True) -> Re
         content = response["content"][MEDIA_TYPE]
         content["schema"]["allOf"][1]["properties"]["code"]["enum"].append(example.code)
         content["examples"][example.code] = {"value": body}
-        sent = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
-        response.setdefault("headers", {}).update(headers(*sent))
+        names = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
+        response.setdefault("headers", {}).update(headers(*names))
     return responses
 
 

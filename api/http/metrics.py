@@ -81,9 +81,9 @@ class _StoreCollector(Collector):
     def collect(self) -> Iterable[Metric]:
         operations = self._store.operations
         depth = GaugeMetricFamily("sgsst_jobs", "Jobs by status.", labels=["status"])
-        found = operations.job_counts()
+        counts = operations.job_counts()
         for status in JobStatus:
-            depth.add_metric([status], found.get(status, 0))
+            depth.add_metric([status], counts.get(status, 0))
         yield depth
         yield GaugeMetricFamily(
             "sgsst_queue_oldest_seconds", "Seconds that the oldest queued job has waited.", operations.oldest_queued()

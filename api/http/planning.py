@@ -59,12 +59,12 @@ async def answer_plan(request: Request, plan: Planning, workers: int | None) -> 
     planning stops.
     """
     if _EVENTS in request.headers.get("accept", ""):
-        sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         reports: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
         # Started here rather than in `_events`, so that the plan releases its resources even if no event is read.
         task = asyncio.create_task(plan(reports.put_nowait))
         task.add_done_callback(lambda _: reports.put_nowait(None))
-        return StreamingResponse(_events(task, reports, workers), 200, sent, _EVENTS)
+        return StreamingResponse(_events(task, reports, workers), 200, response_headers, _EVENTS)
     planning, leaving = asyncio.create_task(plan(lambda now: None)), asyncio.create_task(_wait_for_disconnect(request))
     try:
         await asyncio.wait((planning, leaving), return_when=asyncio.FIRST_COMPLETED)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from service.examples import JOB_ID, SHA256, UPLOAD_ID
 from service.files.artifacts import media_type
@@ -27,6 +26,15 @@ else:  # inlined in the OpenAPI document; enumerations would get schemas of thei
 MOST_POINTS = 512
 #: Times in the examples.
 _CREATED, _STARTED, _NOW = "2026-11-21T14:06:02.057842Z", "2026-11-21T14:06:05.536727Z", "2026-11-21T14:09:30.532514Z"
+
+
+def utc(seconds: object) -> object:
+    """Return a time in seconds since the epoch as a UTC datetime; return anything else unchanged."""
+    return datetime.fromtimestamp(seconds, UTC) if isinstance(seconds, int | float) else seconds
+
+
+#: Time in responses; rows of the database store seconds since the epoch.
+Time = Annotated[datetime, BeforeValidator(utc)]
 
 
 def _with_example(**example: Any) -> ConfigDict:
@@ -87,7 +95,7 @@ class ProgressView(BaseModel):
     )
     seconds: float | None = Field(description="Seconds of all steps so far.")
     attempt: int
-    updated_at: datetime
+    updated_at: Time
 
 
 class ProgressPoint(BaseModel):
@@ -111,7 +119,7 @@ class ProgressPoint(BaseModel):
     seconds: float = Field(description="Seconds of all steps so far.")
     loss: float
     scales: list[float | None] | None = Field(description="Same as in a job's progress.")
-    updated_at: datetime
+    updated_at: Time
 
 
 class ProgressHistory(BaseModel):
@@ -142,8 +150,8 @@ class AttemptView(BaseModel):
     model_config = _with_example(number=1, started_at=_STARTED, finished_at=None, outcome=None, error=None)
 
     number: int
-    started_at: datetime
-    finished_at: datetime | None
+    started_at: Time
+    finished_at: Time | None
     outcome: OutcomeName | None = Field(
         description="`lost`: its dispatcher stopped responding; `released`: it shut down and returned the job."
     )
@@ -194,10 +202,10 @@ class JobView(BaseModel):
     id: str
     name: str
     status: StatusName
-    created_at: datetime
-    started_at: datetime | None
-    finished_at: datetime | None
-    expires_at: datetime | None = Field(
+    created_at: Time
+    started_at: Time | None
+    finished_at: Time | None
+    expires_at: Time | None = Field(
         description="Time at which the results are deleted, or the record of an expired job."
     )
     attempt: int = Field(description="Number of the latest attempt; 0 before the first.")
@@ -247,7 +255,7 @@ class ArtifactView(BaseModel):
     size: int
     sha256: str
     media_type: str
-    created_at: datetime
+    created_at: Time
     url: str
 
 
@@ -294,7 +302,7 @@ class UploadView(BaseModel):
     offset: int
     complete: bool
     sha256: str | None
-    expires_at: datetime
+    expires_at: Time
 
 
 class PlanView(BaseModel):
@@ -399,15 +407,6 @@ ANSWERS: tuple[type[BaseModel], ...] = (
 )
 
 
-def utc(seconds: float) -> datetime:
-    """Return a time in seconds since the epoch as a UTC datetime."""
-    return datetime.fromtimestamp(seconds, UTC)
-
-
-def _utc_or_none(seconds: float | None) -> datetime | None:
-    return None if seconds is None else utc(seconds)
-
-
 def job_view(job: JobRow, queue_position: int | None, preview: str | None) -> JobView:
     """Return a job as the API shows it; `preview` is the file name of its newest preview image."""
     return JobView(**_job_fields(job, queue_position, preview))
@@ -415,43 +414,33 @@ def job_view(job: JobRow, queue_position: int | None, preview: str | None) -> Jo
 
 def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRow], preview: str | None) -> JobDetail:
     """Return a job with its attempts."""
-    shown = [
-        AttemptView(
-            number=row.number,
-            started_at=utc(row.started_at),
-            finished_at=_utc_or_none(row.finished_at),
-            outcome=row.outcome,
-            error=ErrorView(**row.error) if row.error else None,
-        )
-        for row in attempts
-    ]
+    shown = [AttemptView.model_validate(row, from_attributes=True) for row in attempts]
     return JobDetail(**_job_fields(job, queue_position, preview), attempts=shown)
 
 
 def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) -> dict[str, Any]:
-    here = f"/v1/jobs/{job.id}"
-    progress = job.progress
+    address = f"/v1/jobs/{job.id}"
     return {
         "id": job.id,
         "name": job.name,
         "status": job.status,
-        "created_at": utc(job.created_at),
-        "started_at": _utc_or_none(job.started_at),
-        "finished_at": _utc_or_none(job.finished_at),
-        "expires_at": _utc_or_none(job.expires_at),
+        "created_at": job.created_at,
+        "started_at": job.started_at,
+        "finished_at": job.finished_at,
+        "expires_at": job.expires_at,
         "attempt": job.attempt,
         "queue_position": queue_position,
         "preview": preview,
-        "progress": ProgressView(**{**progress, "updated_at": utc(progress["updated_at"])}) if progress else None,
+        "progress": job.progress or None,
         "result": job.result,
-        "error": ErrorView(**job.error) if job.error else None,
+        "error": job.error or None,
         "parameters": JobParameters().model_dump(mode="json") | job.parameters,
-        "inputs": [InputView(**entry) for entry in job.inputs],
+        "inputs": job.inputs,
         "links": Links(
-            self=here,
-            events=f"{here}/events",
-            artifacts=f"{here}/artifacts",
-            result=f"{here}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None,
+            self=address,
+            events=f"{address}/events",
+            artifacts=f"{address}/artifacts",
+            result=f"{address}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None,
         ),
     }
 
@@ -469,9 +458,7 @@ def input_views(job: JobRow) -> list[InputFileView]:
 
 def progress_history(points: list[Point]) -> ProgressHistory:
     """Return the loss history of a job as the API shows it."""
-    return ProgressHistory(
-        points=[ProgressPoint(**{**asdict(point), "updated_at": utc(point.updated_at)}) for point in points]
-    )
+    return ProgressHistory(points=[ProgressPoint.model_validate(point, from_attributes=True) for point in points])
 
 
 def poll_seconds(job: JobRow) -> int | None:
@@ -489,7 +476,7 @@ def artifact_view(row: ArtifactRow) -> ArtifactView:
         size=row.size,
         sha256=row.sha256,
         media_type=media_type(row.name),
-        created_at=utc(row.created_at),
+        created_at=row.created_at,
         url=f"/v1/jobs/{row.job_id}/artifacts/{row.name}",
     )
 
@@ -503,5 +490,5 @@ def upload_view(row: UploadRow) -> UploadView:
         offset=row.offset,
         complete=row.sha256 is not None,
         sha256=row.sha256,
-        expires_at=utc(row.expires_at),
+        expires_at=row.expires_at,
     )

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import anyio
 import anyio.to_thread
-from fastapi import Header, Request, Response
+from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.documentation import Responses, headers
@@ -44,6 +44,18 @@ IfRange = Annotated[
         examples=[f'"{SHA256}"'],
     ),
 ]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Headers of a request that ask for a range of a file, or for the file only if it has changed."""
+
+    range_: RangeHeader = None
+    if_range: IfRange = None
+    if_none_match: IfNoneMatch = None
+
+
+ConditionsDep = Annotated[Conditions, Depends()]
 
 
 class RangeError(ServiceError):
@@ -128,9 +140,7 @@ def names_etag(if_none_match: str | None, tag: str) -> bool:
     return header == "*" or tag in _ETAG.findall(header)
 
 
-async def send_file(
-    request: Request, file: SentFile, range_: str | None, if_range: str | None, if_none_match: str | None
-) -> Response:
+async def send_file(request: Request, file: SentFile, conditions: Conditions) -> Response:
     """Return the response with a file or a range of it.
 
     Raises:
@@ -139,21 +149,22 @@ async def send_file(
         LostFileError, DamagedFileError: If the stored file does not match its database row. No byte of it is sent.
     """
     tag = f'"{file.sha256}"'
-    sent = _headers(file, tag)
-    if names_etag(if_none_match, tag):
-        return Response(status_code=304, headers=sent)
-    span = _parse_range(range_, file.size) if range_ and if_range in (None, tag) else None
+    response_headers = _headers(file, tag)
+    if names_etag(conditions.if_none_match, tag):
+        return Response(status_code=304, headers=response_headers)
+    unchanged = conditions.if_range in (None, tag)
+    span = _parse_range(conditions.range_, file.size) if conditions.range_ and unchanged else None
     start, stop = span or (0, file.size)
-    sent["Content-Length"] = str(stop - start)
+    response_headers["Content-Length"] = str(stop - start)
     if span:
-        sent["Content-Range"] = f"bytes {start}-{stop - 1}/{file.size}"
+        response_headers["Content-Range"] = f"bytes {start}-{stop - 1}/{file.size}"
     status = 206 if span else 200
     if request.method == "HEAD":
-        return Response(status_code=status, headers=sent, media_type=file.kind)
+        return Response(status_code=status, headers=response_headers, media_type=file.kind)
     await anyio.to_thread.run_sync(file.check, limiter=_LARGE_CHECKS if file.size > _LARGE_BYTES else None)
     body = file.read(start, stop)
     first = await asyncio.to_thread(_first, body)  # an error at this point can still be sent as a response
-    return StreamingResponse(chain(first, body), status, sent, file.kind)
+    return StreamingResponse(chain(first, body), status, response_headers, file.kind)
 
 
 def _first(body: Iterator[bytes]) -> list[bytes]:
@@ -165,7 +176,7 @@ def _first(body: Iterator[bytes]) -> list[bytes]:
 
 
 def _headers(file: SentFile, tag: str) -> dict[str, str]:
-    sent = {
+    response_headers = {
         "ETag": tag,
         "Accept-Ranges": "bytes",
         "Cache-Control": "private, no-cache",
@@ -173,8 +184,8 @@ def _headers(file: SentFile, tag: str) -> dict[str, str]:
         "Content-Disposition": disposition(file.name, inline=file.inline),
     }
     if file.policy is not None:
-        sent["Content-Security-Policy"] = file.policy
-    return sent
+        response_headers["Content-Security-Policy"] = file.policy
+    return response_headers
 
 
 def disposition(name: str, *, inline: bool) -> str:

@@ -142,7 +142,7 @@ def add_static(app: FastAPI) -> None:
 def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Response:
     compressed = file.compressed if _accepts_gzip(request.headers.get("accept-encoding", "")) else None
     tag = f'"{file.digest}-gzip"' if compressed is not None else f'"{file.digest}"'
-    sent = {
+    response_headers = {
         "ETag": tag,
         "Cache-Control": caching,
         "Vary": "Accept-Encoding",
@@ -151,10 +151,10 @@ def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Re
         "Referrer-Policy": "no-referrer",
     }
     if names_etag(request.headers.get("if-none-match"), tag):
-        return Response(status_code=304, headers=sent)
+        return Response(status_code=304, headers=response_headers)
     if compressed is not None:
-        sent["Content-Encoding"] = "gzip"
-    return Response(file.body if compressed is None else compressed, headers=sent, media_type=file.kind)
+        response_headers["Content-Encoding"] = "gzip"
+    return Response(file.body if compressed is None else compressed, headers=response_headers, media_type=file.kind)
 
 
 def _accepts_gzip(accepted: str) -> bool:

@@ -16,11 +16,9 @@ from api.http.documentation import Responses, invalid, links, problems
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import ArtifactList, artifact_view
 from api.http.sending import (
-    IfNoneMatch,
-    IfRange,
+    ConditionsDep,
     JustRemovedError,
     RangeError,
-    RangeHeader,
     SentFile,
     file_answers,
     send_file,
@@ -116,9 +114,7 @@ async def get_artifact(
     name: Annotated[str, Path(description="Name in the list of artifacts.", examples=["stylized.ply"])],
     context: ContextDep,
     caller: CallerDep,
-    range_: RangeHeader = None,
-    if_range: IfRange = None,
-    if_none_match: IfNoneMatch = None,
+    conditions: ConditionsDep,
     format_: Annotated[
         ResultName | None,
         Query(
@@ -145,7 +141,7 @@ async def get_artifact(
         check=partial(_check, context, row),
         read=partial(context.artifacts.read, row.location),
     )
-    return await send_file(request, file, range_, if_range, if_none_match)
+    return await send_file(request, file, conditions)
 
 
 async def _find_artifact(context: Context, job: JobRow, name: str, format_: ResultName | None) -> ArtifactRow:

@@ -88,5 +88,5 @@ async def watch_job(
     await asyncio.to_thread(find, context, caller, job_id)
     if last_event_id and await context.hub.ended(job_id, last_event_id):
         return Response(status_code=204)
-    sent = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(context.hub.watch(job_id, last_event_id or 0), 200, sent, "text/event-stream")
+    response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(context.hub.watch(job_id, last_event_id or 0), 200, response_headers, "text/event-stream")

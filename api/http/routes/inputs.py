@@ -16,11 +16,9 @@ from api.http.documentation import Responses, links, problems
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import InputList, input_views
 from api.http.sending import (
-    IfNoneMatch,
-    IfRange,
+    ConditionsDep,
     JustRemovedError,
     RangeError,
-    RangeHeader,
     SentFile,
     file_answers,
     send_file,
@@ -106,9 +104,7 @@ async def get_input(
     ],
     context: ContextDep,
     caller: CallerDep,
-    range_: RangeHeader = None,
-    if_range: IfRange = None,
-    if_none_match: IfNoneMatch = None,
+    conditions: ConditionsDep,
 ) -> Response:
     """Download a file that a job was created from, whole or in ranges, until the job expires."""
     entry, row = await asyncio.to_thread(_find_input, context, caller, job_id, role)
@@ -122,7 +118,7 @@ async def get_input(
         check=partial(_check, context, row),
         read=partial(context.blobs.read, row),
     )
-    return await send_file(request, file, range_, if_range, if_none_match)
+    return await send_file(request, file, conditions)
 
 
 def _check(context: Context, row: BlobRow) -> None:

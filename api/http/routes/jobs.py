@@ -206,12 +206,12 @@ def _queue_job(
     )
     if created:
         receipt.hand_over()
-    sent = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
+    response_headers = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
     if not created:
-        sent["Idempotency-Replayed"] = "true"
+        response_headers["Idempotency-Replayed"] = "true"
     preview = None if created else jobs.previews([job.id]).get(job.id)
     body = job_view(job, jobs.queue_position(job), preview).model_dump_json()
-    return Response(body, 202, sent, media_type="application/json")
+    return Response(body, 202, response_headers, media_type="application/json")
 
 
 async def _from_form(request: Request, context: Context, receipt: Receipt) -> Parts:
@@ -303,11 +303,11 @@ def list_jobs(
 ) -> JobPage:
     """List the jobs of this key, newest first."""
     jobs = context.store.jobs
-    found = jobs.page(caller.owner, status=status or (), before=cursor, limit=limit + 1)
-    shown = found[:limit]
-    previews = jobs.previews([job.id for job in shown])
-    views = [job_view(job, jobs.queue_position(job), previews.get(job.id)) for job in shown]
-    return JobPage(jobs=views, next_cursor=shown[-1].id if len(found) > limit else None)
+    rows = jobs.page(caller.owner, status=status or (), before=cursor, limit=limit + 1)  # one more shows if more follow
+    page = rows[:limit]
+    previews = jobs.previews([job.id for job in page])
+    views = [job_view(job, jobs.queue_position(job), previews.get(job.id)) for job in page]
+    return JobPage(jobs=views, next_cursor=page[-1].id if len(rows) > limit else None)
 
 
 @router.get(
@@ -433,7 +433,7 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
     "/{job_id}",
     status_code=204,
     responses={
-        204: {"description": "It is gone, with its results."},
+        204: {"description": "The job and its results are deleted."},
         **problems(NoJobError, DeleteError),
     },
     operation_id="delete_job",
@@ -469,10 +469,10 @@ def _job_response(
     view = job_detail(job, position, attempts, preview)
     body = view.model_dump_json().encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    sent = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    response_headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     wait = poll_seconds(job)
     if wait is not None:
-        sent["Retry-After"] = str(wait)
+        response_headers["Retry-After"] = str(wait)
     if names_etag(if_none_match, tag):
-        return Response(status_code=304, headers=sent)
-    return Response(body, status, sent, media_type="application/json")
+        return Response(status_code=304, headers=response_headers)
+    return Response(body, status, response_headers, media_type="application/json")

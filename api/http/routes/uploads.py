@@ -97,8 +97,8 @@ _REQUIRES_TUS = [Depends(check_version)]
 
 def _following_operations(**parameters: str) -> dict[str, Any]:
     """Return OpenAPI links to the operations that a client may call next on an upload."""
-    found = links("get_upload", "head_upload", "delete_upload", **parameters)
-    return found | links("append_upload", **parameters, **{"Upload-Offset": "0"})
+    without_offset = links("get_upload", "head_upload", "delete_upload", **parameters)
+    return without_offset | links("append_upload", **parameters, **{"Upload-Offset": "0"})
 
 
 @router.options(
@@ -117,14 +117,14 @@ def _following_operations(**parameters: str) -> dict[str, Any]:
 )
 def describe_uploads(context: ContextDep) -> Response:
     """Describe the supported protocol version and extensions."""
-    sent = {
+    response_headers = {
         "Tus-Resumable": VERSION,
         "Tus-Version": VERSION,
         "Tus-Extension": "creation,expiration,checksum,termination",
         "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
         "Tus-Max-Size": str(context.settings.max_upload_bytes),
     }
-    return Response(status_code=204, headers=sent)
+    return Response(status_code=204, headers=response_headers)
 
 
 @router.post(
@@ -180,8 +180,8 @@ def create_upload(
     )
     if row.sha256 is None:  # a repeated request may refer to an upload that is already complete
         context.blobs.start_upload(row.id)
-    sent = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
-    return Response(upload_view(row).model_dump_json(), 201, sent, "application/json")
+    response_headers = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
+    return Response(upload_view(row).model_dump_json(), 201, response_headers, "application/json")
 
 
 @router.get("/{upload_id}", response_model=UploadView, responses=problems(NoUploadError), operation_id="get_upload")
@@ -213,15 +213,15 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
 def head_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """Get the state of an upload as headers. `Upload-Offset` is where to resume."""
     row = _find_upload(context, caller.owner, upload_id)
-    sent = {
+    response_headers = {
         **_HEADERS,
         "Upload-Offset": str(row.offset),
         "Upload-Length": str(row.length),
         "Upload-Expires": _http_date(row.expires_at),
     }
     if row.metadata_header:
-        sent["Upload-Metadata"] = row.metadata_header
-    return Response(headers=sent)
+        response_headers["Upload-Metadata"] = row.metadata_header
+    return Response(headers=response_headers)
 
 
 _PATCH_BODY = {

@@ -224,9 +224,9 @@ def test_plan_queues_nothing_and_rejects_bad_files(
         with pytest.raises(RequestError, match="is not a scene file") as caught:
             client.plan(files["style"], files["style"], orbit=2)
         assert (caught.value.status, caught.value.problem["input"]) == (422, "scene")
-        with pytest.raises(RequestError, match="is not a file"):
+        with pytest.raises(RequestError, match="not a file"):
             client.submit(tmp_path / "none.ply", files["style"], orbit=2)
-        with pytest.raises(RequestError, match="holds no photos"):
+        with pytest.raises(RequestError, match="contains no photos"):
             client.submit(files["scene"], files["style"], cameras=files["cameras"], photos=tmp_path)
         assert [job.id for job in client.jobs()] == before
 
