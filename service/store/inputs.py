@@ -325,11 +325,6 @@ class Inputs:
                 session.delete(row)
             return [row.id for row in rows]
 
-    def open_uploads(self, owner: str) -> int:
-        """Return the number of unfinished uploads of this owner."""
-        with self._database.reading() as session:
-            return _count_open_uploads(session, owner)
-
     def inspection(self, key: str) -> dict[str, Any] | None:
         """Return the result of an earlier inspection of the same content; None if there is none."""
         with self._database.reading_rows() as connection:

@@ -86,11 +86,11 @@ def test_attempt_reports_its_expected_end(settings: ServiceSettings, store: Stor
         attempt._handle({"kind": "stage", "stage": stage, "seconds_left": 3.0})
     assert attempt.holding == Holding(attempt.grant)
     attempt._handle({"kind": "progress", "step": 1, "total": 2, "seconds_left": 1000.0})
-    told = attempt.holding
-    assert told.until is not None
-    assert told.until - store.database.clock() == pytest.approx(1000.0, abs=60.0)
+    holding = attempt.holding
+    assert holding.until is not None
+    assert holding.until - store.database.clock() == pytest.approx(1000.0, abs=60.0)
     estimated = estimated_seconds(held.job.parameters, held.job.inputs)
-    assert told.pace == pytest.approx(1000.0 / estimated, rel=0.06)
+    assert holding.pace == pytest.approx(1000.0 / estimated, rel=0.06)
     held.job.attempt = 2  # the seconds may be those left after a checkpoint
     assert attempt.holding.pace is None
 
@@ -112,8 +112,8 @@ def test_released_gpus_are_free_for_other_jobs(settings: ServiceSettings, store:
 
 def test_job_with_unsupported_stored_parameters_fails_with_a_message(settings: ServiceSettings, store: Store) -> None:
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
-    told = {"sharpness": 3, "workers": "many", "memory_limit": "all"}
-    job, _ = store.jobs.create(NewJob("local", "", 0, told, [scene]), limit=10)
+    parameters = {"sharpness": 3, "workers": "many", "memory_limit": "all"}
+    job, _ = store.jobs.create(NewJob("local", "", 0, parameters, [scene]), limit=10)
     with at_work(settings, store):
         wait_for(lambda: store.jobs.get(job.id, None).status == "failed", "the job to fail")
     ended = store.jobs.get(job.id, None)

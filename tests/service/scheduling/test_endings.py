@@ -74,7 +74,7 @@ def test_reported_failure_is_recorded_unchanged(permanent: bool) -> None:
 
 @pytest.mark.parametrize("last", [INTERRUPTED, None])
 @pytest.mark.parametrize(
-    ("code", "told"),
+    ("code", "text"),
     [
         (-signal.SIGKILL, "was killed; perhaps the machine had run out of memory"),
         (-signal.SIGSEGV, "was ended by SIGSEGV"),
@@ -82,12 +82,12 @@ def test_reported_failure_is_recorded_unchanged(permanent: bool) -> None:
         (0, "ended with code 0"),
     ],
 )
-def test_process_without_a_final_message_has_crashed(last: Message | None, code: int, told: str) -> None:
+def test_process_without_a_final_message_has_crashed(last: Message | None, code: int, text: str) -> None:
     found = ending(None, last, code)
     assert (found.outcome, found.permanent) == (AttemptOutcome.FAILED, False)
     error: dict[str, Any] = found.error or {}
     assert (error["code"], error["log"]) == ("crashed", "the log")
-    assert told in error["message"]
+    assert text in error["message"]
     assert "log" not in (ending(None, last, code, None).error or {})
 
 
@@ -108,9 +108,9 @@ def test_process_without_a_final_message_has_crashed(last: Message | None, code:
 )
 def test_machine_failures_are_reported_as_outages(error: Exception, outage: bool) -> None:
     assert is_outage(error) == outage
-    told = failure(error)
-    assert (told["error"] == OUTAGE) == outage
-    assert (str(error) in told.get("detail", "")) == outage, "for the operator"
-    found = ending(None, told)
-    assert (found.outcome, found.detail) == (AttemptOutcome.FAILED, told.get("detail"))
+    message = failure(error)
+    assert (message["error"] == OUTAGE) == outage
+    assert (str(error) in message.get("detail", "")) == outage, "for the operator"
+    found = ending(None, message)
+    assert (found.outcome, found.detail) == (AttemptOutcome.FAILED, message.get("detail"))
     assert not (outage and found.permanent)

@@ -95,9 +95,9 @@ def check_published_once(service: Service, job_id: str) -> bytes:
     """Return the job's result; fail unless it was announced, ended the job and was stored exactly once."""
     stream = httpx.get(f"{service.url}/v1/jobs/{job_id}/events", timeout=60).text
     blocks = [dict(line.split(": ", 1) for line in block.splitlines()) for block in stream.split("\n\n") if block]
-    told = [(block["event"], json.loads(block["data"])) for block in blocks if "data" in block]
-    assert [data["name"] for kind, data in told if kind == "artifact"].count("stylized.ply") == 1
-    assert [data["status"] for kind, data in told if kind == "status"].count("succeeded") == 1
+    events = [(block["event"], json.loads(block["data"])) for block in blocks if "data" in block]
+    assert [data["name"] for kind, data in events if kind == "artifact"].count("stylized.ply") == 1
+    assert [data["status"] for kind, data in events if kind == "status"].count("succeeded") == 1
     assert len(list((service.data / "artifacts" / job_id).rglob("stylized.ply"))) == 1
     answer = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply", timeout=60)
     assert f'"{hashlib.sha256(answer.content).hexdigest()}"' == answer.headers["etag"]

@@ -76,7 +76,7 @@ class Queue:
         return [grant.ranks for grant in self.held.values()]
 
 
-def kept_for(queue: Queue) -> list[str]:
+def reserved_jobs(queue: Queue) -> list[str]:
     """Return the jobs that GPUs are reserved for."""
     with queue.store.database.reading() as session:
         return list(session.scalars(select(ReservationRow.job_id)))
@@ -175,7 +175,7 @@ def test_short_jobs_backfill_gpus_reserved_for_a_large_job(eight: Queue) -> None
         del eight.held[job_id]
     eight.ends = dict.fromkeys(long, eight.now + 600)
     assert eight.start() == short[:2]  # as many as there are free GPUs, in order
-    assert kept_for(eight) == [big]
+    assert reserved_jobs(eight) == [big]
     for job_id in short[:2]:
         del eight.held[job_id]
     eight.now += 575  # the third job would end too late now
@@ -195,7 +195,7 @@ def test_backfilling_requires_a_known_pace_and_a_short_job(eight: Queue) -> None
     assert eight.start() == []
     eight.pace = 1.0
     assert eight.start() == [short]
-    assert kept_for(eight) == [big]
+    assert reserved_jobs(eight) == [big]
 
 
 def test_reserved_job_waits_no_longer_than_its_first_forecast(eight: Queue) -> None:
@@ -229,16 +229,16 @@ def test_machine_with_the_earliest_capacity_reserves_it(tmp_path: Path) -> None:
         late.store.jobs.cancel(job_id, None)
     big = late.add("b", workers=8)
     assert late.start() == []
-    assert kept_for(late) == []
+    assert reserved_jobs(late) == []
     soon.now = late.now
     assert soon.start() == []
-    assert kept_for(soon) == []
+    assert reserved_jobs(soon) == []
     soon.now = late.now = late.now + 60
     for queue in (late, soon):
         queue.store.operations.record_heartbeat(queue.selector.dispatcher, 8, 0)
     assert late.start() == []
     assert soon.start() == []
-    assert kept_for(soon) == [big]
+    assert reserved_jobs(soon) == [big]
     with soon.store.database.reading() as session:
         assert session.scalars(select(ReservationRow.dispatcher)).all() == ["soon"]
     for queue in (late, soon):
@@ -340,7 +340,7 @@ def test_slots_are_fractions_of_cores_and_memory() -> None:
     assert large is not None
     assert (large.slots, large.threads) == (2, 8)
     assert capacity.free([small, large]) == 1
-    assert capacity.grant(job(8 * GB), [small, large], 9) is None, "two places, and one is free"
+    assert capacity.grant(job(8 * GB), [small, large], 9) is None, "two slots are needed, and one is free"
     asked = capacity.grant(job(GB, memory_limit=3 * GB), [small, large], 9)
     assert asked is not None
     assert (asked.slots, asked.memory) == (1, 3 * GB)
@@ -351,9 +351,9 @@ def test_slots_are_fractions_of_cores_and_memory() -> None:
     st.integers(1, 9),
     st.lists(st.tuples(st.integers(1, 60 * GB), st.none() | st.integers(1, 200 * GB)), max_size=12),
 )
-def test_concurrent_cpu_jobs_never_exceed_host_memory(places: int, jobs: list[tuple[int, int | None]]) -> None:
+def test_concurrent_cpu_jobs_never_exceed_host_memory(slots: int, jobs: list[tuple[int, int | None]]) -> None:
     held: list[Any] = []
-    capacity, planned = Capacity(machine(0), places), []
+    capacity, planned = Capacity(machine(0), slots), []
     for scene, limit in jobs:
         grant = capacity.grant(job(scene, memory_limit=limit), held, len(jobs))
         if grant is not None:

@@ -53,7 +53,7 @@ def publisher(lease: Lease, folder: Path, store: Store, settings: ServiceSetting
     return Publisher(lease, folder, store, Artifacts(settings.artifacts_url), log_seconds=1e6)
 
 
-def told(store: Store, lease: Lease) -> list[str]:
+def announced(store: Store, lease: Lease) -> list[str]:
     """Return the names of the files that were announced to watchers, in order."""
     return [event.data["name"] for event in store.jobs.events(lease.job_id, 0) if event.kind == "artifact"]
 
@@ -64,7 +64,7 @@ def content(store: Store, settings: ServiceSettings, lease: Lease, name: str) ->
     return b"".join(Artifacts(settings.artifacts_url).read(row.location, 0, row.size))
 
 
-def places(settings: ServiceSettings) -> list[str]:
+def stored_names(settings: ServiceSettings) -> list[str]:
     return sorted(path.name for path in (settings.folder / "artifacts").rglob("*") if path.is_file())
 
 
@@ -72,18 +72,18 @@ def test_new_and_changed_files_are_published(
     publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
 ) -> None:
     publisher.publish_unfinished(whole_log=True)
-    assert told(store, lease) == ["log.txt"]
+    assert announced(store, lease) == ["log.txt"]
     (folder / "out" / "stylized.plan.json").write_text("{}")
     (folder / "out" / "previews" / "step_000010.jpg").write_bytes(b"jpg")
     (folder / "out" / "previews" / "half").write_bytes(b"no preview")
     publisher.publish_unfinished()
     publisher.publish_unfinished()
-    assert sorted(told(store, lease)) == ["log.txt", "plan.json", "previews/step_000010.jpg"]
+    assert sorted(announced(store, lease)) == ["log.txt", "plan.json", "previews/step_000010.jpg"]
     (folder / "out" / "stylized.plan.json").write_text('{"decisions": []}')
     publisher.publish_unfinished()
-    assert told(store, lease)[-1] == "plan.json"
+    assert announced(store, lease)[-1] == "plan.json"
     assert content(store, settings, lease, "plan.json") == b'{"decisions": []}'
-    assert places(settings) == ["log.txt", "plan.json", "step_000010.jpg"], "the older plan is still there"
+    assert stored_names(settings) == ["log.txt", "plan.json", "step_000010.jpg"], "the older plan is still there"
 
 
 def test_log_is_copied_periodically_and_completely_at_the_end(
@@ -109,7 +109,7 @@ def test_published_checkpoint_records_its_step(publisher: Publisher, folder: Pat
             save_file({"x": np.zeros(step)}, checkpoint, metadata={"step": str(step)})
         publisher.publish_unfinished()
         assert store.jobs.get(lease.job_id, None).saved_step == saved
-    assert told(store, lease) == ["log.txt"], "nobody is told of checkpoints"
+    assert announced(store, lease) == ["log.txt"], "checkpoints are not announced"
 
 
 def test_success_publishes_results_and_sweeps_leftovers(
@@ -128,5 +128,5 @@ def test_success_publishes_results_and_sweeps_leftovers(
     assert (job.status, job.result) == ("succeeded", {"steps": 1})
     names = ["log.txt", "loss.png", "report.json", "stylized.ply"]
     assert [row.name for row in store.jobs.artifacts(lease.job_id)] == names
-    assert places(settings) == names
+    assert stored_names(settings) == names
     assert store.retention.unswept(10) == []

@@ -80,21 +80,21 @@ def test_harmless_jobs_run_before_the_reserved_job(store: Store, clock: Clock) -
     for owner in "bcbd":
         clock.now += 1
         others.append(queue(store, owner))
-    told: list[str] = []
+    reserved: list[str] = []
 
     def full(job: JobRow) -> bool:
         return job.id != big
 
-    def before(kept: JobRow) -> Callable[[JobRow], bool]:
-        told.append(kept.id)
+    def before(job: JobRow) -> Callable[[JobRow], bool]:
+        reserved.append(job.id)
         return lambda job: job.id != others[1]
 
     taken = [held.job_id for _ in range(4) if (held := store.leases.take("one", full, backfills=before))]
     assert taken == [others[0], others[3], others[2]], "in turns, but for the one that is in the way"
-    assert told == [big] * 4
+    assert reserved == [big] * 4
     found = store.leases.take("two", full, backfills=before)
     assert found is not None
-    assert found.job_id == others[1], "which another dispatcher has room for: it is kept by the first alone"
+    assert found.job_id == others[1], "only the first dispatcher has a reservation"
     assert store.leases.take("two", full, backfills=before) is None
     assert lease(store, "one").job_id == big
 

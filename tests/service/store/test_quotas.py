@@ -245,7 +245,7 @@ def test_receipt_of_a_dead_process_expires(store: Store, clock: Clock) -> None:
     assert store.inputs.expire_uploads() == [lost]
     assert "bb/blob" in store.inputs.collect()
     assert store.usage.of("me").stored_bytes == 5
-    assert store.inputs.open_uploads("me") == 0, "a receipt is no upload of the user's"
+    store.inputs.create_upload("me", 1, "x", "", 1000, most=1)  # a receipt does not count as an unfinished upload
 
 
 def test_job_whose_input_was_deleted_meanwhile_is_refused(store: Store) -> None:
