@@ -30,7 +30,16 @@ from sgsst_core.quality.lpips import Lpips
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-COLUMNS = ("style", "color_distance", "sliced", "content", "features", "background_sensitivity", "saturated", "seconds")
+COLUMNS = (
+    "style",
+    "interior_style",
+    "sliced_features",
+    "color_distance",
+    "sliced",
+    "content",
+    "background_sensitivity",
+    "seconds",
+)
 #: Number of color directions of the sliced distance, and number of quantiles along each.
 DIRECTIONS, QUANTILES = 64, 1024
 
