@@ -19,7 +19,7 @@ import torch
 
 from benchmarks.machine import write_result
 from benchmarks.work import Counted, Work, meta
-from sgsst_core.budget import GPU_SHARE, memory_for
+from sgsst_core.budget import GPU_SHARE, measuring_memory, memory_for
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
@@ -344,7 +344,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
 
 def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     """Return the fractions of views whose content features, tile intersections and frozen colors fit the caches."""
-    views = memory_for("views", int(memory_limit()))
+    views = view_budget(job, loss)
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
     count = loss.tiling.scale_count(job.size)
     size = (job.size[0] >> count - 1, job.size[1] >> count - 1) if coarse else job.size
@@ -357,6 +357,18 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
         "colors": (views / 4, 12.0 * job.gaussians),
     }
     return {name: min(1.0, room // each / job.views) for name, (room, each) in of_a_view.items()}
+
+
+def view_budget(job: Job, loss: SosLoss) -> int:
+    """Return the memory in bytes for data of views, in a job with CUDA graphs that is measured (`cost.view_memory`)."""
+    memory, network = int(memory_limit()), loss.network
+    budget = memory_for("activations", memory)
+    each = network.held_bytes_per_pixel() + network.working_bytes_per_pixel()
+    once = min(int(job.size[0] * job.size[1] * each), budget)
+    reference = 1 if network.precision == "float32" else 2
+    needed = min(once * reference, budget) if network.precision == "bfloat16" else once
+    spare = max(budget - needed - once, 0)
+    return memory_for("views", memory) - reference * measuring_memory(memory) + spare
 
 
 def step_seconds(parts: Mapping[str, Part], shares: Shares, precision: str, launches: int) -> dict[str, float]:

@@ -23,9 +23,9 @@ from pathlib import Path
 import torch
 from scipy.spatial import cKDTree
 
-from benchmarks.gpu.inputs import surface_scene
 from benchmarks.machine import write_result
 from benchmarks.rasterizer import DATA, timed
+from sgsst_core.bench.synthetic import surface_scene
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene, write_scene

@@ -11,6 +11,7 @@ import typer
 from api.cli import client_commands, operator_commands
 from api.cli.bench_commands import bench_app
 from api.cli.console import BAD_INPUT, FAILURE, error_console, out_console
+from api.cli.doctor_command import doctor
 from api.cli.extras import missing_extra
 from api.cli.scene_commands import check, convert, plan, render
 from api.cli.study_commands import study_app
@@ -26,7 +27,17 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (stylize, plan, check, render, convert, demo, *client_commands.COMMANDS, *operator_commands.COMMANDS):
+for command in (
+    stylize,
+    plan,
+    check,
+    render,
+    convert,
+    demo,
+    doctor,
+    *client_commands.COMMANDS,
+    *operator_commands.COMMANDS,
+):
     app.command()(command)
 app.add_typer(weights_app, name="weights")
 app.add_typer(bench_app, name="bench")

@@ -32,8 +32,21 @@ import torch
 from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.machine import RESULTS, write_result
 
-#: Time limit of each part in seconds, 535 in total. The first part that uses the CPU rasterizer also compiles it.
-BUDGETS = {"parity": 60, "raster": 100, "network": 40, "step": 90, "curve": 120, "ranks": 45, "tests": 80}
+#: Time limit of each part in seconds, 535 in total, the most telling parts first. The first part that uses the CPU
+#: rasterizer also compiles it.
+BUDGETS = {
+    "identity": 15,
+    "poison": 35,
+    "parity": 45,
+    "kernels": 50,
+    "convolutions": 50,
+    "step": 95,
+    "network": 20,
+    "raster": 60,
+    "ranks": 40,
+    "curve": 70,
+    "tests": 55,
+}
 #: Factor on the time limits without a GPU, where the CPU may be busy and times mean nothing.
 _PATIENCE = 5
 #: Packages of this repository. A missing one is an error, not a reason to skip a part.
@@ -50,8 +63,11 @@ def main() -> int:
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
     parts = {}
     for part in arguments.only or BUDGETS:
+        print(f"\n{part}", flush=True)
         parts[part] = in_a_process(part, BUDGETS[part] * (_PATIENCE if arguments.quick else 1))
-        print_part(part, parts[part])
+        print(f"{part}: {parts[part]['status']}, {parts[part]['seconds']} s", flush=True)
+        if "reason" in parts[part]:
+            print(f"  {parts[part]['reason']}", flush=True)
     figures = {"device": name, "quick": arguments.quick, "torch": torch.__version__, "parts": parts}
     where = arguments.out or RESULTS / f"gpu_{re.sub(r'[^a-z0-9]+', '_', name.lower()).strip('_')}.json"
     print(f"\n{write_result(where.stem, figures, where.parent)}")
@@ -116,35 +132,13 @@ def run_part(part: str, arguments: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in _OWN:
             raise
-        found.add("_ended", {"status": "skipped", "reason": f"{error.name} is not installed"})
+        found.end({"status": "skipped", "reason": f"{error.name} is not installed"})
     except Exception:
-        found.add("_ended", {"status": "failed", "reason": traceback.format_exc()})
+        found.end({"status": "failed", "reason": traceback.format_exc()})
     else:
         status = {"status": "failed", "reason": "; ".join(found.broken)} if found.broken else {"status": "succeeded"}
-        found.add("_ended", status)
+        found.end(status)
     return 0
-
-
-def print_part(part: str, result: dict[str, Any]) -> None:
-    """Print the result of a part as rows of a table."""
-    print(f"\n{part}: {result['status']}, {result['seconds']} s")
-    if "reason" in result:
-        print(f"  {result['reason']}")
-    for name, value in leaves(result["found"]):
-        print(f"  {name:<58}{value:.5g}" if isinstance(value, float) else f"  {name:<58}{value}", flush=True)
-
-
-def leaves(found: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
-    """Return all leaf values with their paths; of a long list, only the first and last values."""
-    lines: list[tuple[str, Any]] = []
-    for name, value in found.items():
-        if isinstance(value, dict):
-            lines += leaves(value, f"{above}{name}/")
-        elif isinstance(value, list) and len(value) > 4:
-            lines.append((above + name, f"{value[0]:.5g} ... {value[-1]:.5g}, {len(value)} values"))
-        else:
-            lines.append((above + name, value))
-    return lines
 
 
 if __name__ == "__main__":

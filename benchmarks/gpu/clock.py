@@ -47,6 +47,11 @@ def forget_peak(device: torch.device) -> None:
         torch.cuda.reset_peak_memory_stats(device)
 
 
+def reserved_bytes(device: torch.device) -> int | None:
+    """Return the peak of device memory in bytes that the allocator held, or None on a CPU."""
+    return torch.cuda.max_memory_reserved(device) if device.type == "cuda" else None
+
+
 def peak_bytes(device: torch.device) -> int | None:
     """Return the peak of allocated device memory in bytes, or None on a CPU."""
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None

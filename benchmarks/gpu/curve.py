@@ -16,8 +16,9 @@ from typing import Any
 
 import torch
 
-from benchmarks.gpu.inputs import network_weights, small_weights, surface_scene, texture, views
+from benchmarks.gpu.inputs import network_weights, small_weights
 from benchmarks.gpu.part import QUICK, Findings, Sizes
+from sgsst_core.bench.synthetic import surface_scene, texture, views
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings

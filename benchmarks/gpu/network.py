@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.gpu.clock import seconds
-from benchmarks.gpu.inputs import network_weights, small_weights, texture
+from benchmarks.gpu.inputs import network_weights, small_weights
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device
+from sgsst_core.bench.synthetic import texture
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride, use_whole_float32
 

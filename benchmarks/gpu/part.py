@@ -22,6 +22,7 @@ class Sizes:
         step_repeats: Number of timed steps.
         parity: (Gaussians, width, height) for the comparison with `reference`.
         network: Side in pixels of the square image for the feature network.
+        bits: Repetitions that must be bit-identical.
         curve: (steps, longer side in pixels) of the job that runs on both GPU and CPU.
         repeats: Repetitions of each timed call.
     """
@@ -32,7 +33,8 @@ class Sizes:
     step_repeats: int = 5
     parity: tuple[int, int, int] = (20_000, 320, 200)
     network: int = 1024
-    curve: tuple[int, int] = (200, 128)
+    bits: int = 100
+    curve: tuple[int, int] = (120, 128)
     repeats: int = 20
 
 
@@ -44,6 +46,7 @@ QUICK = Sizes(
     step_repeats=1,
     parity=(120, 40, 33),
     network=48,
+    bits=2,
     curve=(4, 48),
     repeats=1,
 )
@@ -54,8 +57,29 @@ def device() -> torch.device:
     return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
 
 
+def print_rows(found: dict[str, Any]) -> None:
+    """Print findings as rows of a table, at once."""
+    for name, value in leaves(found):
+        print(f"  {name:<58}{value:.5g}" if isinstance(value, float) else f"  {name:<58}{value}", flush=True)
+
+
+def leaves(found: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
+    """Return all leaf values with their paths; of a long list of numbers, only the first and last values."""
+    lines: list[tuple[str, Any]] = []
+    for name, value in found.items():
+        if isinstance(value, dict):
+            lines += leaves(value, f"{above}{name}/")
+        elif isinstance(value, list) and value and isinstance(value[0], float) and len(value) > 4:
+            lines.append((above + name, f"{value[0]:.5g} ... {value[-1]:.5g}, {len(value)} values"))
+        elif isinstance(value, list) and value and name == "topology":
+            lines += [(above + name, line) for line in value]
+        else:
+            lines.append((above + name, value))
+    return lines
+
+
 class Findings:
-    """Findings of a part, written to a file after each entry, so that none are lost if the part is killed.
+    """Findings of a part, printed and written to a file one by one, so that none are lost if the part is killed.
 
     Args:
         path: Path of the JSON file.
@@ -75,6 +99,7 @@ class Findings:
             place = place.setdefault(group, {})
         place[last] = value
         self._write()
+        print_rows({name: value})
 
     def check(self, name: str, error: float, bound: float) -> None:
         """Add an error with its bound. If it exceeds the bound, the part continues, but counts as failed."""
@@ -82,6 +107,11 @@ class Findings:
         self.add(name, {"error": error if math.isfinite(error) else str(error), "bound": bound, "passed": passed})
         if not passed:
             self.broken.append(f"{name}: {error:.3g} exceeds {bound:.3g}")
+
+    def end(self, status: dict[str, str]) -> None:
+        """Record how the part ended, after all findings."""
+        self.entries["_ended"] = status
+        self._write()
 
     def _write(self) -> None:
         self._path.write_text(json.dumps(self.entries), encoding="utf-8")

@@ -14,9 +14,10 @@ import torch.distributed as dist
 import torch.multiprocessing as multiprocessing
 from torch import Tensor
 
-from benchmarks.gpu.inputs import network_weights, small_weights, surface_scene, texture, views
+from benchmarks.gpu.inputs import network_weights, small_weights
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device
 from benchmarks.machine import free_address
+from sgsst_core.bench.synthetic import surface_scene, texture, views
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer

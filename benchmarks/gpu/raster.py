@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.gpu.clock import forget_peak, peak_bytes, seconds, waited_seconds
-from benchmarks.gpu.inputs import surface_scene, views
 from benchmarks.gpu.part import Findings, Sizes, device
+from sgsst_core.bench.synthetic import surface_scene, views
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer

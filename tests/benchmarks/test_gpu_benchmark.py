@@ -11,10 +11,26 @@ from typing import Any
 
 import pytest
 
+from benchmarks.gpu.__main__ import BUDGETS
+from benchmarks.gpu.part import Findings
+
 pytest.importorskip("triton")
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 PASSES = {"forward_seconds", "backward_seconds"}
+
+
+def test_all_parts_together_take_less_than_nine_minutes() -> None:
+    assert sum(BUDGETS.values()) < 540
+    assert list(BUDGETS)[:3] == ["identity", "poison", "parity"]
+
+
+def test_findings_are_printed_at_once(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    found = Findings(tmp_path / "findings.json")
+    found.add("a/b", {"c": 0.5})
+    assert capfd.readouterr().out.split() == ["a/b/c", "0.5"]
+    found.check("off", 2.0, 1.0)
+    assert found.broken == ["off: 2 exceeds 1"]
 
 
 def benchmark(folder: Path, *options: str) -> tuple[int, dict[str, Any]]:
@@ -31,13 +47,23 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     status, written = benchmark(tmp_path)
     parts = written["parts"]
     assert {name: part.get("reason", part["status"]) for name, part in parts.items()} == dict.fromkeys(
-        ("parity", "raster", "network", "step", "curve", "ranks", "tests"), "succeeded"
+        BUDGETS, "succeeded"
     )
     assert status == 0
     assert written["quick"]
     assert {"date", "machine", "device", "torch"} <= set(written)
     found = {name: part["found"] for name, part in parts.items()}
+    assert {"torch", "triton", "copy", "matrix_product"} <= set(found["identity"])
+    assert all(check["passed"] for check in found["poison"]["small"].values())
+    assert len(found["poison"]["small"]) == 7
     assert all(found["parity"]["triton"][name]["passed"] for name in ("image", "coverage", "gradient"))
+    assert found["parity"]["triton"]["different_of_2_repeats"]["error"] == 0
+    for place, name in (("step", "render"), ("step", "slot_gradients"), ("cached_weights", "apply_pieces")):
+        assert min(found["kernels"][place][name].values()) > 0
+        assert found["kernels"]["first_launch_seconds"][name] > 0
+    rates = found["convolutions"]["conv1_1"]["bfloat16"]["forward"]
+    assert set(rates) == {"channels_last", "channels_last_searched", "planes", "planes_searched"}
+    assert min(rates.values()) > 0
     for count in ("60", "120"):
         entry = found["raster"][count]
         assert PASSES | {"survey_seconds_a_view", "lists_seconds", "lists_bytes", "pairs"} <= set(entry)
@@ -49,7 +75,8 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
         entry = found["step"][view]["float32"]
         assert entry["rasterizer"] == "triton"
         assert {"vgg_forward", "vgg_backward", "render", "raster_backward"} <= set(entry["seconds_by_part"])
-        assert entry["planned_peak_bytes"] > 0
+        assert entry["planned_process_bytes"] > 0
+        assert entry["planned_device_bytes"] is None
     assert len(found["curve"]["losses"]) == len(found["curve"]["losses_on_the_cpu"]) == 4
     assert found["curve"]["loss"]["passed"]
     assert found["ranks"]["colors"]["passed"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from torch import Tensor
 if torch.cuda.is_available():
     pytest.skip("there is a GPU", allow_module_level=True)
 
+from sgsst_core.bench import doctor
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 
@@ -118,3 +120,18 @@ def test_device_is_removed_after_the_block() -> None:
     assert not torch.cuda.is_available()
     with pytest.raises((RuntimeError, AssertionError)):
         torch.zeros(2, device="cuda")
+
+
+def test_doctor_describes_the_gpu(counts: Counts) -> None:
+    assert doctor._gpu().text.startswith("1 x pretend, compute capability 9.0, CUDA ")
+    assert doctor._memory(torch.device("cuda", 0)).text == "jobs plan with 105.2 GB of the GPU's memory"
+    text = doctor._precision(torch.device("cuda", 0)).text
+    assert text.startswith("TF32 convolutions are ")
+    assert "bfloat16 convolutions are " in text
+
+
+def test_doctor_says_why_a_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "exists", lambda path: str(path) == "/dev/nvidia0")
+    found = doctor._gpu()
+    assert found.state == "warning"
+    assert "built for CPUs only" in found.text

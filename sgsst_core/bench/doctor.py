@@ -1,0 +1,231 @@
+"""Examination of a machine: what works, what is slow, and what does not work, in plain words.
+
+    python -m sgsst_core.bench.doctor
+
+prints one finding per line as JSON, as soon as it is known.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    import torch
+
+State = Literal["works", "warning", "problem"]
+#: Seconds after which an examination is cut off.
+LIMIT = 27.0
+#: Gigabytes of memory budget below which only small scenes fit.
+_LITTLE_MEMORY = 2.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Finding about one topic.
+
+    Attributes:
+        topic: Examined part of the machine.
+        state: "works"; "warning" if jobs run, but slower than they could; "problem" if they fail or are wrong.
+        text: Description, and for other states than "works", what to do.
+    """
+
+    topic: str
+    state: State
+    text: str
+
+
+def examine(limit: float = LIMIT) -> Iterator[Finding]:
+    """Yield findings about this machine, as a separate process makes them.
+
+    The process is killed after `limit` seconds. A GPU that hangs or a driver that crashes therefore becomes a finding.
+    """
+    started = time.monotonic()
+    command = [sys.executable, "-m", "sgsst_core.bench.doctor"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        timer = threading.Timer(limit, process.kill)
+        timer.start()
+        errors: list[str] = []
+        reader = threading.Thread(target=lambda: errors.append(process.stderr.read() if process.stderr else ""))
+        reader.start()
+        try:
+            for line in process.stdout or ():
+                yield Finding(**json.loads(line))
+            status = process.wait()
+        finally:
+            timer.cancel()
+            process.kill()
+            reader.join()
+    if status and time.monotonic() - started >= limit:
+        text = f"not all checks ended within {limit:.0f} seconds. Run the command again: what was compiled is cached."
+        yield Finding("time", "warning", text)
+    elif status:
+        last = (errors[0].strip().splitlines() or ["no message"])[-1]
+        yield Finding("program", "problem", f"the examination ended with status {status}: {last}")
+
+
+def findings() -> Iterator[Finding]:
+    """Yield findings about this machine, made in this process."""
+    yield _weights()
+    yield from _caches()
+    import torch
+
+    from sgsst_core.bench.device_identity import package_version
+
+    versions = f"Python {sys.version.split()[0]}, PyTorch {torch.__version__}, Triton {package_version('triton')}"
+    yield Finding("program", "works", versions)
+    yield _gpu()
+    gpu = torch.cuda.is_available()
+    device = torch.device("cuda", torch.cuda.current_device()) if gpu else torch.device("cpu")
+    yield _memory(device)
+    rasterizer, found = _rasterizer(gpu=gpu)
+    yield found
+    yield _precision(device)
+    yield from _results(rasterizer, device)
+
+
+def _weights() -> Finding:
+    from sgsst_core.features.network_weights import list_network_weights
+    from sgsst_core.features.weight_files import damage_of
+
+    installed = [entry for entry in list_network_weights() if entry.path is not None]
+    for entry in installed:
+        if entry.path is not None and (damage := damage_of(entry.path, entry.name)):
+            return Finding("weights", "problem", damage)
+    networks = [entry.name for entry in installed if entry.name in ("vgg19", "vgg16")]
+    if not networks:
+        text = (
+            "no network is installed. Run `sgsst weights fetch vgg19` (575 MB) or `sgsst weights fetch vgg16` (64 MB)."
+        )
+        return Finding("weights", "problem", text)
+    return Finding("weights", "works", f"{' and '.join(networks)} installed and undamaged")
+
+
+def _caches() -> Iterator[Finding]:
+    """Yield a finding for each folder that cannot be written, or one if all can."""
+    from sgsst_core.compiled import kernel_folders
+    from sgsst_core.errors import OutputError
+    from sgsst_core.files.atomic import ensure_writable_folder
+    from sgsst_core.files.cache_folder import cache_folder
+
+    importlib.import_module("sgsst_core.rasterizer.kernels")  # registers the folder of its compiled kernels
+    triton = Path(os.environ.get("TRITON_CACHE_DIR") or Path(os.environ.get("TRITON_HOME") or Path.home()) / ".triton")
+    variables = {
+        cache_folder(): "SGSST_CACHE",
+        triton: "TRITON_CACHE_DIR",
+        **dict.fromkeys(kernel_folders(), "NUMBA_CACHE_DIR"),
+    }
+    unwritable = not kernel_folders()
+    if unwritable:
+        yield Finding("cache", "warning", "no folder for compiled kernels can be written. Set NUMBA_CACHE_DIR.")
+    for folder, variable in variables.items():
+        try:
+            ensure_writable_folder(folder)
+        except (OutputError, OSError):
+            unwritable = True
+            text = f"{folder} cannot be written, so every process compiles or downloads again. Set {variable}."
+            yield Finding("cache", "warning", text)
+    if not unwritable:
+        yield Finding("cache", "works", f"{cache_folder()} and the folders of compiled kernels can be written")
+
+
+def _gpu() -> Finding:
+    import torch
+
+    from sgsst_core.bench.device_identity import nvidia_smi
+
+    if torch.cuda.is_available():
+        device = torch.device("cuda", torch.cuda.current_device())
+        capability = ".".join(map(str, torch.cuda.get_device_capability(device)))
+        driver = nvidia_smi(device).get("driver", "unknown")
+        name, library = torch.cuda.get_device_name(device), torch.version.cuda or torch.version.hip
+        text = f"{torch.cuda.device_count()} x {name}, compute capability {capability}, CUDA {library}, driver {driver}"
+        return Finding("GPU", "works", text)
+    if not any(Path(path).exists() for path in ("/dev/nvidia0", "/proc/driver/nvidia/version", "/dev/kfd")):
+        return Finding("GPU", "works", "there is none; jobs run on the CPU")
+    if torch.version.cuda is None and torch.version.hip is None:
+        text = "there is one, but this PyTorch is built for CPUs only. Install a build for its CUDA or ROCm version."
+        return Finding("GPU", "warning", text)
+    try:
+        torch.zeros(1, device="cuda")
+    except Exception as error:  # whatever the exception, it says why
+        return Finding("GPU", "warning", f"PyTorch cannot use it: {str(error).splitlines()[0]} Update its driver.")
+    return Finding("GPU", "warning", "PyTorch sees none. Check CUDA_VISIBLE_DEVICES and the driver.")
+
+
+def _memory(device: torch.device) -> Finding:
+    from sgsst_core.budget import default_memory_limit
+
+    gigabytes = default_memory_limit(device) / 1e9
+    where = "of the GPU's" if device.type == "cuda" else "of"
+    text = f"jobs plan with {gigabytes:.1f} GB {where} memory"
+    if gigabytes >= _LITTLE_MEMORY:
+        return Finding("memory", "works", text)
+    return Finding("memory", "warning", f"{text}, enough for small views only. End other programs.")
+
+
+def _rasterizer(*, gpu: bool) -> tuple[str, Finding]:
+    """Return the rasterizer of jobs on this machine, and the finding about it."""
+    from sgsst_core.parallel.collectives import ALONE
+    from sgsst_core.planning.context import gpu_problems
+    from sgsst_core.rasterizer import RASTERIZERS, rasterizer_for
+
+    problems = gpu_problems(ALONE) if gpu else {}
+    name = rasterizer_for("cuda" if gpu else "cpu", problems)
+    texts = [f"{RASTERIZERS[each].title} cannot be used: {problem}" for each, problem in problems.items()]
+    if not gpu:
+        return name, Finding("rasterizer", "works", "views are rendered on the CPU")
+    if not RASTERIZERS[name].on_gpu:
+        return name, Finding("rasterizer", "warning", f"views are rendered on the CPU; {'; '.join(texts)}")
+    return name, Finding("rasterizer", "works", "; ".join([f"{RASTERIZERS[name].title} works here", *texts]))
+
+
+def _results(rasterizer: str, device: torch.device) -> Iterator[Finding]:
+    """Yield a finding for each wrong result, or one if all are right."""
+    import torch
+
+    from sgsst_core.bench.device_checks import CheckSizes, check_device
+
+    where = device if rasterizer in ("triton", "cuda") else torch.device("cpu")
+    sizes = CheckSizes() if where.type == "cuda" else CheckSizes(repeats=3, channels=16)
+    wrong = total = 0
+    for check in check_device(rasterizer, where, sizes):
+        total += 1
+        if not check.passed:
+            wrong += 1
+            text = f"wrong {check.name}: {check.error:.3g} exceeds {check.bound:.3g}"
+            yield Finding("results", "problem", f"{text}. Do not trust results of this machine.")
+    if not wrong:
+        yield Finding("results", "works", f"{total} checks agree with float64 references, and repeat bit by bit")
+
+
+def _precision(device: torch.device) -> Finding:
+    from sgsst_core.features.vgg import has_bfloat16, has_tf32
+    from sgsst_core.planning.context import convolution_ratio
+
+    kind: Literal["cpu", "cuda"] = "cuda" if device.type == "cuda" else "cpu"
+    texts = []
+    if has_tf32(device):
+        texts.append(f"TF32 convolutions are {convolution_ratio('tf32', kind):.1f} times as fast as float32")
+    if has_bfloat16(device):
+        texts.append(f"bfloat16 convolutions are {convolution_ratio('bfloat16', kind):.1f} times as fast as float32")
+    return Finding("precision", "works", "; ".join(texts) or "float32 only")
+
+
+def main() -> None:
+    """Print all findings as lines of JSON."""
+    for finding in findings():
+        print(json.dumps(asdict(finding)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

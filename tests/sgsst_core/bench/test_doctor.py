@@ -1,0 +1,128 @@
+"""Tests of the examination of a machine."""
+
+from __future__ import annotations
+
+import json
+import stat
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from api.cli.main import main
+from sgsst_core.bench import doctor
+from sgsst_core.bench.device_checks import Check, CheckSizes, Step, check_device, leave_nan
+from sgsst_core.bench.doctor import Finding, examine
+from sgsst_core.bench.synthetic import random_weights, surface_scene, views
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CPU = torch.device("cpu")
+SMALL = CheckSizes(100, 32, 24, 2, 16)
+
+
+def test_this_machine_works(tiny_installed: Path) -> None:
+    found = list(examine(limit=400.0))
+    assert [finding for finding in found if finding.state == "problem"] == []
+    topics = [finding.topic for finding in found]
+    assert topics == ["weights", "cache", "program", "GPU", "memory", "rasterizer", "precision", "results"]
+    assert "7 checks agree" in found[-1].text
+
+
+def test_missing_weights_are_a_problem(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "cache"))
+    assert main(["doctor", "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found[0]["topic"] == "weights"
+    assert found[0]["state"] == "problem"
+    assert "sgsst weights fetch" in found[0]["text"]
+
+
+def test_folders_that_cannot_be_written_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    monkeypatch.setenv("SGSST_CACHE", str(file))
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(file / "triton"))
+    found = [(finding.state, finding.text.split("Set ")[-1]) for finding in doctor._caches()]
+    assert found == [("warning", "SGSST_CACHE."), ("warning", "TRITON_CACHE_DIR.")]
+
+
+def test_wrong_images_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    render = CpuRasterizer._render
+    monkeypatch.setattr(CpuRasterizer, "_render", lambda *arguments: 1.001 * render(*arguments))
+    checks = {check.name: check for check in check_device("cpu", CPU, SMALL)}
+    assert [name for name, check in checks.items() if not check.passed] == ["image"]
+    (found,) = doctor._results("cpu", CPU)
+    assert found.state == "problem"
+    assert found.text.startswith("wrong image: 0.00")
+
+
+def test_results_that_depend_on_free_memory_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rasterizer adds memory that was not written, times 0."""
+    scene, camera = surface_scene(100), views(1, 32, 24)[0]
+    freed: list[Tensor] = []
+
+    def reads_free_memory(rasterizer: CpuRasterizer, *arguments: Any) -> Tensor:
+        image = render(rasterizer, *arguments)
+        return image + 0 * (freed[-1] if freed else torch.zeros(()))
+
+    render = CpuRasterizer._render
+    monkeypatch.setattr(CpuRasterizer, "_render", reads_free_memory)
+    monkeypatch.setattr(
+        "sgsst_core.bench.device_checks.leave_nan", lambda device: freed.append(torch.tensor(torch.nan))
+    )
+    step = Step.of(CpuRasterizer(scene), scene, camera, random_weights("vgg16", (16,) * 5))
+    assert step.changed_by_nan() > 0
+    freed.clear()
+    assert step.different_repeats(2) == 0
+
+
+def test_freed_blocks_hold_nan(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Tensor] = []
+    full = torch.full
+
+    def kept(*arguments: Any, **options: Any) -> Tensor:
+        made.append(full(*arguments, **options))
+        return made[-1]
+
+    monkeypatch.setattr(torch, "full", kept)
+    leave_nan(CPU)
+    assert {tensor.nbytes for tensor in made} == {1 << 12, 1 << 16, 1 << 20}
+    assert all(bool(tensor.isnan().all()) for tensor in made)
+
+
+@pytest.mark.parametrize(("error", "passed"), [(0.5, True), (1.0, True), (1.5, False), (float("nan"), False)])
+def test_checks_pass_within_their_bounds(error: float, passed: bool) -> None:
+    assert Check("x", error, 1.0).passed is passed
+
+
+def test_an_examination_that_hangs_or_crashes_is_a_finding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    program = tmp_path / "python"
+    program.write_text(
+        '#!/bin/sh\necho \'{"topic": "a", "state": "works", "text": "b"}\'\necho no driver >&2\nexit 4\n'
+    )
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setattr(sys, "executable", str(program))
+    first = Finding("a", "works", "b")
+    crashed = Finding("program", "problem", "the examination ended with status 4: no driver")
+    assert list(examine()) == [first, crashed]
+    program.write_text(program.read_text().replace("exit 4", "exec sleep 100"))
+    found = list(examine(limit=1.0))
+    assert found[0] == first
+    assert (found[1].topic, found[1].state) == ("time", "warning")
+
+
+@pytest.mark.parametrize(
+    ("states", "code"), [(["works"], 0), (["works", "warning"], 3), (["warning", "problem", "works"], 1)]
+)
+def test_exit_code_is_that_of_the_worst_finding(
+    states: list[Any], code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "examine", lambda: [Finding("topic", state, "text") for state in states])
+    assert main(["doctor"]) == code
+    assert len(capsys.readouterr().out.splitlines()) == len(states)
