@@ -34,6 +34,8 @@ from sgsst_core.scene.rendering import Rendering
 _MAGIC = b"glTF"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAX_JSON_BYTES = 1 << 20
+#: Maximum number of nodes above the one of the Gaussians.
+_MAX_DEPTH = 64
 _MAX_BYTES = (1 << 32) - 1
 _EXTENSION = "KHR_gaussian_splatting"
 #: Extensions that change nothing in what is read. Files that require another one are refused.
@@ -236,13 +238,11 @@ def _node_matrix(document: dict[str, Any], mesh: int) -> NDArray[np.float64]:
         raise ValueError(f"{len(showing)} nodes show the Gaussians")
     parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
     matrix, node = np.eye(4), showing[0] if showing else None
-    for _ in nodes:
+    for _ in range(_MAX_DEPTH):
         if node is None:
-            break
+            return matrix
         matrix, node = _local_matrix(nodes[node]) @ matrix, parents.get(node)
-    if node is not None:
-        raise ValueError("the nodes form a cycle")
-    return matrix
+    raise ValueError("the nodes are nested too deeply, or form a cycle")
 
 
 def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:

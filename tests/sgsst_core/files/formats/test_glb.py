@@ -225,6 +225,7 @@ FIRST = "meshes__0__primitives__0__"
         (by_hand(nodes=[{"mesh": 0, "scale": [1e200, 1e200, 1e200]}]), "not finite"),
         (by_hand(nodes=[{"mesh": 0, "rotation": [0, 0, 0, 0]}]), "rotation"),
         (by_hand(nodes=[{"mesh": 0, "matrix": [1, 2]}]), "not a valid GLB scene"),
+        (by_hand(nodes=[{"children": [i + 1]} for i in range(64)] + [{"mesh": 0}]), "nested too deeply"),
         (by_hand(nodes=[{"mesh": 0, "children": [0], "scale": [2, 2, 2]}]), "form a cycle"),
         (by_hand()[:-1], "is truncated"),
         (by_hand()[:300], "is truncated"),
