@@ -28,7 +28,7 @@ from tests.small_scenes import cameras, style, wall
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_variants_run_and_are_judged_at_the_same_moments(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_variants_are_evaluated_at_equal_times(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
     names = ["standard", "coarse-only", "coarse-to-fine", "cold-start", "half-weights"]
     scene, views = wall(), cameras(2, 96, 72)
     curves = error_time(scene, views, style(), choose_variants(names), 1.0, weights=tiny_weights, coarsest_side=36)
@@ -48,18 +48,18 @@ def test_variants_run_and_are_judged_at_the_same_moments(tiny_weights: BackboneW
     assert values["pareto_front"]
 
 
-def test_other_style_losses_are_judged_by_the_same_one(
+def test_all_variants_are_evaluated_with_the_papers_loss(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Variants are evaluated with the paper's loss, even if all of them optimize another one."""
     found: list[Evaluation] = []
     evaluate = Float32Reference.evaluate
 
-    def kept(self: Float32Reference, indices: list[int], sh_dc: Tensor) -> Evaluation:
+    def record_evaluation(self: Float32Reference, indices: list[int], sh_dc: Tensor) -> Evaluation:
         found.append(evaluate(self, indices, sh_dc))
         return found[-1]
 
-    monkeypatch.setattr(Float32Reference, "evaluate", kept)
+    monkeypatch.setattr(Float32Reference, "evaluate", record_evaluation)
     scene, views, variants = wall(), cameras(2, 48, 36), choose_variants(["nnfm", "mixed"])
     for style_loss in ("sos", "nnfm"):
         curves = error_time(scene, views, style(), variants, 1.0, weights=tiny_weights, style_loss=style_loss)
@@ -68,7 +68,7 @@ def test_other_style_losses_are_judged_by_the_same_one(
     assert all(terms["nearest"] == 0 < terms["gram"] for evaluation in found for terms in evaluation.values())
 
 
-def test_the_front_holds_what_nothing_beats() -> None:
+def test_pareto_front_contains_undominated_points() -> None:
     def curve(name: str, *points: tuple[float, float]) -> Curve:
         return Curve(VARIANTS[name], [Point(seconds, 1, loss, {0: loss}) for seconds, loss in points])
 
@@ -77,6 +77,6 @@ def test_the_front_holds_what_nothing_beats() -> None:
     assert front == [("two-views", 1), ("standard", 2), ("two-views", 3), ("standard", 4)]
 
 
-def test_an_unknown_variant_is_named() -> None:
+def test_unknown_variant_error_names_it() -> None:
     with pytest.raises(SettingsError, match="no variant slower"):
         choose_variants(["standard", "slower"])

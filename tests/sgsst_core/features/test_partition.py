@@ -44,7 +44,7 @@ def test_misaligned_partitions_are_refused(tile_size, halo):
         partition(500, 730, tile_size, halo)
 
 
-def test_whole_view_where_it_fits_and_a_tile_that_fits_where_not():
+def test_view_is_partitioned_only_if_it_does_not_fit():
     assert choose_tile_size(512, 512, 64, held=512 * 512 * 1.5, working=0.5) is None
     for held in (4e6, 1e6, 3e5, 1e5):
         size = choose_tile_size(3361, 5187, 64, held=held, working=0.5)
@@ -60,7 +60,7 @@ def test_tiles_have_no_more_pixels_than_allowed_even_if_more_fit_in_memory():
         assert max(tile.outer.pixels for tile in partition(3361, 5187, size, 64)) <= largest
 
 
-def test_region_holds_what_is_covered_and_no_more_than_it_must():
+def test_covered_region_is_minimal_and_aligned():
     coverage = torch.zeros((100, 210))
     assert covered_region(coverage).pixels == 0
     assert partition(100, 210, None, 64, covered_region(coverage)) == []
@@ -77,7 +77,7 @@ def test_region_holds_what_is_covered_and_no_more_than_it_must():
 
 @pytest.mark.parametrize("scale", [0, 1, 2, 3])
 @pytest.mark.parametrize("size", [(100, 210), (97, 133), (64, 48)])
-def test_a_region_at_a_scale_is_that_of_the_averaged_coverage(size, scale):
+def test_scaled_region_matches_downscaled_coverage(size, scale):
     generator = torch.Generator().manual_seed(scale)
     for _ in range(30):
         rows, columns = (torch.randint(0, side + 1, (2,), generator=generator).sort().values.tolist() for side in size)
@@ -89,13 +89,13 @@ def test_a_region_at_a_scale_is_that_of_the_averaged_coverage(size, scale):
         assert scaled_region(region, scale, tuple(scaled.shape)) == covered_region(scaled)
 
 
-def test_work_outside_the_region_does_not_count():
+def test_tile_size_ignores_pixels_outside_the_region():
     assert choose_tile_size(4000, 4000, 64, held=1e6, working=0.5, region=Rectangle(1600, 1600, 2000, 2000)) is None
 
 
 @pytest.mark.parametrize("held", [0.0, 90.0, 130.0, 250.0, 299.0, 1000.0])
 @pytest.mark.parametrize("working", [0.0, 0.4])
-def test_what_is_kept_fits_beside_the_pass_in_hand_and_leaves_no_room_for_another_tile(held, working):
+def test_cached_tiles_fit_and_leave_no_space_for_another(held, working):
     areas = [40, 100, 60, 100]
     kept = cached_tiles(areas, held, working)
     total = sum(area for area, flag in zip(areas, kept, strict=True) if flag)
@@ -105,7 +105,7 @@ def test_what_is_kept_fits_beside_the_pass_in_hand_and_leaves_no_room_for_anothe
     assert computed_twice(areas, kept) == sum(areas) - total
 
 
-def test_a_view_that_just_fits_is_kept_whole():
+def test_view_that_just_fits_is_cached_whole():
     assert cached_tiles([100], 140.0, 0.4) == [True]
     assert cached_tiles([100], 139.0, 0.4) == [False]
     assert choose_tile_size(1000, 1000, 64, held=1.4e6, working=0.4) is None

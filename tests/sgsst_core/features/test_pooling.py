@@ -28,7 +28,7 @@ def relu_output(height: int, width: int, dtype: torch.dtype, *, levels: int = 0)
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("levels", [0, 1])
-def test_pool_and_its_backward_pass(size: tuple[int, int], dtype: torch.dtype, levels: int) -> None:
+def test_max_pool_and_backward_pass_match_pytorch(size: tuple[int, int], dtype: torch.dtype, levels: int) -> None:
     source = relu_output(*size, dtype, levels=levels)
     pooled = max_pool(source)
     assert pooled.shape[2:] == (size[0] // 2, size[1] // 2)
@@ -54,7 +54,7 @@ def test_negative_zeros_and_infinities_are_compared_as_numbers(dtype: torch.dtyp
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_not_a_number_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
+def test_nan_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
     """NaN of either sign must propagate through max pooling."""
     source = relu_output(2, 2, dtype)
     source[0, 5, 1, 0] = torch.copysign(torch.tensor(torch.nan, dtype=dtype), torch.tensor(sign, dtype=dtype))
@@ -63,13 +63,13 @@ def test_not_a_number_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
     assert int(max_pool(source).isnan().sum()) == 1
 
 
-def test_a_slice_of_a_larger_gradient_is_taken_as_it_lies() -> None:
+def test_non_contiguous_gradient_is_supported() -> None:
     source = relu_output(8, 8, torch.float32)
     gradient = torch.randn((1, 4, 6, 24), generator=torch.Generator().manual_seed(5)).permute(0, 3, 1, 2)[..., 1:5]
     assert torch.equal(max_pool_backward(gradient, source), max_pool_backward_reference(gradient, source))
 
 
-def test_relu_backward_writes_over_its_gradient() -> None:
+def test_relu_backward_works_in_place() -> None:
     output = relu_output(5, 7, torch.float32)
     gradient = torch.randn(output.shape, generator=torch.Generator().manual_seed(6))
     gradient = gradient.contiguous(memory_format=torch.channels_last)

@@ -40,7 +40,7 @@ def test_agrees_with_reference(dtype, tolerance, weighted):
 
 @settings(max_examples=25, deadline=None)
 @given(cuts=st.lists(st.integers(0, 40), max_size=6), weighted=st.booleans())
-def test_merge_does_not_depend_on_the_cut(cuts, weighted):
+def test_merge_does_not_depend_on_the_division(cuts, weighted):
     x = features()
     a = torch.rand(x.shape[:2], dtype=torch.float64) if weighted else None
     edges = [0, *sorted(cuts), 40]
@@ -48,7 +48,7 @@ def test_merge_does_not_depend_on_the_cut(cuts, weighted):
     assert_equal(merge_all(parts), layer_statistics_reference(x, a), 1e-11)
 
 
-def test_large_mean_keeps_its_standard_deviation_where_one_pass_loses_it():
+def test_standard_deviation_survives_large_means():
     x = features(ratio=1e4, dtype=torch.float32)
     expected = layer_statistics_reference(x).std()
     found = layer_statistics(x).std()
@@ -68,7 +68,7 @@ def test_dead_channels_have_exactly_zero_deviation():
     assert std[5] == 0
 
 
-def test_no_positions_and_no_weight_are_the_neutral_element():
+def test_empty_statistics_are_neutral_in_merges():
     x = features()
     whole = layer_statistics(x)
     nothing = layer_statistics(x[:0])
@@ -83,7 +83,7 @@ def test_half_precision_features_are_summed_in_float32():
     assert_equal(layer_statistics(x), layer_statistics_reference(x), 1e-5)
 
 
-def test_a_shift_that_lies_far_from_the_mean_is_replaced():
+def test_shift_far_from_the_mean_is_replaced():
     """If all sampled positions are outliers, a shift from them would cost three digits of the variance."""
     x = features(1024, 1000, 2, dtype=torch.float32)
     x[:, 0] = 1e3
@@ -94,7 +94,7 @@ def test_a_shift_that_lies_far_from_the_mean_is_replaced():
 
 
 @pytest.mark.parametrize("height", [40, 700])
-def test_shift_of_a_small_covered_part(height):
+def test_shift_comes_from_covered_features(height):
     """The shift must come from covered features, which a sample of all positions would hardly contain."""
     x = features(height, 50, 8, dtype=torch.float32)
     covered = torch.zeros(x.shape[:2])
@@ -104,7 +104,7 @@ def test_shift_of_a_small_covered_part(height):
     assert_equal(found, expected, 1e-5)
 
 
-def test_constant_channels_of_any_value_and_weight():
+def test_constant_channels_have_exact_mean_and_zero_deviation():
     generator = torch.Generator().manual_seed(2)
     x = (torch.rand((1, 1, 64), generator=generator) * 10 ** torch.arange(-20, 12, 0.5)).expand(130, 70, 64)
     some = torch.rand((130, 70), generator=generator)
@@ -123,13 +123,13 @@ def test_tiny_weights_do_not_vanish():
 
 @pytest.mark.parametrize("channels", [1, 3, 31, 33, 100, 512])
 @pytest.mark.parametrize("width", [1, 7, 4099])
-def test_blocks_and_strips_of_any_shape(channels, width):
+def test_blocks_and_strips_of_any_shape_agree_with_reference(channels, width):
     x = features(3 if width > 7 else 70, width, channels, dtype=torch.float32)
     a = torch.rand(x.shape[:2], generator=torch.Generator().manual_seed(1))
     assert_equal(layer_statistics(x, a), layer_statistics_reference(x, a), 2e-5)
 
 
-def test_statistics_of_a_slice_are_those_of_a_copy():
+def test_statistics_of_a_slice_match_its_copy():
     x = features(60, 70, 24, dtype=torch.float32)[5:50, 3:40]
     found, expected = layer_statistics(x), layer_statistics(x.clone())
     assert torch.equal(found.centered, expected.centered)

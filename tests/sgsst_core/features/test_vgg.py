@@ -60,7 +60,7 @@ class Watched(FeatureNetwork):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_every_convolution_has_channels_last(tiny_weights: BackboneWeights, dtype: torch.dtype) -> None:
+def test_convolutions_run_in_channels_last(tiny_weights: BackboneWeights, dtype: torch.dtype) -> None:
     """No convolution needs to copy its input, not even after a ReLU's or a pool's backward pass."""
     network = Watched(tiny_weights, dtype=dtype)
     pixel_gradient(network)
@@ -86,7 +86,7 @@ def on_a_gpu(device: torch.device, **flags: bool) -> contextlib.AbstractContextM
 
 @pytest.mark.parametrize("search", [False, True])
 @pytest.mark.parametrize("tf32", [False, True])
-def test_flags_hold_in_the_network_alone(
+def test_flags_are_set_only_within_the_network(
     tiny_weights: BackboneWeights, tf32: bool, search: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The network runs on the CPU, but sets the flags as on a GPU."""
@@ -103,7 +103,7 @@ def test_flags_hold_in_the_network_alone(
     assert network.precision == ("tf32" if tf32 else "float32")
 
 
-def test_statistics_are_summed_in_whole_float32(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_statistics_are_summed_in_full_float32(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
     """The callback runs in the middle of the backward pass."""
     use_whole_float32()
     monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
@@ -114,7 +114,7 @@ def test_statistics_are_summed_in_whole_float32(tiny_weights: BackboneWeights, m
 
 
 @pytest.mark.parametrize("before", ["ieee", "tf32", "none"])
-def test_flags_come_back_after_an_error(before: str) -> None:
+def test_flags_are_restored_after_an_error(before: str) -> None:
     CUDNN.conv.fp32_precision = before
     with contextlib.suppress(KeyError), convolutions(CUDA, tf32=True, search=True):
         assert CUDNN.benchmark
@@ -124,13 +124,13 @@ def test_flags_come_back_after_an_error(before: str) -> None:
     assert not CUDNN.benchmark
 
 
-def test_nothing_is_set_on_a_cpu() -> None:
+def test_flags_are_unchanged_on_a_cpu() -> None:
     before = CUDNN.benchmark, CUDNN.conv.fp32_precision
     with convolutions(torch.device("cpu"), tf32=True, search=True):
         assert (CUDNN.benchmark, CUDNN.conv.fp32_precision) == before
 
 
-def test_float32_is_whole_where_tf32_is_allowed_in_general(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_float32_overrides_a_global_tf32_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends, "fp32_precision", "tf32")
     use_whole_float32()
     assert CUDNN.conv.fp32_precision == torch.backends.cuda.matmul.fp32_precision == "ieee"
@@ -146,7 +146,7 @@ def test_float32_is_whole_where_tf32_is_allowed_in_general(monkeypatch: pytest.M
         ("cpu", None, (9, 0), False, True),
     ],
 )
-def test_which_devices_have_tf32_and_bfloat16(
+def test_tf32_and_bfloat16_depend_on_the_device(
     device: str,
     hip: str | None,
     capability: tuple[int, int],
@@ -159,7 +159,7 @@ def test_which_devices_have_tf32_and_bfloat16(
     assert (has_tf32(device), has_bfloat16(device)) == (tf32, bfloat16)
 
 
-def test_tf32_is_of_float32(tiny_weights: BackboneWeights) -> None:
+def test_tf32_requires_float32(tiny_weights: BackboneWeights) -> None:
     with pytest.raises(ValueError, match="float32"):
         FeatureNetwork(tiny_weights, dtype=torch.bfloat16, tf32=True)
 
@@ -207,7 +207,7 @@ def fuse(network: FeatureNetwork) -> set[bool]:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_a_fused_network_is_the_same(tiny_weights: BackboneWeights, dtype: torch.dtype) -> None:
+def test_fused_network_is_bit_identical(tiny_weights: BackboneWeights, dtype: torch.dtype) -> None:
     network = FeatureNetwork(tiny_weights, dtype=dtype)
     expected = pixel_gradient(network)
     with operator_on_cpu(fused) as calls:
@@ -219,12 +219,14 @@ def test_a_fused_network_is_the_same(tiny_weights: BackboneWeights, dtype: torch
 
 
 @pytest.mark.parametrize("does", [without_bias, in_planes])
-def test_what_differs_from_its_parts_is_not_fused(tiny_weights: BackboneWeights, does: Callable[..., Tensor]) -> None:
+def test_convolutions_with_different_results_are_not_fused(
+    tiny_weights: BackboneWeights, does: Callable[..., Tensor]
+) -> None:
     with operator_on_cpu(does):
         assert fuse(FeatureNetwork(tiny_weights)) == {False}
 
 
-def test_what_there_is_no_engine_for_is_not_fused(tiny_weights: BackboneWeights) -> None:
+def test_convolutions_without_an_engine_are_not_fused(tiny_weights: BackboneWeights) -> None:
     assert fuse(FeatureNetwork(tiny_weights)) == {False}
 
 
@@ -264,7 +266,7 @@ def test_algorithms_that_read_their_output_are_not_fused(
         assert all(step.fused for step in network._steps[2:] if isinstance(step, vgg._Convolution))
 
 
-def test_memory_that_is_reused_holds_nan() -> None:
+def test_reused_memory_contains_nan() -> None:
     """Check the trial's premise on an allocator that returns the last freed block of a size, as CUDA's does."""
     kept: list[Tensor] = []
 
@@ -303,7 +305,7 @@ class Launches(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_launches_of_the_passes_on_a_gpu(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpu_passes_have_the_expected_launches(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
     """The forward pass has one launch per convolution with its ReLU and per pool, the backward pass two."""
     network = FeatureNetwork(tiny_weights, tf32=True)
     monkeypatch.setattr(pooling, "_is_compiled_for", lambda values: False)

@@ -36,12 +36,12 @@ def difference(weights: BackboneWeights, dtype: torch.dtype = torch.float32, *, 
     return Difference.of(*gradients)
 
 
-def test_float32_on_a_gpu_is_whole(vgg16_weights: BackboneWeights) -> None:
+def test_gpu_float32_is_not_rounded_to_tf32(vgg16_weights: BackboneWeights) -> None:
     assert difference(vgg16_weights).relative_error < 5e-3
 
 
 @pytest.mark.parametrize("tf32", [True, False])
-def test_other_precisions_differ_by_what_they_round(vgg16_weights: BackboneWeights, tf32: bool) -> None:
+def test_lower_precisions_differ_by_their_rounding(vgg16_weights: BackboneWeights, tf32: bool) -> None:
     if tf32 and not has_tf32("cuda"):
         pytest.skip("this GPU has no TF32")
     found = difference(vgg16_weights, torch.float32 if tf32 else torch.bfloat16, tf32=tf32)
@@ -49,7 +49,7 @@ def test_other_precisions_differ_by_what_they_round(vgg16_weights: BackboneWeigh
     assert 1e-3 < found.relative_error < (0.2 if tf32 else 0.8)
 
 
-def test_tf32_is_on_in_the_block_alone() -> None:
+def test_tf32_is_enabled_only_within_the_block() -> None:
     if not has_tf32("cuda"):
         pytest.skip("this GPU has no TF32")
     use_whole_float32()
@@ -77,7 +77,7 @@ def test_fused_convolutions_have_channels_last(vgg16_weights: BackboneWeights, d
     assert all(output.is_contiguous(memory_format=torch.channels_last) for output in held)
 
 
-def test_events_time_what_the_device_does() -> None:
+def test_events_time_the_work_of_the_device() -> None:
     timer = Timer("cuda")
     matrix = torch.randn(4096, 4096, device="cuda")
     with timer("whole"):

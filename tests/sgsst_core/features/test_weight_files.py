@@ -41,7 +41,7 @@ def flip(path: Path, position: int, bit: int = 0) -> None:
 
 
 @pytest.mark.parametrize("name", PACKAGE_FILES)
-def test_files_of_the_package_have_the_digests_in_the_code(name: str, vgg16_weights: BackboneWeights) -> None:
+def test_package_files_match_digests_in_the_code(name: str, vgg16_weights: BackboneWeights) -> None:
     with (cache_folder() / f"{name}.safetensors").open("rb") as stream:
         metadata = verify(stream, name, name)
     assert metadata["source"] == PACKAGE_SOURCE
@@ -49,7 +49,7 @@ def test_files_of_the_package_have_the_digests_in_the_code(name: str, vgg16_weig
     assert metadata["sha256"] == PACKAGE_FILES[name]
 
 
-def test_every_flipped_bit_is_found(folder: Path) -> None:
+def test_every_flipped_bit_is_detected(folder: Path) -> None:
     content = bytearray((folder / "lpips_vgg16.safetensors").read_bytes())
     verify(io.BytesIO(content), "lpips_vgg16", "file")
     missed = []
@@ -65,7 +65,7 @@ def test_every_flipped_bit_is_found(folder: Path) -> None:
     assert missed == []
 
 
-def test_weights_that_only_claim_to_be_the_package_s_are_refused(folder: Path) -> None:
+def test_forged_package_weights_are_refused(folder: Path) -> None:
     """The file was damaged before its own digest was computed, so only the digest in the code detects it."""
     path = folder / "lpips_vgg16.safetensors"
     tensors = safetensors.torch.load_file(path)
@@ -80,8 +80,8 @@ def test_weights_that_only_claim_to_be_the_package_s_are_refused(folder: Path) -
         network_weights._install(folder, {"lpips_vgg16": tensors}, PACKAGE_SOURCE, PACKAGE_DIGEST)
 
 
-def test_damaged_files_are_named_with_what_to_run(folder: Path, tiny_cache: Path) -> None:
-    """One of the package, and one that was installed from a file of the user's own."""
+def test_damaged_files_are_named_with_a_repair_command(folder: Path, tiny_cache: Path) -> None:
+    """Cases are a file of the package, and one that was installed from a file of the user."""
     shutil.copy(tiny_cache / "vgg16.safetensors", folder)
     assert damaged_weights(folder) == []
     for name in ("vgg16", "lpips_vgg16"):
@@ -96,7 +96,7 @@ def test_damaged_files_are_named_with_what_to_run(folder: Path, tiny_cache: Path
         assert "--from FILE" in damage
 
 
-def test_a_file_that_is_replaced_is_verified_again(folder: Path, vgg16_weights: BackboneWeights) -> None:
+def test_replaced_file_is_verified_again(folder: Path, vgg16_weights: BackboneWeights) -> None:
     path = folder / "lpips_vgg16.safetensors"
     flip(path, -1)
     path.touch()
@@ -106,7 +106,7 @@ def test_a_file_that_is_replaced_is_verified_again(folder: Path, vgg16_weights: 
     assert damaged_weights(folder / "empty") == []
 
 
-def test_a_fetch_replaces_damaged_weights_from_a_file(tiny_cache: Path, tmp_path: Path) -> None:
+def test_fetch_replaces_damaged_weights_from_a_file(tiny_cache: Path, tmp_path: Path) -> None:
     path = Path(shutil.copy(tiny_cache / "vgg16.safetensors", tmp_path))
     flip(path, -1, 7)
     assert damaged_weights(tmp_path)

@@ -13,7 +13,7 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, remove_leftovers
 
 
-def test_the_target_appears_only_at_the_end_and_nothing_else_stays(tmp_path: Path) -> None:
+def test_target_appears_only_when_complete(tmp_path: Path) -> None:
     target = tmp_path / "scene.ply"
     with atomic_path(target) as temporary:
         temporary.write_bytes(b"new")
@@ -25,7 +25,7 @@ def test_the_target_appears_only_at_the_end_and_nothing_else_stays(tmp_path: Pat
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit, OSError])
-def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, error: type[BaseException]) -> None:
+def test_interrupted_write_preserves_the_old_file(tmp_path: Path, error: type[BaseException]) -> None:
     target = tmp_path / "report.json"
     target.write_bytes(b"old")
 
@@ -40,7 +40,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, error: type[Ba
     assert os.listdir(tmp_path) == ["report.json"]
 
 
-def test_a_full_disk_is_an_output_error(tmp_path: Path) -> None:
+def test_full_disk_is_an_output_error(tmp_path: Path) -> None:
     def fail() -> None:
         with atomic_path(tmp_path / "a.ply"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -50,7 +50,7 @@ def test_a_full_disk_is_an_output_error(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_a_new_file_has_the_usual_permissions_and_an_old_one_keeps_its_own(tmp_path: Path) -> None:
+def test_new_file_gets_default_permissions_and_old_file_keeps_its_own(tmp_path: Path) -> None:
     plain, target = tmp_path / "plain", tmp_path / "target"
     plain.touch()
     with atomic_path(target) as temporary:
@@ -63,7 +63,7 @@ def test_a_new_file_has_the_usual_permissions_and_an_old_one_keeps_its_own(tmp_p
     assert target.read_text() == "2"
 
 
-def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
+def test_symbolic_link_is_preserved(tmp_path: Path) -> None:
     real, link = tmp_path / "real", tmp_path / "link"
     real.write_text("old")
     link.symlink_to(real)
@@ -73,7 +73,7 @@ def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
     assert real.read_text() == "new"
 
 
-def test_where_nothing_can_be_written_the_error_says_so(tmp_path: Path) -> None:
+def test_unwritable_targets_are_output_errors(tmp_path: Path) -> None:
     def write(target: Path) -> None:
         with atomic_path(target):
             pytest.fail("the block must not run")
@@ -106,7 +106,7 @@ def test_ensure_writable_folder_tries_to_write() -> None:
         ensure_writable_folder(Path("/proc/self"))
 
 
-def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+def test_only_leftovers_of_the_target_are_removed(tmp_path: Path) -> None:
     target, other = tmp_path / "a.ply", tmp_path / "b.ply"
     paths = []
     for path in (target, other):
@@ -116,7 +116,7 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) ->
     assert [path.exists() for path in paths] == [False, True]
 
 
-def test_what_lies_in_a_folder_does_not_make_it_unwritable(tmp_path: Path) -> None:
+def test_existing_entries_do_not_make_a_folder_unwritable(tmp_path: Path) -> None:
     for name in ("trial", "sgsst", "part"):
         (tmp_path / name).mkdir()
     ensure_writable_folder(tmp_path)

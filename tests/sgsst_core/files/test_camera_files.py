@@ -113,27 +113,27 @@ def assert_same(actual: list[Camera], expected: list[Camera], names: Callable[[s
         assert torch.allclose(a.world_to_camera, b.world_to_camera, atol=1e-12)
 
 
-def test_inria(tmp_path: Path) -> None:
+def test_inria_cameras_are_read(tmp_path: Path) -> None:
     cameras = list(reversed(views()))
     assert_same(read_cameras(save(tmp_path / "any_name.json", inria(cameras))), cameras)
     save(tmp_path / "cameras.json", inria(cameras))
     assert_same(read_cameras(tmp_path), cameras)
 
 
-def test_principal_points_of_cameras_json(tmp_path: Path) -> None:
+def test_principal_points_of_cameras_json_are_read(tmp_path: Path) -> None:
     entries = [entry | {"cx": 300.0, "cy": 250.5} for entry in inria(views())]
     expected = [replace(view, cx=300.0, cy=250.5) for view in views()]
     assert_same(read_cameras(save(tmp_path / "cameras.json", entries)), expected)
 
 
-def test_nerfstudio(tmp_path: Path) -> None:
+def test_nerfstudio_cameras_are_read(tmp_path: Path) -> None:
     cameras = list(reversed(views()))
     path = save(tmp_path / "transforms.json", nerfstudio(cameras))
     assert_same(read_cameras(path), cameras, lambda name: f"images/{name}")
     assert_same(read_cameras(tmp_path), cameras, lambda name: f"images/{name}")
 
 
-def test_nerfstudio_with_a_lens_for_each_frame(tmp_path: Path) -> None:
+def test_nerfstudio_frames_may_have_own_intrinsics(tmp_path: Path) -> None:
     content = nerfstudio(views(2))
     content["frames"][1] |= {"fl_x": 300.0, "fl_y": 310.0, "cx": 99.0, "cy": 101.0, "w": 200, "h": 200.0}
     content["frames"][1]["transform_matrix"] = content["frames"][1]["transform_matrix"][:3]
@@ -143,7 +143,7 @@ def test_nerfstudio_with_a_lens_for_each_frame(tmp_path: Path) -> None:
     assert torch.allclose(second.world_to_camera, views(2)[1].world_to_camera)
 
 
-def test_nerfstudio_lenses_of_the_file_and_of_frames(tmp_path: Path) -> None:
+def test_nerfstudio_frame_lenses_override_the_files(tmp_path: Path) -> None:
     content = nerfstudio(views(4)) | {"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": None, "k3": 0.01}
     content["frames"][1] |= {"camera_model": "OPENCV_FISHEYE", "k4": 0.002}
     content["frames"][2] |= {"camera_model": "PINHOLE", "k1": 0, "k2": 0, "k3": 0, "p1": 0}
@@ -160,7 +160,7 @@ def test_nerfstudio_lenses_of_the_file_and_of_frames(tmp_path: Path) -> None:
     assert (other.kind, other.model) == (None, "FISHEYE624")
 
 
-def test_fisheyes_of_instant_ngp(tmp_path: Path) -> None:
+def test_instant_ngp_fisheyes_are_read(tmp_path: Path) -> None:
     content = nerfstudio(views(1)) | {"is_fisheye": True}
     del content["camera_model"]
     (view,) = read_cameras(save(tmp_path / "t.json", content))
@@ -169,7 +169,7 @@ def test_fisheyes_of_instant_ngp(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["", ".png", ".jpg"])
-def test_blender_takes_the_size_from_its_images(tmp_path: Path, suffix: str) -> None:
+def test_blender_size_comes_from_its_images(tmp_path: Path, suffix: str) -> None:
     cameras = views(2)
     content = {"camera_angle_x": 2 * math.atan(WIDTH / 2 / 500), "frames": nerfstudio(cameras)["frames"]}
     (tmp_path / "images").mkdir()
@@ -188,7 +188,7 @@ def test_blender_takes_the_size_from_its_images(tmp_path: Path, suffix: str) -> 
         read_cameras(tmp_path / "transforms_train.json")
 
 
-def test_blender_with_a_broken_image(tmp_path: Path) -> None:
+def test_blender_with_a_broken_image_is_refused(tmp_path: Path) -> None:
     content = {"camera_angle_x": 0.7, "frames": nerfstudio(views(1))["frames"]}
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "img_0.png").write_bytes(b"nothing")
@@ -196,7 +196,7 @@ def test_blender_with_a_broken_image(tmp_path: Path) -> None:
         read_cameras(save(tmp_path / "t.json", content))
 
 
-def test_nerfstudio_training_frame(tmp_path: Path) -> None:
+def test_nerfstudio_training_frame_is_applied(tmp_path: Path) -> None:
     """Cameras moved as by nerfstudio show a scene trained by nerfstudio in the same way."""
     cameras = views()
     content = nerfstudio(cameras)
@@ -216,7 +216,7 @@ def test_nerfstudio_training_frame(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("place", [".", "sparse/0", "sparse"])
 @pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE"])
-def test_colmap(tmp_path: Path, text: bool, place: str, model: str) -> None:
+def test_colmap_cameras_are_read(tmp_path: Path, text: bool, place: str, model: str) -> None:
     colmap(tmp_path / "data" / place, views(), text=text, model=model)
     assert_same(read_cameras(tmp_path / "data"), views())
     file = tmp_path / "data" / place / ("images.txt" if text else "cameras.bin")
@@ -268,7 +268,7 @@ def test_panoramas_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
-def test_every_truncation_of_a_binary_model_is_noticed(tmp_path: Path, name: str) -> None:
+def test_every_truncation_of_a_binary_model_is_detected(tmp_path: Path, name: str) -> None:
     folder = colmap(tmp_path / "model", views(), text=False)
     data = (folder / name).read_bytes()
     for stop in range(0, len(data), 3):
@@ -277,7 +277,7 @@ def test_every_truncation_of_a_binary_model_is_noticed(tmp_path: Path, name: str
             read_cameras(folder)
 
 
-def test_colmap_models_that_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_colmap_models_are_refused(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "model", views(), text=True)
     (folder / "images.txt").unlink()
     with pytest.raises(CameraError, match=r"images\.txt: cannot be read: No such file"):
@@ -290,7 +290,7 @@ def test_colmap_models_that_cannot_be_read(tmp_path: Path) -> None:
         read_cameras(empty)
 
 
-def test_poses_are_those_of_pycolmap_to_the_last_bit(tmp_path: Path) -> None:
+def test_poses_are_bit_identical_to_pycolmap(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "model", views(200), text=False)
     model = pycolmap.Reconstruction(folder)
     expected = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
@@ -302,7 +302,7 @@ def test_poses_are_those_of_pycolmap_to_the_last_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_images_hold_the_poses_of_rigs(tmp_path: Path, text: bool) -> None:
+def test_rig_poses_come_from_the_images(tmp_path: Path, text: bool) -> None:
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 3, 4
     options.camera_model_id, options.camera_params = pycolmap.CameraModelId.PINHOLE, [500.0, 510.0, 320.0, 240.0]
@@ -318,7 +318,7 @@ def test_images_hold_the_poses_of_rigs(tmp_path: Path, text: bool) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_files_that_no_view_needs_are_never_opened(tmp_path: Path, text: bool) -> None:
+def test_unneeded_model_files_are_never_opened(tmp_path: Path, text: bool) -> None:
     """Eight bytes of any of them could declare 2^64 entries."""
     folder = colmap(tmp_path / "model", views(), text=text)
     for name in ("points3D", "rigs", "frames"):
@@ -330,7 +330,7 @@ def test_files_that_no_view_needs_are_never_opened(tmp_path: Path, text: bool) -
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
 @pytest.mark.parametrize("count", [4, 2**28, 2**64 - 1])
-def test_counts_of_binary_models_are_not_believed(tmp_path: Path, name: str, count: int) -> None:
+def test_false_counts_of_binary_models_are_refused(tmp_path: Path, name: str, count: int) -> None:
     folder = colmap(tmp_path / "model", views(), text=False)
     data = (folder / name).read_bytes()
     (folder / name).write_bytes(struct.pack("<Q", count) + data[8:])
@@ -338,7 +338,7 @@ def test_counts_of_binary_models_are_not_believed(tmp_path: Path, name: str, cou
         read_cameras(folder)
 
 
-def test_camera_models_are_those_of_pycolmap(tmp_path: Path) -> None:
+def test_camera_models_match_pycolmap(tmp_path: Path) -> None:
     known = {
         int(number.value): number for number in pycolmap.CameraModelId.__members__.values() if int(number.value) >= 0
     }
@@ -384,7 +384,7 @@ def test_wrong_lines_of_colmap_text_are_named(tmp_path: Path, name: str, old: st
         read_cameras(folder)
 
 
-def test_names_with_spaces_and_windows_line_ends(tmp_path: Path) -> None:
+def test_names_with_spaces_and_windows_line_ends_are_read(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "model", views(), text=True)
     for file in ("cameras.txt", "images.txt"):
         content = (folder / file).read_text().replace("img_1", "my img_1")
@@ -464,7 +464,7 @@ def test_wrong_values_of_nerfstudio_cameras_are_named(tmp_path: Path, key: str, 
         read_cameras(path)
 
 
-def test_lenses_that_are_missing_or_impossible(tmp_path: Path) -> None:
+def test_missing_or_impossible_lenses_are_refused(tmp_path: Path) -> None:
     content = nerfstudio(views())
     del content["fl_x"]
     with pytest.raises(CameraError, match="neither fl_x nor camera_angle_x"):
@@ -488,7 +488,7 @@ def test_wrong_training_frames_are_named(tmp_path: Path, values: Any, message: s
         read_cameras(save(tmp_path / "transforms.json", nerfstudio(views())))
 
 
-def test_a_rotation_with_few_digits_becomes_exact(tmp_path: Path) -> None:
+def test_rounded_rotations_are_orthonormalized(tmp_path: Path) -> None:
     content = inria(views())
     for entry in content:
         entry["rotation"] = np.round(entry["rotation"], 4).tolist()
@@ -516,21 +516,21 @@ def test_a_rotation_with_few_digits_becomes_exact(tmp_path: Path) -> None:
         (b"", "neither JSON nor a COLMAP model"),
     ],
 )
-def test_unknown_forms_are_refused(tmp_path: Path, data: bytes, message: str) -> None:
+def test_unknown_formats_are_refused(tmp_path: Path, data: bytes, message: str) -> None:
     path = tmp_path / "cameras.json"
     path.write_bytes(data)
     with pytest.raises(CameraError, match=rf"cameras\.json: .*{message}"):
         read_cameras(path)
 
 
-def test_missing_files_and_folders_without_cameras(tmp_path: Path) -> None:
+def test_missing_files_and_folders_without_cameras_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match="No such file"):
         read_cameras(tmp_path / "none.json")
     with pytest.raises(CameraError, match="holds no cameras in a known format"):
         read_cameras(tmp_path)
 
 
-def test_the_real_colmap_model_and_cameras_json_agree(shared_data: Path) -> None:
+def test_real_colmap_model_matches_cameras_json(shared_data: Path) -> None:
     folder = shared_data / "photos" / "snowmiku_plush"
     from_json, from_colmap = read_cameras(folder / "cameras.json"), read_cameras(folder)
     assert len(from_json) == 97

@@ -54,19 +54,19 @@ def assert_close(found: list[Camera], expected: list[Camera], world: torch.Tenso
         ("frames", ["OPENCV_FISHEYE", None, "OPENCV"]),
     ],
 )
-def test_folders_of_many_tools_hold_the_same_cameras(tool: str, models: list[str | None]) -> None:
+def test_folders_of_many_tools_give_the_same_cameras(tool: str, models: list[str | None]) -> None:
     found = read_cameras(CAPTURES / tool)
     assert_close(found, views())
     assert [view.lens and view.lens.model for view in found] == models
 
 
-def test_nerfstudio_has_axes_of_its_own() -> None:
+def test_nerfstudio_cameras_have_nerfstudio_axes() -> None:
     found = read_cameras(CAPTURES / "nerfstudio")
     assert_close(found, views(), NERFSTUDIO)
     assert {view.lens and view.lens.coefficients[:4] for view in found} == {(0.05, -0.01, 0.001, -0.0005)}
 
 
-def test_cameras_of_a_nerfstudio_training_run_show_the_trained_scene() -> None:
+def test_nerfstudio_training_cameras_match_the_trained_scene() -> None:
     """The training frame is scale * (T0 x), where `transform` is T0 times `applied_transform`."""
     stored = json.loads((CAPTURES / "nerfstudio_trained" / "dataparser_transforms.json").read_text())
     transform = torch.tensor(stored["transform"], dtype=torch.float64)
@@ -86,7 +86,7 @@ def photos_of_blender(folder: Path) -> Path:
     return folder
 
 
-def test_blender_folders_have_their_sizes_from_photos(tmp_path: Path) -> None:
+def test_blender_sizes_come_from_photos(tmp_path: Path) -> None:
     elsewhere = photos_of_blender(tmp_path)
     assert_close(read_cameras(CAPTURES / "blender", elsewhere), views())
     assert_close(read_cameras(CAPTURES / "blender", elsewhere / "train"), views())
@@ -104,7 +104,7 @@ def tmp_path_without_photos(folder: Path) -> Path:
     return folder / "empty"
 
 
-def test_sizes_are_never_looked_up_outside_of_the_photos(tmp_path: Path) -> None:
+def test_sizes_are_never_read_outside_the_photo_folder(tmp_path: Path) -> None:
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "secret.png")
     (tmp_path / "photos").mkdir()
     content = json.loads((CAPTURES / "blender" / "transforms_train.json").read_text())
@@ -117,7 +117,7 @@ def test_sizes_are_never_looked_up_outside_of_the_photos(tmp_path: Path) -> None
             read_cameras(file, tmp_path / "photos")
 
 
-def test_photos_reduced_by_2_belong_to_cameras_of_the_full_size(tmp_path: Path) -> None:
+def test_half_size_photos_match_full_size_cameras(tmp_path: Path) -> None:
     (tmp_path / "images_2").mkdir()
     for view in views():
         Image.new("RGB", (WIDTH // 2, HEIGHT // 2)).save(tmp_path / "images_2" / view.name)
@@ -129,14 +129,14 @@ def test_photos_reduced_by_2_belong_to_cameras_of_the_full_size(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse/1", "sparse", "colmap/sparse/0", "."])
-def test_layouts_of_colmap_projects(tmp_path: Path, place: str) -> None:
+def test_colmap_project_layouts_are_read(tmp_path: Path, place: str) -> None:
     shutil.copytree(CAPTURES / "metashape" / "sparse" / "0", tmp_path / "project" / place)
     for name in ("points3D.txt", "points3D.bin"):
         (tmp_path / "project" / place / name).unlink(missing_ok=True)
     assert_close(read_cameras(tmp_path / "project"), views())
 
 
-def test_the_first_model_and_the_own_transforms_of_a_project_come_first(tmp_path: Path) -> None:
+def test_project_prefers_its_first_model_and_own_transforms(tmp_path: Path) -> None:
     project = tmp_path / "project"
     shutil.copytree(CAPTURES / "metashape" / "sparse" / "0", project / "colmap" / "sparse" / "0")
     shutil.copy(CAPTURES / "nerfstudio" / "transforms.json", project)
@@ -152,7 +152,7 @@ def test_the_first_model_and_the_own_transforms_of_a_project_come_first(tmp_path
     assert [view.name for view in read_cameras(project)] == [view.name for view in views()]
 
 
-def test_a_rig_without_points_is_read(tmp_path: Path) -> None:
+def test_rig_capture_has_no_points_file(tmp_path: Path) -> None:
     names = {path.name for path in (CAPTURES / "colmap4_rig" / "sparse" / "0").iterdir()}
     assert names == {"cameras.bin", "images.bin", "rigs.bin", "frames.bin"}
 
@@ -172,7 +172,7 @@ def test_a_rig_without_points_is_read(tmp_path: Path) -> None:
         ("transforms_train.json", '[{"file_path": "a.png", "transform": []}]', "`ns-export cameras`.*no focal"),
     ],
 )  # fmt: skip
-def test_other_formats_name_the_way_out(tmp_path: Path, name: str, content: str, message: str) -> None:
+def test_unsupported_formats_suggest_a_conversion(tmp_path: Path, name: str, content: str, message: str) -> None:
     path = tmp_path / name
     path.write_text(content, encoding="utf-8")
     with pytest.raises(CameraError, match=rf"{name}: is .*{message}"):
@@ -189,7 +189,7 @@ def test_other_formats_name_the_way_out(tmp_path: Path, name: str, content: str,
         ("bundle.out", "Bundler"),
     ],
 )
-def test_folders_of_other_tools_name_the_way_out(tmp_path: Path, name: str, message: str) -> None:
+def test_unsupported_folders_suggest_a_conversion(tmp_path: Path, name: str, message: str) -> None:
     path = tmp_path / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("{}")
@@ -229,11 +229,11 @@ def test_damaged_files_are_read_or_refused_with_a_message(tmp_path: Path, name: 
                 assert 1 <= reduced.height <= view.height
 
 
-def test_names_alone_suggest_a_format() -> None:
+def test_file_name_suggests_a_format() -> None:
     assert advice_for_name("My Export.CSV").startswith(" It may be cameras of RealityCapture. ")
     assert advice_for_name("cameras.zip") == ""
 
 
-def test_a_pinhole_of_a_frame_overrides_the_lens_of_the_file() -> None:
+def test_frame_pinhole_overrides_the_files_lens() -> None:
     pinhole = read_cameras(CAPTURES / "frames")[1]
     assert pinhole == replace(pinhole, lens=None)

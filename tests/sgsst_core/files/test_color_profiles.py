@@ -76,7 +76,7 @@ def test_images_without_a_profile_or_in_srgb_are_bit_identical(tmp_path: Path, p
     assert torch.equal(image, expected.expand(24, 36, 3))
 
 
-def test_gray_of_8_and_16_bits_is_converted_alike(tmp_path: Path) -> None:
+def test_gray_of_8_and_16_bits_is_converted_equally(tmp_path: Path) -> None:
     profile = gray_profile(1.8)
     steps = np.arange(256, dtype="u1")[None]
     narrow = load_image(save(tmp_path / "a.png", steps, profile))
@@ -89,14 +89,14 @@ def test_gray_of_8_and_16_bits_is_converted_alike(tmp_path: Path) -> None:
     assert len(image[:, :, 0].unique()) > 30_000
 
 
-def test_an_rgb_profile_applies_to_gray_pixels(tmp_path: Path) -> None:
+def test_rgb_profile_applies_to_gray_pixels(tmp_path: Path) -> None:
     steps = np.arange(256, dtype="u1")[None]
     gray = load_image(save(tmp_path / "a.png", steps, rgb_profile(*PROPHOTO)))
     same = load_image(save(tmp_path / "b.png", np.repeat(steps[:, :, None], 3, axis=2), rgb_profile(*PROPHOTO)))
     assert torch.equal(gray, same)
 
 
-def test_transparent_and_palette_images_are_converted_before_they_are_composited(tmp_path: Path) -> None:
+def test_transparent_and_palette_images_are_converted_before_compositing(tmp_path: Path) -> None:
     profile = rgb_profile(*DISPLAY_P3)
     opaque = load_image(save(tmp_path / "a.png", colors(), profile))
     rgba = np.dstack([colors(), np.full((24, 36), 255, "u1")])
@@ -148,11 +148,11 @@ def test_unusable_profiles_are_ignored_with_a_warning(tmp_path: Path, name: str)
     with pytest.warns(ImageWarning, match=rf"a\.tif: its color profile is ignored, because it {reason}"):
         image = load_image(path)
     assert torch.equal(image, torch.from_numpy(colors()).float() / 255)
-    told: list[str] = []
+    messages: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        load_image(path, warn=told.append)
-    assert len(told) == 1
+        load_image(path, warn=messages.append)
+    assert len(messages) == 1
 
 
 def test_floating_point_conversions_are_not_used() -> None:
@@ -225,7 +225,7 @@ FILES: dict[str, Callable[[Path], Path]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
-def test_colors_are_those_of_imagemagick(tmp_path: Path, name: str) -> None:
+def test_colors_match_imagemagick(tmp_path: Path, name: str) -> None:
     program = shutil.which("convert-im6.q16") or shutil.which("magick")
     if program is None:
         pytest.skip("ImageMagick is not installed: apt-get install imagemagick")

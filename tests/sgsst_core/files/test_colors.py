@@ -14,7 +14,7 @@ from sgsst_core.files import colors
 from sgsst_core.files.colors import write_colors
 
 
-def test_colors_come_back_within_their_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colors_round_trip_within_the_error_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(colors, "_BLOCK_ROWS", 100)
     generator = torch.Generator().manual_seed(1)
     size = torch.rand(1003, 3, generator=generator) * 14 - 9  # from 1e-9 to 1e5
@@ -36,7 +36,7 @@ def test_colors_between_black_and_white_keep_their_gray_level(tmp_path: Path) ->
     assert 255 * np.abs(found - levels.numpy()).max() < 0.04
 
 
-def test_a_scene_without_gaussians_and_a_place_without_a_folder(tmp_path: Path) -> None:
+def test_empty_scene_is_written_and_missing_folder_is_an_error(tmp_path: Path) -> None:
     write_colors(tmp_path / "c", torch.zeros(0, 3))
     assert (tmp_path / "c").read_bytes() == b""
     with pytest.raises(OutputError):

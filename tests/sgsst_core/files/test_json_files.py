@@ -11,18 +11,18 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.json_files import json_numbers, write_json
 
 
-def test_a_name_that_is_not_unicode_is_json_all_the_same(tmp_path: Path) -> None:
+def test_non_unicode_names_are_written_as_json(tmp_path: Path) -> None:
     write_json(tmp_path / "r.json", {"path": "caf\udce9.ply"})
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8")) == {"path": "caf\udce9.ply"}
 
 
-def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:
+def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         write_json(tmp_path / "missing" / "r.json", {})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_numbers_are_numbers() -> None:
+def test_numbers_are_accepted() -> None:
     assert json_numbers([1, 2.5, 10**30], 3).tolist() == [1, 2.5, 1e30]
     assert json_numbers(7, 1).tolist() == [7]
     assert math.isnan(json_numbers([None], 1)[0])
@@ -31,6 +31,6 @@ def test_numbers_are_numbers() -> None:
 @pytest.mark.parametrize(
     "values", [[], [1], [1, 2, 3], ["1_0", 2], [True, 2], [[1], [2]], [{}, 2], "12", {"a": 1, "b": 2}]
 )
-def test_other_values_are_no_numbers(values: Any) -> None:
+def test_other_values_are_refused(values: Any) -> None:
     with pytest.raises(ValueError, match="in place of 2 numbers"):
         json_numbers(values, 2)

@@ -46,13 +46,13 @@ def paths(found: list[Photo | None]) -> list[Path]:
         ("frame.0001.jpg", "frame.0001.jpg"),
     ],
 )
-def test_photos_are_found_by_name(tmp_path: Path, file: str, name: str) -> None:
+def test_photos_are_matched_by_name(tmp_path: Path, file: str, name: str) -> None:
     save(tmp_path / "other.jpg", Image.new("RGB", (90, 60)))
     path = save(tmp_path / file, Image.new("RGB", (180, 120)))
     assert paths(check_photos(tmp_path, [camera(name)])) == [path]
 
 
-def test_photos_of_a_rig_are_told_apart_by_folder_and_by_extension(tmp_path: Path) -> None:
+def test_rig_photos_are_matched_by_folder_and_extension(tmp_path: Path) -> None:
     for name in ("cam0/a.png", "cam1/a.png", "cam1/a.jpg", "b.png", "old/b.png"):
         save(tmp_path / name, Image.new("RGB", (90, 60)))
     names = ["cam1/a.png", "images/cam0/a", "cam1/a.jpg", "b.png"]
@@ -73,7 +73,7 @@ def test_missing_photos_are_named(tmp_path: Path) -> None:
         check_photos(tmp_path / "v03.png", cameras)
 
 
-def test_photos_of_another_aspect_are_refused_early_and_late(tmp_path: Path) -> None:
+def test_photos_with_another_aspect_ratio_are_refused(tmp_path: Path) -> None:
     path = save(tmp_path / "a.png", Image.new("RGB", (93, 60)))
     for check in (
         lambda: check_photos(tmp_path, [camera("a")]),
@@ -96,18 +96,18 @@ def oriented(folder: Path, orientation: int, size: tuple[int, int]) -> Path:
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_exif_orientation_is_ignored_where_the_stored_photo_fits_its_camera(tmp_path: Path, orientation: int) -> None:
+def test_exif_orientation_is_ignored_if_the_stored_photo_fits(tmp_path: Path, orientation: int) -> None:
     path = oriented(tmp_path, orientation, (90, 60))
     (photo,) = check_photos(tmp_path, [camera("a")])
     assert photo == Photo(path, (90, 60), oriented=False, ambiguous=orientation == 3)
     assert photo
     assert float(load_photo(photo, camera("a"))[:, 60:].min()) == 1
-    turned = load_photo(Photo(path, (90, 60), oriented=True), camera("a")) if orientation == 3 else None
-    assert turned is None or float(turned[:, :30].min()) == 1
+    rotated = load_photo(Photo(path, (90, 60), oriented=True), camera("a")) if orientation == 3 else None
+    assert rotated is None or float(rotated[:, :30].min()) == 1
 
 
 @pytest.mark.parametrize(("orientation", "white"), [(6, slice(40, 60)), (8, slice(0, 20))])
-def test_exif_orientation_is_applied_where_only_the_rotated_photo_fits(
+def test_exif_orientation_is_applied_if_only_the_rotated_photo_fits(
     tmp_path: Path, orientation: int, white: slice
 ) -> None:
     path = oriented(tmp_path, orientation, (60, 90))
@@ -119,13 +119,13 @@ def test_exif_orientation_is_applied_where_only_the_rotated_photo_fits(
     assert float(pixels[white].min()) == 1  # the stored right side: 6 turns it down, and 8 up
 
 
-def test_broken_photos_are_noticed_early(tmp_path: Path) -> None:
+def test_broken_photos_are_detected_early(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(b"no photo")
     with pytest.raises(ImageError, match=r"a\.jpg: is not an image"):
         check_photos(tmp_path, [camera("a")])
 
 
-def test_photos_come_at_their_cameras_size_without_aliasing(tmp_path: Path) -> None:
+def test_photos_are_resized_to_the_camera_without_aliasing(tmp_path: Path) -> None:
     stripes = np.zeros((120, 180, 3), dtype="u1")
     stripes[:, ::2] = 255
     photo = Photo(save(tmp_path / "a.png", Image.fromarray(stripes)), (180, 120))
@@ -140,7 +140,7 @@ def test_photos_come_at_their_cameras_size_without_aliasing(tmp_path: Path) -> N
     assert float(large.max()) <= 1
 
 
-def test_real_photos_belong_to_their_cameras(shared_data: Path) -> None:
+def test_real_photos_match_their_cameras(shared_data: Path) -> None:
     photos = shared_data / "photos" / "snowmiku_plush"
     cameras = read_cameras(photos / "cameras.json")
     found = check_photos(photos / "images", cameras)

@@ -156,9 +156,7 @@ def files(draw: st.DrawFn) -> File:
 
 @settings(max_examples=120, deadline=None, suppress_health_check=list(HealthCheck))
 @given(files(), st.floats(-50, 50, width=32))
-def test_any_3dgs_ply_comes_back_with_new_colors_and_nothing_else_changed(
-    tmp_path_factory: pytest.TempPathFactory, file: File, shift: float
-) -> None:
+def test_only_colors_of_any_3dgs_ply_change(tmp_path_factory: pytest.TempPathFactory, file: File, shift: float) -> None:
     folder = tmp_path_factory.mktemp("ply")
     source = read_scene(save(folder, file))
     _, kinds, rows = next(element for element in file.elements if element[0] == "vertex")
@@ -193,9 +191,7 @@ def test_any_3dgs_ply_comes_back_with_new_colors_and_nothing_else_changed(
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("block", [1, 2, 1 << 16])
-def test_only_the_bytes_of_the_colors_change(
-    tmp_path: Path, form: str, block: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_color_bytes_change(tmp_path: Path, form: str, block: int, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (scene_file, stylized_ply):
         monkeypatch.setattr(module, "BLOCK_ROWS", block)
     file = simple(5, degree=1, form=form)
@@ -219,7 +215,7 @@ def test_only_the_bytes_of_the_colors_change(
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("dropped", [False, True])
-def test_a_cut_gaussian_has_a_row_for_each_part_with_all_that_its_row_held(
+def test_children_of_split_gaussians_inherit_all_properties(
     tmp_path: Path, form: str, dropped: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (scene_file, stylized_ply):
@@ -256,7 +252,7 @@ def test_a_cut_gaussian_has_a_row_for_each_part_with_all_that_its_row_held(
             assert row["y"] == parent["y"], "what is not cut keeps its double precision"
 
 
-def test_shapes_that_are_stored_as_integers_cannot_be_cut(tmp_path: Path) -> None:
+def test_scales_stored_as_integers_cannot_be_split(tmp_path: Path) -> None:
     file = simple(2, scale_1=-3)
     properties = file.elements[0][1]
     properties[properties.index(("float", "scale_1"))] = ("char", "scale_1")
@@ -266,21 +262,21 @@ def test_shapes_that_are_stored_as_integers_cannot_be_cut(tmp_path: Path) -> Non
         source.refined(Refinement(pieces, 1, 4))
 
 
-def test_unchanged_colors_give_the_same_bytes(tmp_path: Path) -> None:
+def test_unchanged_colors_write_the_same_bytes(tmp_path: Path) -> None:
     text = simple(form="ascii").to_bytes().replace(b"  ", b"\t ").replace(b"0.03", b"+.30e-1")
     source = read_scene(save(tmp_path, text))
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
     assert (tmp_path / "out.ply").read_bytes() == text
 
 
-def test_the_source_itself_may_be_the_target(tmp_path: Path) -> None:
+def test_source_can_be_overwritten(tmp_path: Path) -> None:
     source = read_scene(save(tmp_path, simple()))
     write_stylized(source, source.path, torch.zeros(3, 3))
     assert not read_scene(source.path).scene.sh_dc.any()
     assert os.listdir(tmp_path) == ["scene.ply"]
 
 
-def test_a_source_that_was_changed_meanwhile_is_refused(tmp_path: Path) -> None:
+def test_source_changed_since_reading_is_refused(tmp_path: Path) -> None:
     source = read_scene(save(tmp_path, simple()))
     save(tmp_path, simple(4))
     with pytest.raises(SceneError, match="was changed after it was read"):
@@ -288,7 +284,7 @@ def test_a_source_that_was_changed_meanwhile_is_refused(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["scene.ply"]
 
 
-def test_colors_that_cannot_be_right_are_refused(tmp_path: Path) -> None:
+def test_invalid_colors_are_refused(tmp_path: Path) -> None:
     source = read_scene(save(tmp_path, simple()))
     for wrong in (torch.zeros(2, 3), torch.full((3, 3), torch.nan)):
         with pytest.raises(ValueError, match="sh_dc must be finite"):
@@ -298,7 +294,7 @@ def test_colors_that_cannot_be_right_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_non_finite_values_are_counted_by_property_and_may_be_dropped(tmp_path: Path, form: str) -> None:
+def test_non_finite_values_are_counted_by_property_or_dropped(tmp_path: Path, form: str) -> None:
     file = simple(5, degree=1, form=form)
     file.elements.append(("after", [("uchar", "a")], [{"a": 3}]))
     rows = file.elements[0][2]
@@ -318,7 +314,7 @@ def test_non_finite_values_are_counted_by_property_and_may_be_dropped(tmp_path: 
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_infinite_opacities_are_read_as_those_of_compressed_formats_and_kept(tmp_path: Path, form: str) -> None:
+def test_infinite_opacities_are_clamped_and_preserved_in_the_file(tmp_path: Path, form: str) -> None:
     file = simple(5, form=form)
     file.elements[0][2][1]["opacity"], file.elements[0][2][3]["opacity"] = float("inf"), float("-inf")
     source = read_scene(save(tmp_path, file))
@@ -330,13 +326,13 @@ def test_infinite_opacities_are_read_as_those_of_compressed_formats_and_kept(tmp
     assert [rows[1]["opacity"], rows[3]["opacity"]] == [float("inf"), float("-inf")]
 
 
-def test_a_scene_without_any_finite_gaussian_is_refused(tmp_path: Path) -> None:
+def test_scene_without_finite_gaussians_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="No valid Gaussians remain"):
         read_scene(save(tmp_path, simple(x=float("nan"))), drop_invalid=True)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_a_quaternion_of_length_0_is_refused_by_its_row_and_may_be_dropped(tmp_path: Path, form: str) -> None:
+def test_zero_quaternions_are_refused_by_row_or_dropped(tmp_path: Path, form: str) -> None:
     file = simple(5, form=form)
     rotation = [f"rot_{i}" for i in range(4)]
     file.elements[0][1][:] = [("double" if name in rotation else kind, name) for kind, name in file.elements[0][1]]
@@ -357,7 +353,7 @@ def test_a_quaternion_of_length_0_is_refused_by_its_row_and_may_be_dropped(tmp_p
     assert bool(source.scene.quats.any(dim=1).all())
 
 
-def test_a_double_beyond_float32_counts_as_infinite(tmp_path: Path) -> None:
+def test_double_beyond_float32_counts_as_infinite(tmp_path: Path) -> None:
     file = simple(2)
     file.elements[0][1][0] = ("double", "x")
     file.elements[0][2][0]["x"] = 1e300
@@ -365,7 +361,7 @@ def test_a_double_beyond_float32_counts_as_infinite(tmp_path: Path) -> None:
         read_scene(save(tmp_path, file))
 
 
-def test_non_finite_values_in_extra_properties_do_not_matter(tmp_path: Path) -> None:
+def test_non_finite_values_in_extra_properties_are_ignored(tmp_path: Path) -> None:
     file = simple(2)
     file.elements[0][1].append(("float", "nx"))
     for row in file.elements[0][2]:
@@ -429,7 +425,7 @@ GAUSSIAN = [f"property float {name}" for name in BASE]
         ),
     ],
 )
-def test_what_is_no_3dgs_scene_is_refused_with_the_reason(tmp_path: Path, data: bytes, message: str) -> None:
+def test_invalid_scenes_are_refused_with_the_reason(tmp_path: Path, data: bytes, message: str) -> None:
     path = save(tmp_path, data)
     with pytest.raises(SceneError, match=message) as caught:
         read_scene(path)
@@ -445,9 +441,7 @@ def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("element", ["vertex", "face", "other"])
-def test_a_header_that_declares_more_than_the_file_holds_never_allocates(
-    tmp_path: Path, form: str, element: str
-) -> None:
+def test_header_beyond_the_file_size_never_allocates(tmp_path: Path, form: str, element: str) -> None:
     file = simple(3, form=form)
     file.elements += [
         ("face", [("list uchar int", "i")], [{"i": [1, 2]}]),
@@ -464,7 +458,7 @@ def test_a_header_that_declares_more_than_the_file_holds_never_allocates(
     assert peak < 8 << 20
 
 
-def test_a_list_that_declares_more_than_the_file_holds_never_allocates(tmp_path: Path) -> None:
+def test_list_beyond_the_file_size_never_allocates(tmp_path: Path) -> None:
     file = simple(1)
     file.elements.insert(0, ("face", [("list uint32 double", "i")], [{"i": [1.0]}]))
     data = file.to_bytes()
@@ -478,7 +472,7 @@ def test_a_list_that_declares_more_than_the_file_holds_never_allocates(tmp_path:
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_every_truncation_is_noticed(tmp_path: Path, form: str) -> None:
+def test_every_truncation_is_detected(tmp_path: Path, form: str) -> None:
     file = simple(2, form=form)
     file.elements += [("face", [("list uchar int", "i"), ("float", "q")], [{"i": [1, 2], "q": 0.5}])]
     data = file.to_bytes()
@@ -491,13 +485,13 @@ def test_every_truncation_is_noticed(tmp_path: Path, form: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new"), [(b"0.03", b"wrong"), (b"0.03", b"0.03 1.5"), (b"0.03", b"\xff"), (b"0.03", b"1_0")]
 )
-def test_text_that_is_no_number_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
+def test_non_numeric_text_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
     with pytest.raises(SceneError, match="cannot be read as PLY"):
         read_scene(save(tmp_path, simple(form="ascii").to_bytes().replace(old, new)))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_written_scene_reads_back(tmp_path: Path, degree: int) -> None:
+def test_written_scene_round_trips(tmp_path: Path, degree: int) -> None:
     generator = torch.Generator().manual_seed(1)
     shapes = {"means": (7, 3), "quats": (7, 4), "scales": (7, 3), "opacities": (7,), "sh_dc": (7, 3)}
     shapes["sh_rest"] = (7, (degree + 1) ** 2 - 1, 3)
@@ -510,7 +504,7 @@ def test_a_written_scene_reads_back(tmp_path: Path, degree: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["biker", "snowmiku_plush", "playbot_synthetic_sh2"])
-def test_real_scenes_differ_in_their_colors_only(shared_data: Path, tmp_path: Path, name: str) -> None:
+def test_stylized_real_scenes_differ_only_in_colors(shared_data: Path, tmp_path: Path, name: str) -> None:
     path = shared_data / "scenes" / name / "point_cloud.ply"
     source = read_scene(path)
     colors = source.scene.sh_dc.flip(0) + 0.25

@@ -21,7 +21,7 @@ from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.splat_scenes import cloud
 
-FADES = (1e-9, 0.25, 0.7, 1.0)
+ATTENUATIONS = (1e-9, 0.25, 0.7, 1.0)
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,7 @@ def written(folder: Path, degree: int = 3) -> Path:
     return folder / "scene.ply"
 
 
-def in_another_form(path: Path, form: str) -> Path:
+def in_another_encoding(path: Path, form: str) -> Path:
     """Write the same scene as ASCII, as big-endian, with doubles, or with another property between the coefficients."""
     vertices = PlyData.read(path)["vertex"].data
     kinds = [(name, "<f8" if form == "doubles" and "rest" in name else "<f4") for name in vertices.dtype.names]
@@ -54,11 +54,11 @@ def in_another_form(path: Path, form: str) -> Path:
 
 
 @pytest.mark.parametrize("form", ["plain", "text", "big", "doubles", "mixed up"])
-@pytest.mark.parametrize("attenuation", FADES)
-def test_the_file_holds_what_a_job_works_with(tmp_path: Path, form: str, attenuation: float) -> None:
+@pytest.mark.parametrize("attenuation", ATTENUATIONS)
+def test_file_contains_the_attenuated_coefficients(tmp_path: Path, form: str, attenuation: float) -> None:
     path = written(tmp_path)
     if form != "plain":
-        path = in_another_form(path, form)
+        path = in_another_encoding(path, form)
     source = read_scene(path)
     wanted = source.scene.attenuated(attenuation)
     colors = source.scene.sh_dc + 1
@@ -79,7 +79,7 @@ def test_the_file_holds_what_a_job_works_with(tmp_path: Path, form: str, attenua
             assert np.array_equal(before[name], after[name])
 
 
-def test_without_fading_every_byte_stays(tmp_path: Path) -> None:
+def test_file_is_bit_identical_without_attenuation(tmp_path: Path) -> None:
     source = read_scene(written(tmp_path))
     for name, values in (("a", {}), ("b", {"sh_attenuation": 0.0}), ("c", {"sh_attenuation": 1e-9})):
         write_stylized(source, tmp_path / f"{name}.ply", source.scene.sh_dc, **values)
@@ -87,8 +87,8 @@ def test_without_fading_every_byte_stays(tmp_path: Path) -> None:
     assert source.scene.attenuated(0) is source.scene
 
 
-@pytest.mark.parametrize("attenuation", FADES)
-def test_coefficients_in_the_file_are_those_in_memory(tmp_path: Path, attenuation: float) -> None:
+@pytest.mark.parametrize("attenuation", ATTENUATIONS)
+def test_stored_coefficients_match_those_in_memory(tmp_path: Path, attenuation: float) -> None:
     path = written(tmp_path)
     stored, plain = (read_scene(path, held_bytes=limit).scene.attenuated(attenuation) for limit in (0, None))
     assert isinstance(plain.sh_rest, Tensor)
@@ -105,7 +105,7 @@ def test_coefficients_in_the_file_are_those_in_memory(tmp_path: Path, attenuatio
     assert stored.used_degree() == 3
 
 
-def test_rows_that_were_dropped_are_absent_and_the_others_fade(tmp_path: Path) -> None:
+def test_dropped_rows_are_absent_and_others_are_attenuated(tmp_path: Path) -> None:
     scene = cloud(60, degree=2)
     scene.means[5] = torch.nan
     write_scene(tmp_path / "scene.ply", scene)
@@ -116,21 +116,21 @@ def test_rows_that_were_dropped_are_absent_and_the_others_fade(tmp_path: Path) -
     assert torch.equal(held(found.sh_rest), held(source.scene.sh_rest) * 0.5)
 
 
-def test_a_scene_of_degree_0_has_nothing_to_fade(tmp_path: Path) -> None:
+def test_attenuation_ignores_scenes_of_degree_0(tmp_path: Path) -> None:
     source = read_scene(written(tmp_path, degree=0))
     assert source.scene.attenuated(0.5) is source.scene
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
     assert (tmp_path / "out.ply").read_bytes() == source.path.read_bytes()
 
 
-def test_packed_scenes_fade_into_their_ply(tmp_path: Path) -> None:
+def test_compressed_scenes_are_attenuated_in_their_ply(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene.spz", cloud(60, degree=1), SPZ)
     source = read_scene(tmp_path / "scene.spz")
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.25)
     assert torch.equal(held(read_scene(tmp_path / "out.ply").scene.sh_rest), held(source.scene.sh_rest) * 0.75)
 
 
-def test_whole_numbers_cannot_fade(tmp_path: Path) -> None:
+def test_integer_coefficients_cannot_be_attenuated(tmp_path: Path) -> None:
     vertices = PlyData.read(written(tmp_path, 1))["vertex"].data
     kinds = [(name, "i4" if "rest" in name else "<f4") for name in vertices.dtype.names]
     PlyData([PlyElement.describe(vertices.astype(kinds), "vertex")], byte_order="<").write(tmp_path / "whole.ply")
@@ -140,7 +140,7 @@ def test_whole_numbers_cannot_fade(tmp_path: Path) -> None:
         write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
 
 
-def test_the_factor_is_a_float32() -> None:
+def test_attenuation_factor_is_a_float32() -> None:
     assert attenuation_factor(0) == 1
     assert attenuation_factor(1) == 0
     assert np.float32(attenuation_factor(0.3)) == attenuation_factor(0.3)

@@ -60,7 +60,7 @@ def test_only_colors_of_a_checkpoint_change(tmp_path: Path, write: Any) -> None:
     assert same(load_scene(tmp_path / "out.pt").scene, result.scene)
 
 
-def test_a_checkpoint_is_saved_as_a_scene_file_too(tmp_path: Path) -> None:
+def test_checkpoint_can_be_saved_as_a_scene_file(tmp_path: Path) -> None:
     found = load_scene(write_nerfstudio(tmp_path / "given.ckpt", wall(sh_degree=1)))
     save(tmp_path / "out.ply", found)
     assert same(read_scene(tmp_path / "out.ply").scene, wall(sh_degree=1))
@@ -156,7 +156,7 @@ def test_activated_values_are_detected() -> None:
     assert scene_of_splats(opaque).sh_degree == 0
 
 
-def test_values_of_which_only_some_are_activated_are_refused() -> None:
+def test_partly_activated_values_are_refused() -> None:
     scene = wall()
     for logits, scales in ((scene.opacities.sigmoid(), scene.scales), (scene.opacities, scene.scales.exp())):
         with pytest.raises(SceneError, match="logarithms and logits as gsplat's trainers keep them"):

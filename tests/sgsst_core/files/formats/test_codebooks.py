@@ -12,7 +12,7 @@ def error(rows: np.ndarray, found: np.ndarray) -> float:
     return float(((rows.astype(np.float64) - found) ** 2).mean())
 
 
-def test_few_distinct_values_are_held_exactly() -> None:
+def test_few_distinct_values_are_stored_exactly() -> None:
     values = np.random.default_rng(0).integers(-100, 100, (500, 3)).astype(np.float32) / 7
     codebook = value_codebook(values)
     assert len(codebook) == VALUES
@@ -34,7 +34,7 @@ def test_values_get_their_nearest_entry_and_a_small_error() -> None:
     assert error(values, wide[labels]) < 1.05 * error(values, reference[other, 0])
 
 
-def test_few_distinct_rows_are_held_exactly() -> None:
+def test_few_distinct_rows_are_stored_exactly() -> None:
     generator = np.random.default_rng(2)
     rows = generator.normal(size=(300, 9)).astype(np.float32)[generator.integers(0, 300, 5000)]
     vectors, labels = palette(rows, 1024)

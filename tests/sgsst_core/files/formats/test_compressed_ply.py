@@ -31,7 +31,7 @@ from tests.small_scenes import wall
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_file_of_gsply_is_read_as_gsply_reads_it(tmp_path: Path, degree: int) -> None:
+def test_gsply_files_are_read_as_by_gsply(tmp_path: Path, degree: int) -> None:
     path = tmp_path / "scene.ply"
     data = gsply_of(cloud(700, degree=degree))
     write_compressed(path, data.means, data.scales, data.quats, data.opacities, data.sh0, data.shN)
@@ -47,7 +47,7 @@ def test_file_of_gsply_is_read_as_gsply_reads_it(tmp_path: Path, degree: int) ->
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gsply_reads_what_is_written(tmp_path: Path, degree: int) -> None:
+def test_gsply_reads_written_files(tmp_path: Path, degree: int) -> None:
     path = tmp_path / "scene"
     write_scene(path, cloud(700, degree=degree), COMPRESSED_PLY)
     found = read_scene(path).scene
@@ -55,7 +55,7 @@ def test_gsply_reads_what_is_written(tmp_path: Path, degree: int) -> None:
     assert_close(found, scene_of(read_compressed(path)))
 
 
-def test_bounds_without_colors(tmp_path: Path) -> None:
+def test_files_without_color_bounds_are_read(tmp_path: Path) -> None:
     """Compressed PLYs of older versions have colors between 0 and 1."""
     path = tmp_path / "scene.ply"
     scene = replace(wall(), sh_dc=torch.zeros(616, 3))

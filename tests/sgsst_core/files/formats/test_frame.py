@@ -28,13 +28,13 @@ def applied(frame: Frame, scene: Scene) -> Scene:
     return Scene(*(torch.from_numpy(array) for array in arrays.values()))
 
 
-def test_basis_is_that_of_the_renderer() -> None:
+def test_basis_matches_the_renderer() -> None:
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1)
     torch.testing.assert_close(torch.from_numpy(basis(directions.numpy())), spherical_harmonics.basis(directions, 3))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.3])
-def test_transformed_scene_looks_the_same_to_a_transformed_camera(scale: float) -> None:
+def test_transformed_scene_and_camera_give_the_same_image(scale: float) -> None:
     scene, view = cloud(300, degree=3), camera(90, 70)
     moved = matrix(scale)
     pose = view.world_to_camera.clone()

@@ -87,7 +87,7 @@ def read(tmp_path: Path, data: bytes) -> Any:
     return read_scene(tmp_path / "scene").scene
 
 
-def test_values_computed_by_hand(tmp_path: Path) -> None:
+def test_values_match_those_computed_by_hand(tmp_path: Path) -> None:
     scene = read(tmp_path, by_hand())
     assert scene.means.tolist() == [[-1, -2, 3], [1, 0, 5]]
     half = 32767 / 65535
@@ -99,7 +99,7 @@ def test_values_computed_by_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_written_values_come_back(tmp_path: Path, degree: int) -> None:
+def test_written_values_round_trip(tmp_path: Path, degree: int) -> None:
     scene = cloud(500, degree=degree)
     write_scene(tmp_path / "scene.glb", scene, GLB)
     found = read_scene(tmp_path / "scene.glb").scene
@@ -109,7 +109,7 @@ def test_written_values_come_back(tmp_path: Path, degree: int) -> None:
     torch.testing.assert_close(found.opacities, scene.opacities, rtol=1e-5, atol=1e-2)
 
 
-def test_document_is_that_of_the_specification(tmp_path: Path) -> None:
+def test_document_follows_the_specification(tmp_path: Path) -> None:
     document, data = split(encoded(tmp_path, GLB, degree=1))
     primitive = document["meshes"][0]["primitives"][0]
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
@@ -148,8 +148,8 @@ def test_extreme_sizes_and_opacities_are_written_finite(tmp_path: Path) -> None:
     assert found.scene.opacities.abs().amin() > 16
 
 
-def test_transformations_of_nodes_are_applied(tmp_path: Path) -> None:
-    """A quarter turn about x, with a parent that scales and translates, in both notations."""
+def test_node_transformations_are_applied(tmp_path: Path) -> None:
+    """A node is rotated by 90 degrees about x, with a parent that scales and translates, in both notations."""
     turn = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
     parent = {"children": [1], "scale": [2, 2, 2], "translation": [10, 0, 0]}
     whole = [2, 0, 0, 0, 0, 0, 2, 0, 0, -2, 0, 0, 10, 0, 0, 1]
@@ -170,7 +170,7 @@ def test_infinite_opacities_are_clamped(tmp_path: Path) -> None:
     assert bool(torch.isfinite(file.scene.opacities).all())
 
 
-def test_only_the_header_is_read_for_the_checks(tmp_path: Path) -> None:
+def test_checks_read_only_the_header(tmp_path: Path) -> None:
     document, data = split(encoded(tmp_path, GLB))
     (tmp_path / "scene").write_bytes(joined(document, bytes(len(data))))
     assert read_scene_header(tmp_path / "scene").count == 616
@@ -242,7 +242,7 @@ def test_false_file_is_refused(tmp_path: Path, data: bytes, message: str) -> Non
     refused(tmp_path, data, message, "scene.glb")
 
 
-def test_wrong_values_anywhere_in_the_document_are_refused(tmp_path: Path) -> None:
+def test_wrong_document_values_are_refused(tmp_path: Path) -> None:
     placed = {"mesh": 0, "translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
     document, data = split(by_hand(nodes=[placed]))
     check_documents(tmp_path / "scene", document, lambda changed: joined(changed, data))

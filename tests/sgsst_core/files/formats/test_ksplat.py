@@ -32,7 +32,7 @@ def read(tmp_path: Path, data: bytes) -> Scene:
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_all_levels(tmp_path: Path, level: int, degree: int) -> None:
+def test_all_compression_levels_are_read(tmp_path: Path, level: int, degree: int) -> None:
     expected = scene(degree)
     found = read(tmp_path, ksplat(expected, level))
     assert found.sh_degree == degree
@@ -45,7 +45,7 @@ def test_all_levels(tmp_path: Path, level: int, degree: int) -> None:
     assert_close(colors, expected, others=1e-3 if level else 1e-6)
 
 
-def test_values_computed_by_hand(tmp_path: Path) -> None:
+def test_values_match_those_computed_by_hand(tmp_path: Path) -> None:
     """Two Gaussians in two buckets of a level 1 file: the first one is full, the second one holds one of two."""
     head = struct.pack("<4BIIIIH", 0, 1, 0, 0, 1, 1, 2, 2, 1).ljust(4096, b"\0")
     section = struct.pack("<IIIIfHxxIIIIH", 2, 4, 1, 2, 8.0, 12, 4, 0, 1, 1, 0).ljust(1024, b"\0")
@@ -61,7 +61,7 @@ def test_values_computed_by_hand(tmp_path: Path) -> None:
     torch.testing.assert_close(found.opacities[0].sigmoid(), torch.tensor(128 / 255))
 
 
-def test_sections_of_different_degree(tmp_path: Path) -> None:
+def test_sections_of_different_sh_degree_are_read(tmp_path: Path) -> None:
     """Missing SH coefficients are 0; empty sections are skipped."""
     parts = scene(2, 300), scene(0, 200)
     one, other = (ksplat(part, 1) for part in parts)
@@ -111,7 +111,7 @@ def test_false_file_is_refused(tmp_path: Path, data: bytes, message: str) -> Non
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_random_damage_never_breaks_the_reader(tmp_path: Path, level: int) -> None:
+def test_random_damage_never_crashes_the_reader(tmp_path: Path, level: int) -> None:
     good = ksplat(scene(1, 60), level)
     check_damage(tmp_path / "scene", good)
     # the headers are mostly empty, so that changes in their fields are made on their own

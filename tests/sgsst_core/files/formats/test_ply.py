@@ -19,7 +19,7 @@ from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.splat_scenes import cloud
 
 
-def test_written_ply_is_that_of_plyfile(tmp_path: Path) -> None:
+def test_written_ply_is_bit_identical_to_plyfile(tmp_path: Path) -> None:
     """The file is bit-identical to plyfile's."""
     scene, path, other = cloud(300, degree=2), tmp_path / "a.ply", tmp_path / "b.ply"
     write_scene(path, scene)
@@ -57,7 +57,7 @@ def rgb_columns(scene: Scene) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_8_bit_colors_of_nerfstudio(tmp_path: Path, text: bool) -> None:
+def test_8_bit_colors_of_nerfstudio_are_read(tmp_path: Path, text: bool) -> None:
     """`ns-export gaussian-splat --ply-color-mode rgb` writes no f_dc_*; the stylized PLY has them."""
     scene, path, out = cloud(200), tmp_path / "splat.ply", tmp_path / "out.ply"
     scene = replace(scene, sh_dc=scene.sh_dc.clamp(-1.5, 1.5))
@@ -74,7 +74,7 @@ def test_8_bit_colors_of_nerfstudio(tmp_path: Path, text: bool) -> None:
 
 
 @pytest.mark.parametrize("name", ["scale", "scale_0"])
-def test_isotropic_scales(tmp_path: Path, name: str) -> None:
+def test_isotropic_scales_are_read(tmp_path: Path, name: str) -> None:
     scene, path, out = cloud(200, degree=1), tmp_path / "scene.ply", tmp_path / "out.ply"
     columns = {key: values for key, values in table(scene).items() if "scale" not in key}
     save(path, columns | {name: scene.scales[:, 1].numpy()})
@@ -85,7 +85,7 @@ def test_isotropic_scales(tmp_path: Path, name: str) -> None:
     assert torch.equal(read_scene(out).scene.scales, file.scene.scales)
 
 
-def test_two_scales_are_not_one(tmp_path: Path) -> None:
+def test_two_of_three_scales_are_refused(tmp_path: Path) -> None:
     columns = table(cloud(20))
     del columns["scale_2"]
     columns["scale"] = columns["scale_0"]
@@ -96,7 +96,7 @@ def test_two_scales_are_not_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stored", [False, True])
 @pytest.mark.parametrize("text", [False, True])
-def test_sh_degree_4_is_drawn_up_to_3_and_kept(tmp_path: Path, text: bool, stored: bool) -> None:
+def test_sh_degree_4_is_rendered_up_to_3_and_preserved(tmp_path: Path, text: bool, stored: bool) -> None:
     scene, path, out = cloud(150, degree=3), tmp_path / "scene.ply", tmp_path / "out.ply"
     more = torch.randn(150, 9, 3, generator=torch.Generator().manual_seed(1))
     whole = torch.cat([held(scene.sh_rest), more], dim=1)
@@ -114,7 +114,7 @@ def test_sh_degree_4_is_drawn_up_to_3_and_kept(tmp_path: Path, text: bool, store
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_8_bit_colors_beside_coefficients_follow_them(tmp_path: Path, text: bool) -> None:
+def test_8_bit_colors_follow_changed_coefficients(tmp_path: Path, text: bool) -> None:
     scene, path, out = cloud(100), tmp_path / "scene.ply", tmp_path / "out.ply"
     save(path, table(scene) | rgb_columns(scene) | {"label": np.arange(100, dtype="u1")}, text)
     new = torch.rand(100, 3) * 4 - 2

@@ -53,7 +53,7 @@ def test_content_matches_one_format(tmp_path: Path, format: SceneFormat) -> None
 
 
 @pytest.mark.parametrize("format", EXTRA_FORMATS, ids=lambda format: format.name)
-def test_scene_of_any_format_becomes_a_ply_with_new_colors(tmp_path: Path, format: SceneFormat) -> None:
+def test_scenes_of_any_format_become_stylized_plys(tmp_path: Path, format: SceneFormat) -> None:
     path, out = tmp_path / "scene.any", tmp_path / "out.ply"
     write_scene(path, wall(sh_degree=2), format)
     source = read_scene(path)
@@ -76,7 +76,7 @@ def test_sh_bands_of_zeros_are_omitted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("format", [COMPRESSED_PLY, SPZ, SPZ_4, SOG], ids=lambda format: format.name)
-def test_opacities_of_0_and_1_are_finite_and_come_back(tmp_path: Path, format: SceneFormat) -> None:
+def test_opacities_of_0_and_1_are_finite_and_round_trip(tmp_path: Path, format: SceneFormat) -> None:
     scene = replace(wall(), opacities=torch.cat([torch.full((308,), 1e4), torch.full((308,), -1e4)]))
     path = tmp_path / f"scene.{format.name}"
     write_scene(path, scene, format)
@@ -87,7 +87,9 @@ def test_opacities_of_0_and_1_are_finite_and_come_back(tmp_path: Path, format: S
 
 
 @pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53), (SPZ_4, 53), (SOG, 46)])
-def test_real_scene_loses_little(shared_data: Path, tmp_path: Path, format: SceneFormat, bound: float) -> None:
+def test_real_scene_round_trips_with_small_loss(
+    shared_data: Path, tmp_path: Path, format: SceneFormat, bound: float
+) -> None:
     """The plush toy has 47,974 Gaussians of degree 3, trained from photos."""
     folder = shared_data / "scenes" / "snowmiku_plush"
     scene = read_scene(next(folder.glob("*.ply"))).scene
@@ -115,7 +117,7 @@ def test_compressed_scene_renders_nearly_the_same(tmp_path: Path, format: SceneF
     }
 
 
-def test_loss_is_the_psnr_of_renders(tmp_path: Path) -> None:
+def test_compression_loss_is_the_psnr_of_renders(tmp_path: Path) -> None:
     """The PSNR of one view is computed by hand."""
     scene, view = wall(sh_degree=1), cameras(1)[0]
     path = tmp_path / "scene.spz"
@@ -131,7 +133,7 @@ def test_loss_is_the_psnr_of_renders(tmp_path: Path) -> None:
     assert measure_compression(path, scene, [view], near=0.01).psnr == pytest.approx(float(expected))
 
 
-def test_suffix_names_the_format() -> None:
+def test_suffix_determines_the_format() -> None:
     assert format_of_name("a.ply") is format_of_name("a.PLY") is PLY
     assert format_of_name("a.b.compressed.ply") is COMPRESSED_PLY
     assert format_of_name("a.SPZ") is SPZ
@@ -154,7 +156,7 @@ def test_truncated_file_is_refused(tmp_path: Path, format: SceneFormat) -> None:
 
 
 @pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
-def test_random_damage_never_breaks_a_reader(tmp_path: Path, format: SceneFormat) -> None:
+def test_random_damage_never_crashes_a_reader(tmp_path: Path, format: SceneFormat) -> None:
     check_damage(tmp_path / "scene", encoded(tmp_path, format))
 
 

@@ -56,13 +56,13 @@ def ply(tmp_path: Path, *comments: str, newline: bytes = b"\n") -> Path:
         ([], CLASSIC),
     ],
 )
-def test_comments_of_programs(tmp_path: Path, comments: list[str], expected: Rendering) -> None:
+def test_comments_of_programs_state_the_render_mode(tmp_path: Path, comments: list[str], expected: Rendering) -> None:
     for newline in (b"\n", b"\r\n"):
         file = read_scene(ply(tmp_path, *comments, newline=newline))
         assert file.scene.rendering == file.tag.rendering == expected
 
 
-def test_doubtful_comments_are_warnings(tmp_path: Path) -> None:
+def test_doubtful_comments_give_warnings(tmp_path: Path) -> None:
     for comment, said in (
         ("SplatRenderMode: banana", "unknown"),
         ("SplatRenderMode: 2dgs", "without thickness"),
@@ -86,7 +86,7 @@ def test_written_files_state_the_render_mode(tmp_path: Path, format: SceneFormat
 
 
 @pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
-def test_files_of_classic_scenes_state_nothing(tmp_path: Path, format: SceneFormat) -> None:
+def test_classic_scenes_state_no_render_mode(tmp_path: Path, format: SceneFormat) -> None:
     path = tmp_path / "scene.any"
     write_scene(path, wall(), format)
     data = path.read_bytes()
@@ -102,7 +102,7 @@ def test_files_of_classic_scenes_state_nothing(tmp_path: Path, format: SceneForm
     assert read_scene(path).tag.reason == ""
 
 
-def test_flag_of_old_spz_files_is_not_believed(tmp_path: Path) -> None:
+def test_flag_of_old_spz_files_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "scene.spz"
     write_scene(path, replace(wall(), rendering=AA), by_name("spz"))
     data = bytearray(gzip.decompress(path.read_bytes()))
@@ -122,7 +122,7 @@ def stylized(file: SceneFile, target: Path) -> SceneFile:
 
 
 @pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
-def test_stylized_ply_keeps_the_statement_of_its_source(tmp_path: Path, newline: bytes) -> None:
+def test_stylized_ply_keeps_the_render_mode_of_its_source(tmp_path: Path, newline: bytes) -> None:
     path = ply(tmp_path, "Exported from Brush", "SplatRenderMode: mip", newline=newline)
     found = stylized(read_scene(path), tmp_path / "out.ply")
     assert found.scene.rendering == MIP
@@ -133,7 +133,7 @@ def test_stylized_ply_keeps_the_statement_of_its_source(tmp_path: Path, newline:
 @pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
 @pytest.mark.parametrize("comments", [[], ["Exported from Brush", "SplatRenderMode: mip"], ["antialiased 1"]])
 @pytest.mark.parametrize("rendering", [CLASSIC, AA, MIP], ids=lambda each: each.text)
-def test_stylized_ply_states_what_was_requested(
+def test_stylized_ply_states_the_requested_render_mode(
     tmp_path: Path, rendering: Rendering, comments: list[str], newline: bytes
 ) -> None:
     mode: RenderMode = "antialiased" if rendering.antialiased else "classic"
@@ -154,6 +154,6 @@ def test_requested_mode_is_stated_when_gaussians_are_dropped(tmp_path: Path) -> 
     assert (len(found.scene), found.scene.rendering) == (len(scene) - 1, AA)
 
 
-def test_scenes_of_other_formats_become_plys_with_their_mode(tmp_path: Path) -> None:
+def test_plys_from_other_formats_keep_the_render_mode(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene.sog", replace(wall(), rendering=MIP), by_name("sog"))
     assert stylized(read_scene(tmp_path / "scene.sog"), tmp_path / "out.ply").scene.rendering == MIP

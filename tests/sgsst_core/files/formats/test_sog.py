@@ -78,7 +78,7 @@ def by_hand(version: int) -> Files:
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 @pytest.mark.parametrize("version", [1, 2])
-def test_values_computed_by_hand(tmp_path: Path, version: int, method: int) -> None:
+def test_values_match_those_computed_by_hand(tmp_path: Path, version: int, method: int) -> None:
     path = tmp_path / "scene"
     path.write_bytes(zipped(by_hand(version), method))
     scene = read_scene(path).scene
@@ -114,7 +114,7 @@ def test_folder_is_read_by_its_meta_json(tmp_path: Path) -> None:
     )
 
 
-def test_new_colors_change_one_image_alone(tmp_path: Path) -> None:
+def test_new_colors_change_only_one_image(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     write_scene(first, cloud(3000, degree=2), SOG)
     scene = read_scene(first).scene
@@ -200,7 +200,7 @@ def test_false_file_is_refused(tmp_path: Path, data: bytes, message: str) -> Non
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_wrong_values_anywhere_in_meta_json_are_refused(tmp_path: Path, version: int) -> None:
+def test_wrong_meta_json_values_are_refused(tmp_path: Path, version: int) -> None:
     files = by_hand(version)
     check_documents(
         tmp_path / "scene",

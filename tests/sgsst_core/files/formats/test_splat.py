@@ -16,7 +16,7 @@ from tests.sgsst_core.files.formats.samples import (
 )
 
 
-def test_values_computed_by_hand(tmp_path: Path) -> None:
+def test_values_match_those_computed_by_hand(tmp_path: Path) -> None:
     path = tmp_path / "scene.bin"
     row = struct.pack("<6f8B", 1, 2, 3, 1, np.e, 0.5, 0, 255, 51, 128, 128, 205, 26, 128)
     path.write_bytes(row * 3)
@@ -40,5 +40,5 @@ def test_truncated_file_and_flat_gaussian_are_refused(tmp_path: Path) -> None:
     assert (len(kept.scene), kept.dropped) == (300, 1)
 
 
-def test_random_damage_never_breaks_a_reader(tmp_path: Path) -> None:
+def test_random_damage_never_crashes_the_reader(tmp_path: Path) -> None:
     check_damage(tmp_path / "scene", SPLAT_ROW * 100)

@@ -56,7 +56,7 @@ def rotated(scene: Scene) -> Scene:
 
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_file_of_gsply_is_read_as_gsply_reads_it(tmp_path: Path, degree: int, version: int) -> None:
+def test_gsply_files_are_read_as_by_gsply(tmp_path: Path, degree: int, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=degree)), version=version)
     assert read_scene_header(path).format is (SPZ if version == 3 else SPZ_4)
@@ -68,7 +68,7 @@ def test_file_of_gsply_is_read_as_gsply_reads_it(tmp_path: Path, degree: int, ve
 
 @pytest.mark.parametrize("format", [SPZ, SPZ_4], ids=lambda format: format.name)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gsply_reads_what_is_written(tmp_path: Path, degree: int, format: SceneFormat) -> None:
+def test_gsply_reads_written_files(tmp_path: Path, degree: int, format: SceneFormat) -> None:
     path = tmp_path / "scene"
     write_scene(path, cloud(700, degree=degree), format)
     found = read_scene(path).scene
@@ -118,7 +118,7 @@ def test_unknown_extensions_are_noted(tmp_path: Path, version: int) -> None:
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_unknown_axes_and_broken_records(tmp_path: Path, version: int) -> None:
+def test_unknown_axes_are_refused_and_broken_records_ignored(tmp_path: Path, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=1)), version=version)
     data = path.read_bytes()
@@ -138,7 +138,7 @@ def test_written_file_states_the_axes_of_a_ply(tmp_path: Path) -> None:
     assert raw[32:44] == axes_record(6)
 
 
-def test_both_versions_hold_the_same_values(tmp_path: Path) -> None:
+def test_both_versions_store_the_same_values(tmp_path: Path) -> None:
     paths = [tmp_path / format.name for format in (SPZ, SPZ_4)]
     for path, format in zip(paths, (SPZ, SPZ_4), strict=True):
         write_scene(path, cloud(700, degree=3), format)
@@ -164,7 +164,7 @@ def spz_bytes(version: int, count: int = 1, degree: int = 0, sections: bytes = b
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_values_computed_by_hand(tmp_path: Path, version: int) -> None:
+def test_values_match_those_computed_by_hand(tmp_path: Path, version: int) -> None:
     position = struct.pack("<3e", 1.5, -2, 0.25)
     if version > 1:
         position = b"".join(round(value * 4096).to_bytes(3, "little", signed=True) for value in (1.5, -2, 0.25))
@@ -186,7 +186,7 @@ def test_values_computed_by_hand(tmp_path: Path, version: int) -> None:
     assert scene.quats[0].tolist() == pytest.approx([0.6, 0, sign * 0.8, 0], abs=0.01)
 
 
-def test_position_out_of_range_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
+def test_position_out_of_range_is_refused_without_a_file(tmp_path: Path) -> None:
     scene = wall()
     scene.means[5, 1] = -1e7
     with pytest.raises(OutputError, match=r"cannot hold a Gaussian 1e\+07 from the origin"):
@@ -235,13 +235,13 @@ def test_false_header_is_refused(tmp_path: Path, data: bytes, message: str) -> N
     refused(tmp_path, data, message)
 
 
-def test_wrong_checksum_or_damaged_data(tmp_path: Path) -> None:
+def test_wrong_checksum_or_damaged_data_is_refused(tmp_path: Path) -> None:
     data = encoded(tmp_path, SPZ)
     refused(tmp_path, data[:-5] + bytes([data[-5] ^ 1]) + data[-4:], "damaged: .*incorrect data check")
     refused(tmp_path, data[:200] + bytes(50) + data[250:], "the compressed data")
 
 
-def test_extensions_behind_the_data_are_skipped(tmp_path: Path) -> None:
+def test_extensions_after_the_data_are_skipped(tmp_path: Path) -> None:
     raw = bytearray(gzip.decompress(encoded(tmp_path, SPZ)))
     raw[14] = 2
     (tmp_path / "more").write_bytes(gzip.compress(bytes(raw) + bytes(1000)))
@@ -250,7 +250,7 @@ def test_extensions_behind_the_data_are_skipped(tmp_path: Path) -> None:
 
 
 def test_false_streams_of_version_4_are_refused(tmp_path: Path) -> None:
-    """Streams are truncated, too long or damaged, behind a correct table."""
+    """Streams are truncated, too long or damaged, after a correct table."""
     sections = [bytes(size) for size in (9, 1, 3, 3, 4)]
     for index, wrong, message in ((0, bytes(8), "ends before"), (2, bytes(1 << 27), "continues"), (4, None, "damaged")):
         bodies = [zstandard.compress(section) for section in sections]
@@ -260,7 +260,7 @@ def test_false_streams_of_version_4_are_refused(tmp_path: Path) -> None:
         refused(tmp_path, head + table + b"".join(bodies), message)
 
 
-def test_random_damage_never_breaks_a_reader(tmp_path: Path) -> None:
+def test_random_damage_never_crashes_the_reader(tmp_path: Path) -> None:
     """The damage is within the gzip stream, or in a file of version 4."""
     check_damage(tmp_path / "scene", zlib.decompress(encoded(tmp_path, SPZ), 31), wrap=gzip.compress)
     write_spz(tmp_path / "four", gsply_of(wall(sh_degree=1)), version=4)

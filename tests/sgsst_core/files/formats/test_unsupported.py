@@ -26,12 +26,12 @@ OBJ = b"# Blender\nmtllib cube.mtl\no Cube\n" + b"".join(b"v %d 0 1.5\n" % i for
         (b"\x80\x02}q\x00.", "model.pth", "is a checkpoint.*ns-export"),
     ],
 )
-def test_message_says_what_the_file_is(tmp_path: Path, data: bytes, name: str, message: str) -> None:
+def test_error_names_the_file_type(tmp_path: Path, data: bytes, name: str, message: str) -> None:
     refused(tmp_path, data, message, name)
 
 
 @pytest.mark.parametrize("legacy", [False, True])
-def test_checkpoints_are_named(tmp_path: Path, legacy: bool) -> None:
+def test_checkpoints_are_refused_as_such(tmp_path: Path, legacy: bool) -> None:
     path = tmp_path / "step-000029999.ckpt"
     content = {"splats": {"means": torch.zeros(5, 3)}}
     torch.save(content, path, _use_new_zipfile_serialization=not legacy)
@@ -39,7 +39,7 @@ def test_checkpoints_are_named(tmp_path: Path, legacy: bool) -> None:
         read_scene(path)
 
 
-def test_text_is_no_obj_file(tmp_path: Path) -> None:
+def test_text_is_not_taken_for_an_obj_file(tmp_path: Path) -> None:
     refused(tmp_path, b"so it is\nv 1 2 3\n" * 100, "is not a scene file")
     refused(tmp_path, b"# only\n# comments\n" * 100, "is not a scene file")
 
@@ -65,7 +65,7 @@ def test_text_is_no_obj_file(tmp_path: Path) -> None:
         ([], "is a folder. Give the file of a scene"),
     ],
 )
-def test_folder_names_the_scene_in_it(tmp_path: Path, files: list[str], message: str) -> None:
+def test_folder_error_names_the_scene_in_it(tmp_path: Path, files: list[str], message: str) -> None:
     for name in files:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
