@@ -18,7 +18,7 @@ from rich.table import Table
 from api.cli.arguments import JobInputs, JsonOption
 from api.cli.console import FAILURE, error_console, out_console
 from api.cli.options import with_arguments, with_options
-from api.cli.progress_bars import clock, live_bar, transfer_bar
+from api.cli.progress_bars import transfer_bar
 from api.client.inputs import different_names
 from service.parameters import JobParameters
 from sgsst_core.files.formats import (
@@ -29,6 +29,7 @@ from sgsst_core.files.formats import (
     format_of_name,
     result_name,
 )
+from sgsst_core.stylizing.progress_bar import clock, live_bar
 from worker.region_requests import RegionOptions, region_requests
 from worker.styles import parse_styles
 

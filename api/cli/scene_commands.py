@@ -12,8 +12,8 @@ from rich.table import Column, Table
 from api.cli.arguments import CamerasOption, JobInputs, SceneArgument
 from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
-from api.cli.progress_bars import job_bar, live_bar
 from sgsst_core.files.formats import RESULT_SUFFIXES
+from sgsst_core.stylizing.progress_bar import job_bar, live_bar
 from worker.options import StylizeOptions, ViewOptions
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from api.cli.arguments import JobInputs
 from api.cli.console import FAILURE, error_console, out_console, print_field, spinner
 from api.cli.interrupt import stop_on_signal
 from api.cli.options import with_arguments, with_options
-from api.cli.progress_bars import clock, job_bar
 from api.cli.weights_commands import fetch
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.progress_bar import clock, job_bar
 from worker.options import RunOptions, StylizeOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
@@ -123,7 +123,7 @@ def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, check
         prepared = describe(job)
         _print_plan(prepared)
         with job_bar(error_console) as bar:
-            bar.start(prepared)
+            bar.start(prepared.step, prepared.total)
             result = execute(
                 job, progress=bar.show, stop=stop, warn=error_console.print, checkpoint_seconds=checkpoint_seconds
             )
@@ -144,7 +144,7 @@ def _stylize_on_ranks(
 
         def start(prepared: Prepared) -> None:
             _print_plan(prepared)
-            bar.start(prepared)
+            bar.start(prepared.step, prepared.total)
 
         notify = error_console.print
         listener = Listener(

@@ -25,6 +25,7 @@ from sgsst_core.planning.context import PlanningContext, make_network, sharing_m
 from sgsst_core.planning.cost import view_memory
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
+from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions
@@ -193,8 +194,9 @@ def plan_job(
     rasterizer: str | None = None,
     collectives: Collectives = ALONE,
     regions: Regions | None = None,
+    show: ShowPlanning | None = None,
 ) -> StylizationJob:
-    """Plan and prepare a job; see `make_plan` for `weights`, `rasterizer` and exceptions.
+    """Plan and prepare a job; see `make_plan` for `weights`, `rasterizer`, `show` and exceptions.
 
     Inputs are checked, and converted if necessary. If the settings request refinement, the job contains the refined
     scene.
@@ -212,6 +214,7 @@ def plan_job(
         rasterizer=rasterizer,
         collectives=collectives,
         regions=regions,
+        show=show,
     )
     scene, regions = refined(scene, refinement), regions and regions.refined(refinement)
     plan, planning_context = make_plan(
@@ -224,6 +227,7 @@ def plan_job(
         style=style,
         regions=regions,
         refinement=refinement,
+        show=show,
     )
     return prepare_job(
         plan,

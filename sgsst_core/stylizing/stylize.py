@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, cast
 
 from numpy.typing import NDArray
+from rich.console import Console
 from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
@@ -17,7 +19,8 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.ahead import PhotoLoader
-from sgsst_core.stylizing.loop import Callbacks, run
+from sgsst_core.stylizing.loop import Callbacks, Progress, run
+from sgsst_core.stylizing.progress_bar import JobBar, job_bar
 from sgsst_core.stylizing.stylizer import Stylizer
 
 
@@ -28,6 +31,7 @@ def stylize(
     *,
     preset: PresetName = "standard",
     photos: PhotoLoader | None = None,
+    progress: bool = False,
     callbacks: Callbacks | None = None,
     weights: BackboneWeights | None = None,
     **settings: Any,
@@ -41,6 +45,7 @@ def stylize(
         preset: Preset of the settings: "preview", "standard" or "paper".
         photos: Function that loads the content image of a view by its index, at the size of the view; None for
             unstylized renders.
+        progress: Whether to show a progress bar, on a terminal or in a notebook (which needs ipywidgets).
         callbacks: Callbacks for progress, checkpoints and previews.
         weights: Weights of the feature network; None for VGG19 if it is installed, else VGG16.
         settings: Further settings by name (docs/options.md, with underscores), such as `steps_sos=100`.
@@ -61,10 +66,26 @@ def stylize(
     chosen = make_settings(preset, **settings)
     if isinstance(scene, SceneFile):
         check_sh_attenuation(scene, chosen.sh_attenuation)
-    stylizer = Stylizer.planned(as_scene(scene), cameras, style, chosen, weights=weights, photos=photos)
-    job = stylizer.job
-    if isinstance(scene, SceneFile):
-        scene.refined(job.plan.refinement)  # raises before the steps if the file cannot hold the result
-    run(stylizer, callbacks)
+    with job_bar(Console(highlight=False, markup=False)) if progress else nullcontext() as bar:
+        show = bar.show_planning if bar else None
+        given = as_scene(scene)
+        stylizer = Stylizer.planned(given, cameras, style, chosen, weights=weights, photos=photos, show=show)
+        job = stylizer.job
+        if isinstance(scene, SceneFile):
+            scene.refined(job.plan.refinement)  # raises before the steps if the file cannot hold the result
+        run(stylizer, _shown(bar, callbacks or Callbacks()))
     result = replace(job.scene, sh_dc=stylizer.stylized())
     return cast(F, stylized(scene, result, job.plan.refinement, chosen.sh_attenuation))
+
+
+def _shown(bar: JobBar | None, callbacks: Callbacks) -> Callbacks:
+    """Return callbacks that update a progress bar, if there is one, and call the given ones."""
+    if bar is None:
+        return callbacks
+
+    def show(progress: Progress) -> None:
+        bar.show(progress)
+        if callbacks.progress:
+            callbacks.progress(progress)
+
+    return replace(callbacks, progress=show)

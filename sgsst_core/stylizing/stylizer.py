@@ -22,6 +22,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.sos import SosResult
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -105,6 +106,7 @@ class Stylizer:
         rasterizer: str | None = None,
         collectives: Collectives = ALONE,
         regions: Regions | None = None,
+        show: ShowPlanning | None = None,
     ) -> Self:
         """Plan a job and create its stylizer; see `plan_job`.
 
@@ -127,6 +129,7 @@ class Stylizer:
             rasterizer=rasterizer,
             collectives=collectives,
             regions=regions,
+            show=show,
         )
         return cls(job)
 

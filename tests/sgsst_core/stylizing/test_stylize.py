@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import torch
 
-from sgsst_core import load_scene, save, stylize
+from sgsst_core import Callbacks, Stylizer, load_scene, make_settings, save, stylize
 from sgsst_core.errors import CameraError, ImageError, SceneError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import as_scene
+from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held
@@ -167,6 +168,26 @@ def test_arrays_of_numpy_make_a_scene(tiny_weights: BackboneWeights) -> None:
         for each, views, picture in ((arrays, camera, image), (scene, view, (255 * style()).byte() / 255))
     ]
     assert torch.equal(results[0].sh_dc, results[1].sh_dc)
+
+
+def test_progress_is_shown_on_a_terminal_only_if_asked_for(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes any output for a terminal
+    steps: list[int] = []
+    callbacks = Callbacks(progress=lambda progress: steps.append(progress.step))
+    run(wall(), tiny_weights, callbacks=callbacks)
+    assert capsys.readouterr().out == ""
+    run(wall(), tiny_weights, callbacks=callbacks, progress=True)
+    assert "2/2" in capsys.readouterr().out
+    assert steps == [1, 2, 1, 2]
+
+
+def test_planning_reports_its_progress(tiny_weights: BackboneWeights) -> None:
+    surveyed: list[PlanningProgress] = []
+    settings = make_settings("preview", steps_sos=1)
+    Stylizer.planned(wall(), cameras(3), style(), settings, weights=tiny_weights, show=surveyed.append)
+    assert [(each.done, each.total) for each in surveyed] == [(done, 3) for done in range(4)]
 
 
 def test_importing_the_package_imports_no_pytorch() -> None:

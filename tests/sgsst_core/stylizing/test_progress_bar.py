@@ -7,11 +7,10 @@ import io
 import pytest
 from rich.console import Console
 
-from api.cli import progress_bars
-from api.cli.progress_bars import clock, job_bar
 from sgsst_core.planning.survey import PlanningProgress
+from sgsst_core.stylizing import progress_bar
 from sgsst_core.stylizing.loop import Progress
-from worker.description import Prepared
+from sgsst_core.stylizing.progress_bar import clock, job_bar
 
 
 def shown(*, terminal: bool) -> str:
@@ -21,7 +20,7 @@ def shown(*, terminal: bool) -> str:
         for done, left in [(0, None), (3, 125.0), (8, 0.0)]:
             bar.show_planning(PlanningProgress(done, 8, left))
             bar._bar.refresh()  # now, instead of within a tenth of a second
-        bar.start(Prepared([], 0, 50))
+        bar.start(0, 50)
         for step in (1, 2):
             bar.show(Progress("coarse", step, 50, 123.4, 1.0, 61.0))
             bar._bar.refresh()
@@ -37,7 +36,7 @@ def test_terminal_shows_views_then_steps() -> None:
 
 def test_log_prints_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown(terminal=False).strip() == ""
-    monkeypatch.setattr(progress_bars, "LOG_SECONDS", 0.0)
+    monkeypatch.setattr(progress_bar, "LOG_SECONDS", 0.0)
     assert shown(terminal=False).strip().splitlines() == [
         "Surveying the views: 0 of 8",
         "Surveying the views: 3 of 8, 2:05 left",
