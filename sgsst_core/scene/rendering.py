@@ -6,9 +6,10 @@ PyTorch is not imported, because the API process and the command line's help rea
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 from sgsst_core.constants import EPS2D
+from sgsst_core.errors import SettingsError
 
 #: Requested render mode; "auto" for that of the scene's file.
 RenderMode = Literal["auto", "classic", "antialiased"]
@@ -46,7 +47,14 @@ class Rendering:
         """Return the rendering for a requested mode and blur, where None and "auto" stand for this rendering's own.
 
         Another mode than this one's has the usual blur. Flat Gaussians stay flat in classic mode.
+
+        Raises:
+            SettingsError: If there is no such mode, or the blur is out of range.
         """
+        if mode not in get_args(RenderMode):
+            raise SettingsError(f"There is no render mode {mode!r}. Choose one of {', '.join(get_args(RenderMode))}.")
+        if eps2d is not None and not 0 < eps2d <= MAX_EPS2D:
+            raise SettingsError(f"The blur eps2d is {eps2d}; it must be above 0, and at most {MAX_EPS2D:g}.")
         same = mode in ("auto", self.mode) or (mode, self.mode) == ("classic", "2dgs")
         chosen = self if same else Rendering(mode)  # type: ignore[arg-type]
         return chosen if eps2d is None else replace(chosen, eps2d=eps2d)

@@ -16,6 +16,7 @@ from sgsst_core.files.library import F, as_scene, stylized
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.ahead import PhotoLoader
@@ -30,6 +31,8 @@ def stylize(
     style: Tensor | NDArray[Any] | Style,
     *,
     preset: PresetName = "standard",
+    render_mode: RenderMode = "auto",
+    eps2d: float | None = None,
     photos: PhotoLoader | None = None,
     progress: bool = False,
     callbacks: Callbacks | None = None,
@@ -43,12 +46,15 @@ def stylize(
         cameras: Cameras of the views.
         style: Style image, such as from `load_image`; or a mixture of several.
         preset: Preset of the settings: "preview", "standard" or "paper".
+        render_mode: Render mode of the scene's training, "classic" or "antialiased"; "auto" for that of its file, which
+            is classic for checkpoints and tensors.
+        eps2d: Blur of projected Gaussians in square pixels; None for that of the file or the mode.
         photos: Function that loads the content image of a view by its index, at the size of the view; None for
             unstylized renders.
         progress: Whether to show a progress bar, on a terminal or in a notebook (which needs ipywidgets).
         callbacks: Callbacks for progress, checkpoints and previews.
         weights: Weights of the feature network; None for VGG19 if it is installed, else VGG16.
-        settings: Further settings by name (docs/options.md, with underscores), such as `steps_sos=100`.
+        settings: Further fields of `Settings`, such as `steps_sos=100`.
 
     Returns:
         Stylized scene in the form in which it was given. `save` writes it to a file.
@@ -69,6 +75,7 @@ def stylize(
     with job_bar(Console(highlight=False, markup=False)) if progress else nullcontext() as bar:
         show = bar.show_planning if bar else None
         given = as_scene(scene)
+        given = replace(given, rendering=given.rendering.requested(render_mode, eps2d))
         stylizer = Stylizer.planned(given, cameras, style, chosen, weights=weights, photos=photos, show=show)
         job = stylizer.job
         if isinstance(scene, SceneFile):

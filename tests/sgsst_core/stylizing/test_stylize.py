@@ -20,6 +20,7 @@ from sgsst_core.files.library import as_scene
 from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.rendering import Rendering
 from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.sgsst_core.trainer_scenes import splats_of, write_gsplat, write_nerfstudio
@@ -137,6 +138,8 @@ WRONG: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "style": ({"style": 255 * style()}, ImageError, "by 255"),
     "photos": ({"photos": lambda index: 255 * torch.ones(48, 64, 3)}, ImageError, "photo of view 0 .*by 255"),
     "setting": ({"steps": 5}, SettingsError, "steps"),
+    "mode": ({"render_mode": "mip"}, SettingsError, "no render mode 'mip'"),
+    "blur": ({"eps2d": 0.0}, SettingsError, "blur eps2d is 0"),
     "preset": ({"preset": "fast"}, SettingsError, "There is no preset 'fast'"),
     "shape": ({"scene": replace(wall(), scales=torch.zeros(5, 3))}, SceneError, r"`scales` has shape \[5, 3\]"),
     "degree": ({"scene": replace(wall(), sh_rest=torch.zeros(616, 24, 3))}, SceneError, r"`sh_rest` has shape"),
@@ -168,6 +171,17 @@ def test_arrays_of_numpy_make_a_scene(tiny_weights: BackboneWeights) -> None:
         for each, views, picture in ((arrays, camera, image), (scene, view, (255 * style()).byte() / 255))
     ]
     assert torch.equal(results[0].sh_dc, results[1].sh_dc)
+
+
+def test_scenes_are_drawn_in_the_requested_mode(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    antialiased = run(scene, tiny_weights, render_mode="antialiased", eps2d=0.1)
+    assert antialiased.rendering == Rendering("antialiased", 0.1)
+    given = replace(scene, rendering=antialiased.rendering)
+    assert torch.equal(antialiased.sh_dc, run(given, tiny_weights).sh_dc)
+    splats = run(splats_of(scene), tiny_weights, render_mode="antialiased", eps2d=0.1)
+    assert torch.equal(splats["sh0"][:, 0], antialiased.sh_dc)
+    assert not torch.equal(antialiased.sh_dc, run(scene, tiny_weights).sh_dc)
 
 
 def test_progress_is_shown_on_a_terminal_only_if_asked_for(
