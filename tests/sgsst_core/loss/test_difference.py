@@ -26,6 +26,8 @@ from sgsst_core.loss.difference import Difference
         ([math.inf, 0.0], [1.0, 0.0], math.inf, 0.0),
     ],
 )
-def test_difference(found: list[float], exact: list[float], error: float, cosine: float) -> None:
+def test_difference_has_relative_error_and_cosine(
+    found: list[float], exact: list[float], error: float, cosine: float
+) -> None:
     difference = Difference.of(torch.tensor(found), torch.tensor(exact))
     assert (difference.relative_error, difference.cosine) == (pytest.approx(error), pytest.approx(cosine, abs=1e-12))

@@ -25,7 +25,7 @@ LAYERS = (*STYLE_LAYERS, CONTENT_LAYER)
 
 
 @pytest.fixture
-def trained_anew(tiny_weights: BackboneWeights) -> BackboneWeights:
+def renormalized(tiny_weights: BackboneWeights) -> BackboneWeights:
     """Return a network with another input normalization than the original network."""
     return replace(tiny_weights, input_scale=torch.tensor([250.0, 255.0, 260.0]))
 
@@ -35,7 +35,7 @@ def features(weights: BackboneWeights, picture: torch.Tensor) -> dict[str, torch
     return network.forward(picture.double(), cache=False).features
 
 
-def test_features_of_each_layer_are_its_factor_times_as_large(tiny_weights: BackboneWeights) -> None:
+def test_features_of_each_layer_are_scaled_by_its_factor(tiny_weights: BackboneWeights) -> None:
     scales = dict(zip(LAYERS, (1.3, 0.25, 7.0, 3.0, 1e-3, 40.0), strict=True))
     picture = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0))
     before, after = features(tiny_weights, picture), features(with_scales(tiny_weights, scales), picture)
@@ -45,13 +45,13 @@ def test_features_of_each_layer_are_its_factor_times_as_large(tiny_weights: Back
     assert float(before["relu5_1"].amax()) > 0
 
 
-def test_scales_of_the_paper_give_the_published_statistics(trained_anew: BackboneWeights) -> None:
+def test_paper_scales_give_the_published_statistics(renormalized: BackboneWeights) -> None:
     """Statistics agree to 22 %, because the factors have two digits."""
     with Image.open(STARRY_NIGHT) as painting:
         small = painting.resize((512, 405), Image.Resampling.LANCZOS)
     picture = torch.from_numpy(np.array(small)).double() / 255
     nothing = (torch.tensor([123.68, 116.779, 103.939]) / 255).expand(picture.shape)
-    scaled = at_scale(trained_anew, "paper")
+    scaled = at_scale(renormalized, "paper")
     found, of_nothing = features(scaled, picture), features(scaled, nothing)
     for layer in STYLE_LAYERS:
         grams = [values[layer].flatten(0, 1).T @ values[layer].flatten(0, 1) for values in (found, of_nothing)]
@@ -61,32 +61,32 @@ def test_scales_of_the_paper_give_the_published_statistics(trained_anew: Backbon
     assert float(difference) == pytest.approx(PUBLISHED[CONTENT_LAYER], rel=0.12)
 
 
-def test_scales_of_torchvisions_vgg16(vgg16_weights: BackboneWeights) -> None:
+def test_torchvision_vgg16_has_the_expected_scales(vgg16_weights: BackboneWeights) -> None:
     wanted = {"relu1_1": 1.2, "relu2_1": 1.5, "relu3_1": 0.91, "relu4_1": 4.9, "relu4_2": 4.4, "relu5_1": 0.75}
     assert paper_scales(vgg16_weights) == pytest.approx(wanted, rel=0.02)
 
 
-def test_even_scales_are_one_factor_but_for_the_layer_that_knows_colors(trained_anew: BackboneWeights) -> None:
-    scaled = at_scale(trained_anew, "even")
+def test_even_scales_differ_only_in_the_color_layers(renormalized: BackboneWeights) -> None:
+    scaled = at_scale(renormalized, "even")
     assert scaled.scales["relu1_1"] == EVEN_COLOR_SCALE
     assert scaled.scales[PIXELS] == EVEN_PIXEL_SCALE
     assert {factor for layer, factor in scaled.scales.items() if layer not in ("relu1_1", PIXELS)} == {EVEN_SCALE}
     picture = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))
-    before, after = features(trained_anew, picture), features(scaled, picture)
+    before, after = features(renormalized, picture), features(scaled, picture)
     for layer in LAYERS:  # exact, because factors are powers of two
         torch.testing.assert_close(after[layer], before[layer] * scaled.scales[layer], rtol=0, atol=0)
 
 
-def test_scaling_twice_is_scaling_once(trained_anew: BackboneWeights) -> None:
-    scaled = at_scale(trained_anew, "even")
+def test_scaling_is_idempotent(renormalized: BackboneWeights) -> None:
+    scaled = at_scale(renormalized, "even")
     assert at_scale(scaled, "even") is scaled
 
 
-def test_the_papers_own_network_stays_as_it_is(tiny_weights: BackboneWeights) -> None:
+def test_papers_network_is_returned_unchanged(tiny_weights: BackboneWeights) -> None:
     assert at_scale(tiny_weights, "paper") is tiny_weights
     assert at_scale(tiny_weights, "even") is tiny_weights
 
 
-def test_the_paper_preset_has_the_papers_scale() -> None:
+def test_paper_preset_uses_the_paper_scale() -> None:
     assert make_settings("paper").feature_scale == "paper"
     assert make_settings("standard").feature_scale == make_settings("preview").feature_scale == "even"

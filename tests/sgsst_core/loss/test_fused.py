@@ -105,7 +105,7 @@ def test_survives_a_large_mean_to_sigma_ratio() -> None:
     assert relative_error(gradient.cpu(), expected.apply(x.double())) < 1e-4
 
 
-def test_channels_that_differ_by_less_than_their_mean_is_rounded() -> None:
+def test_gradients_are_correct_below_the_rounding_of_the_mean() -> None:
     """Gradients are correct for pixels of nearly one color, which have no Gram term.
 
     Their differences are below the rounding error of the mean, so features must be centered about the float32 mean.
@@ -140,7 +140,7 @@ def test_dead_and_constant_channels_give_finite_gradients(dead_in: str) -> None:
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (0, 7)])
-def test_without_any_weight_all_is_nothing(shape: tuple[int, int]) -> None:
+def test_zero_weights_give_zero_terms_and_maps(shape: tuple[int, int]) -> None:
     x = features(*shape, 16, seed=1) if shape[0] else torch.zeros((*shape, 16), device=DEVICE)
     a = torch.zeros(shape, device=DEVICE)
     found = on_cpu(fused_statistics(x, a))
@@ -165,14 +165,14 @@ def test_bfloat16_features_are_summed_in_float32() -> None:
     assert relative_error(gradient.double(), style_loss(exact, cpu_target)[1].apply(x.cpu().double())) < 1e-2
 
 
-def test_repeats_to_the_bit() -> None:
+def test_runs_are_bit_identical() -> None:
     x, a = features(60, 70, 64, seed=4), position_weights(60, 70)
     first, second = fused_statistics(x, a), fused_statistics(x, a)
     assert torch.equal(first.centered, second.centered)
     assert torch.equal(first.mean, second.mean)
 
 
-def test_a_map_made_by_kernels_is_applied_by_the_tensor_functions_too() -> None:
+def test_tensor_functions_apply_maps_made_by_kernels() -> None:
     """They are needed for features in another memory layout."""
     x, target = features(12, 14, 16, seed=5), target_of(16)
     _, *maps = fused_style_loss(fused_statistics(x), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)

@@ -73,7 +73,7 @@ def assert_same(found: SosResult, expected: SosResult) -> None:
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_a_graph_gives_the_same_bits_for_every_view(
+def test_graph_is_bit_identical_to_eager_mode_for_every_view(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, weighted: bool
 ) -> None:
     if not weighted:  # once is enough for the Triton kernels, which are slow in the interpreter
@@ -101,7 +101,7 @@ def test_a_graph_gives_the_same_bits_for_every_view(
 
 @pytest.mark.usefixtures("without_triton")
 @pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
-def test_graphs_hold_the_search_for_nearest_vectors(
+def test_graphs_include_feature_matching(
     counts: Counts, tiny_weights: BackboneWeights, style_loss: StyleLossName
 ) -> None:
     network = FeatureNetwork(tiny_weights, layers_of(style_loss, tiny_weights, content=True), device="cuda")
@@ -122,7 +122,7 @@ def test_graphs_hold_the_search_for_nearest_vectors(
 
 
 @pytest.mark.usefixtures("without_triton")
-def test_every_kind_of_evaluation_has_a_graph_of_its_own(tiny_weights: BackboneWeights) -> None:
+def test_each_kind_of_evaluation_has_its_own_graph(tiny_weights: BackboneWeights) -> None:
     """Graphs differ by scales and style targets, and interleaved ones do not interfere."""
     loss = make_loss(tiny_weights)
     whole, other = (
@@ -146,7 +146,7 @@ def test_every_kind_of_evaluation_has_a_graph_of_its_own(tiny_weights: BackboneW
 
 
 @pytest.mark.usefixtures("without_triton")
-def test_there_are_no_more_graphs_than_asked_for(tiny_weights: BackboneWeights) -> None:
+def test_number_of_graphs_is_limited(tiny_weights: BackboneWeights) -> None:
     loss = make_loss(tiny_weights, content_weight=0.0)
     view, styles = loss.targets.of_view(image(2)), [style_of(loss), style_of(loss)]
     graphs = LossGraphs(loss, most=1)
@@ -157,7 +157,7 @@ def test_there_are_no_more_graphs_than_asked_for(tiny_weights: BackboneWeights) 
 
 
 @pytest.mark.usefixtures("without_triton")
-def test_what_cannot_be_captured_is_evaluated_as_ever(
+def test_failed_capture_falls_back_to_eager_mode(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loss = make_loss(tiny_weights, content_weight=0.0)
@@ -182,9 +182,7 @@ def test_what_cannot_be_captured_is_evaluated_as_ever(
     assert not torch.cuda.is_current_stream_capturing()
 
 
-def test_graphs_are_used_from_the_version_whose_allocator_survives_failures(
-    counts: Counts, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_graphs_require_pytorch_2_13(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
     for version, used in (("2.11.0+cu128", False), ("2.12.1", False), ("2.13.0+cu130", True), ("3.0", True)):
         monkeypatch.setattr(torch, "__version__", version)
         assert (graphs_problem("cuda") is None) is used
@@ -208,7 +206,7 @@ def test_only_scales_of_one_tile_that_fit_twice_are_captured(
 
 
 @pytest.mark.usefixtures("without_triton")
-def test_a_view_without_its_content_is_not_captured(tiny_weights: BackboneWeights) -> None:
+def test_view_without_cached_content_is_not_captured(tiny_weights: BackboneWeights) -> None:
     """A graph would recompute the content features of the captured view in every replay."""
     loss = make_loss(tiny_weights)
     style, view = style_of(loss), loss.targets.of_view(image(2), cache_content=False)
@@ -218,7 +216,7 @@ def test_a_view_without_its_content_is_not_captured(tiny_weights: BackboneWeight
     assert (graphs.captured, graphs.problem) == (0, None)
 
 
-def test_no_tensor_of_a_tile_needs_64_bit_indices(counts: Counts, tiny_weights: BackboneWeights) -> None:
+def test_gpu_tiles_need_no_64_bit_indices(counts: Counts, tiny_weights: BackboneWeights) -> None:
     network = FeatureNetwork(tiny_weights, device="cuda")
     side, channels = 40_000, max(network.channels("relu1_1"), network.channels("relu1_2"))
     tiles = SosLoss(network, memory=1 << 60).tiling.tiles((side, side))
@@ -226,7 +224,7 @@ def test_no_tensor_of_a_tile_needs_64_bit_indices(counts: Counts, tiny_weights: 
     assert len(SosLoss(FeatureNetwork(tiny_weights), memory=1 << 60).tiling.tiles((side, side))) == 1
 
 
-def test_where_graphs_are_thought_of(tiny_weights: BackboneWeights) -> None:
+def test_graphs_require_a_gpu_enough_memory_and_one_rank(tiny_weights: BackboneWeights) -> None:
     assert graphs_problem("cpu") == "only NVIDIA GPUs are known to replay them"
     tiling = Tiling(halo=64, held=1000.0, working=0.25, coarsest=16)
     assert can_be_captured(tiling, [400, 100])

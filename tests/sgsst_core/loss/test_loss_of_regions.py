@@ -19,7 +19,7 @@ from tests.sgsst_core.pictures import picture, relative_error
 SIZE = (112, 150)
 
 
-def shares(size, count):
+def coverage_maps(size, count):
     """Return coverage maps of `count` regions, which add up to 1 with the background; the first have hard borders."""
     raw = torch.stack([picture(*size, seed=10 + number)[:, :, 0] ** 4 for number in range(count + 1)])
     raw[0, :, size[1] // 2 :] = 0
@@ -42,7 +42,7 @@ def evaluate(network, image, content, styles, maps, weights, **options):
 @pytest.fixture
 def case():
     styles = [resize_area(picture(90, 130, seed=s) ** s, style_size((90, 130), SIZE)) for s in (1, 2, 3)]
-    return picture(*SIZE, seed=5), picture(*SIZE, seed=6), styles, shares(SIZE, 3), [1.0, 0.3, 7.0]
+    return picture(*SIZE, seed=5), picture(*SIZE, seed=6), styles, coverage_maps(SIZE, 3), [1.0, 0.3, 7.0]
 
 
 @pytest.mark.parametrize("tile_size", [None, 64])
@@ -59,14 +59,14 @@ def test_float64_agrees_with_autograd(tiny_weights, case, tile_size, style_loss,
     assert relative_error(found.image_gradient, gradient) < 1e-9
 
 
-def test_float32_tiles_agree_with_the_whole_in_float64(tiny_weights, case):
+def test_float32_tiles_agree_with_untiled_float64(tiny_weights, case):
     whole = evaluate(FeatureNetwork(tiny_weights, dtype=torch.float64), *case)
     tiled = evaluate(FeatureNetwork(tiny_weights), *case, tile_size=64, cache_activations=False)
     assert tiled.loss == pytest.approx(whole.loss, rel=1e-5)
     assert relative_error(tiled.image_gradient, whole.image_gradient) < 1e-5
 
 
-def test_the_order_of_regions_does_not_matter(tiny_weights, case):
+def test_order_of_regions_does_not_matter(tiny_weights, case):
     image, content, *parts = case
     network = FeatureNetwork(tiny_weights, dtype=torch.float64)
     found = [
@@ -77,7 +77,7 @@ def test_the_order_of_regions_does_not_matter(tiny_weights, case):
     assert relative_error(found[1].image_gradient, found[0].image_gradient) < 1e-12
 
 
-def test_one_region_of_everything_is_a_view_without_regions(tiny_weights, case):
+def test_single_region_is_bit_identical_to_no_regions(tiny_weights, case):
     """Results are bit-identical: same statistics, same position weights."""
     image, content, styles, maps, _ = case
     network = FeatureNetwork(tiny_weights)
@@ -93,7 +93,7 @@ def test_one_region_of_everything_is_a_view_without_regions(tiny_weights, case):
     assert torch.equal(found.image_gradient, plain.image_gradient)
 
 
-def test_a_region_that_a_view_does_not_show_adds_nothing(tiny_weights, case):
+def test_region_outside_the_view_adds_nothing(tiny_weights, case):
     image, content, styles, maps, weights = case
     network = FeatureNetwork(tiny_weights, dtype=torch.float64)
     without = evaluate(network, image, content, styles[:2], maps[:2], weights[:2])
@@ -103,7 +103,7 @@ def test_a_region_that_a_view_does_not_show_adds_nothing(tiny_weights, case):
     assert torch.equal(found.image_gradient, without.image_gradient)
 
 
-def test_weights_scale_the_style_terms_alone(tiny_weights, case):
+def test_weights_scale_only_the_style_terms(tiny_weights, case):
     image, content, styles, maps, _ = case
     network = FeatureNetwork(tiny_weights, dtype=torch.float64)
     one, two = (evaluate(network, image, content, styles, maps, [w] * 3) for w in (1.0, 2.0))
@@ -112,10 +112,10 @@ def test_weights_scale_the_style_terms_alone(tiny_weights, case):
             assert two.terms[scale][name] == pytest.approx(value if name == "content" else 2 * value, rel=1e-12)
 
 
-def test_statistics_of_two_regions_together_are_merged_statistics():
+def test_statistics_of_united_regions_are_merged():
     """The union's map is the sum of both, and its moments are theirs, merged."""
     features = torch.rand(9, 13, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    first, second = shares((9, 13), 2)
+    first, second = coverage_maps((9, 13), 2)
     whole = layer_statistics(features, first + second)
     parts = merge(layer_statistics(features, first), layer_statistics(features, second))
     for name in ("count", "mean", "centered"):
@@ -131,26 +131,26 @@ def regions(labels, **frozen):
     return Regions(every, torch.tensor(labels, dtype=torch.uint8))
 
 
-def test_regions_that_no_view_sees_become_the_rest():
+def test_regions_outside_all_views_join_the_rest():
     found = regions([0, 1, 2, 2]).resolved(torch.tensor([1.0, 0, 0, 2]))
     assert found.labels.tolist() == [0, 0, 2, 2]
     assert found.active == (0, 2)
     assert found.mapped
 
 
-def test_kept_regions_stay_kept_where_no_view_sees_them():
+def test_frozen_regions_outside_all_views_stay_frozen():
     found = regions([0, 1, 2, 2], a=True).resolved(torch.tensor([1.0, 0, 1, 2]))
     assert found.frozen.tolist() == [False, True, False, False]
     assert not found.frozen_in_view
 
 
-def test_a_region_of_all_that_is_seen_needs_no_map():
+def test_region_of_all_seen_gaussians_needs_no_map():
     found = regions([0, 1, 1]).resolved(torch.tensor([0.0, 1, 1]))
     assert found.active == (1,)
     assert not found.mapped
 
 
-def test_nothing_to_do_is_an_error():
+def test_freezing_everything_is_an_error():
     kept = regions([1, 1, 2], a=True, b=True)
     with pytest.raises(SettingsError, match=r"Every Gaussian is frozen \(a, b\)"):
         check_regions(kept)

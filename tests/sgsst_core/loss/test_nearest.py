@@ -97,7 +97,7 @@ def test_any_partition_agrees_with_untiled_autograd(
 
 
 @pytest.mark.parametrize("style_loss", MATCHED)
-def test_the_gradient_is_the_slope_of_the_loss(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
+def test_gradient_matches_finite_differences(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
     image, style, content, coverage = setting(48, 64, covered=True)
     loss = loss_of(tiny_weights, style_loss)
     gradient = gradient_of(evaluate(loss, (image, style, content, coverage)))
@@ -108,9 +108,7 @@ def test_the_gradient_is_the_slope_of_the_loss(tiny_weights: BackboneWeights, st
 
 
 @pytest.mark.parametrize("style_loss", [MATCHED[0], pytest.param(MATCHED[1], marks=pytest.mark.slow)])
-def test_the_real_network_agrees_with_untiled_autograd(
-    vgg16_weights: BackboneWeights, style_loss: StyleLossName
-) -> None:
+def test_real_network_agrees_with_untiled_autograd(vgg16_weights: BackboneWeights, style_loss: StyleLossName) -> None:
     image, style, content, coverage = case = setting(84, 100, covered=True)
     expected, gradient = sos_reference(vgg16_weights, image, style, content, coverage=coverage, style_loss=style_loss)
     result = evaluate(loss_of(vgg16_weights, style_loss, tile_size=48), case)
@@ -119,7 +117,7 @@ def test_the_real_network_agrees_with_untiled_autograd(
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
-def test_other_precisions_match_as_float64_does(vgg16_weights: BackboneWeights, dtype: torch.dtype) -> None:
+def test_lower_precisions_agree_with_float64(vgg16_weights: BackboneWeights, dtype: torch.dtype) -> None:
     case = setting(84, 100)
     exact, found = (evaluate(loss_of(vgg16_weights, "nnfm", each), case) for each in (torch.float64, dtype))
     loss, gradient = (1e-5, 1e-2) if dtype == torch.float32 else (1e-2, 0.5)
@@ -128,7 +126,7 @@ def test_other_precisions_match_as_float64_does(vgg16_weights: BackboneWeights, 
 
 
 @pytest.mark.parametrize("style_loss", MATCHED)
-def test_tiles_that_are_computed_twice_are_matched_once(
+def test_recomputed_tiles_are_matched_once(
     tiny_weights: BackboneWeights, style_loss: StyleLossName, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     case, searched = setting(96, 128), []
@@ -146,7 +144,7 @@ def test_tiles_that_are_computed_twice_are_matched_once(
 
 @pytest.mark.parametrize("blocks", [(7, 5), (1, 1), (1000, 1000)])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_blocks_of_any_size_find_the_same(
+def test_block_size_does_not_change_matches(
     blocks: tuple[int, int], weighted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(nearest._BLOCK, "cpu", blocks)
@@ -164,7 +162,7 @@ def test_blocks_of_any_size_find_the_same(
         assert relative_error(gradient - 1, wanted[layer]) < 1e-12
 
 
-def test_the_first_of_equally_near_vectors_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_of_equally_near_vectors_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(nearest._BLOCK, "cpu", (2, 2))
     units = torch.eye(3)
     style = units[[2, 1, 1, 0, 2, 0, 0]]
@@ -173,7 +171,7 @@ def test_the_first_of_equally_near_vectors_counts(monkeypatch: pytest.MonkeyPatc
     assert places.tolist() == [3, 1, 0]
 
 
-def test_features_of_no_length_have_no_angle() -> None:
+def test_zero_vectors_match_nothing() -> None:
     """Zero vectors, and vectors of rounding size, count as far from everything and get no gradient."""
     own, style = features((3, 4), (6, 4), 1), features((2, 2), (6, 4), 2)
     for part in own.values():
@@ -191,7 +189,7 @@ def test_features_of_no_length_have_no_angle() -> None:
     assert gradient[2].abs().max() > 0
 
 
-def test_a_style_of_no_length_pulls_at_nothing() -> None:
+def test_zero_style_vectors_give_no_gradient() -> None:
     own = features((3, 4), (6,), 1)
     vectors = vectors_of({"relu3_1": torch.zeros((2, 2, 6), dtype=torch.float64)})
     found = Matches.of(own, vectors, EPS)
@@ -201,7 +199,7 @@ def test_a_style_of_no_length_pulls_at_nothing() -> None:
     assert gradient.abs().max() == 0
 
 
-def test_what_is_no_number_does_not_look_like_one() -> None:
+def test_nan_features_give_nan_gradients() -> None:
     """NaN reaches the gradient, which stops a run that diverges."""
     own, style = features((3, 4), (6,), 1), features((2, 2), (6,), 2)
     own["relu3_1"][1, 2, 3] = torch.nan
@@ -213,7 +211,7 @@ def test_what_is_no_number_does_not_look_like_one() -> None:
 
 
 @pytest.mark.parametrize("style_loss", MATCHED)
-def test_uncovered_positions_do_not_count(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
+def test_uncovered_positions_are_ignored(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
     image, style, content, _ = setting(96, 64)
     coverage = torch.zeros((96, 64), dtype=torch.float64)
     loss = loss_of(tiny_weights, style_loss, leave_out=False)
@@ -230,7 +228,7 @@ def test_uncovered_positions_do_not_count(tiny_weights: BackboneWeights, style_l
 
 @pytest.mark.parametrize("size", [(4, 4), (7, 5), (4, 300)])
 @pytest.mark.parametrize("style_loss", MATCHED)
-def test_a_style_of_hardly_any_vector(
+def test_styles_with_few_vectors_are_matched(
     tiny_weights: BackboneWeights, style_loss: StyleLossName, size: tuple[int, int]
 ) -> None:
     loss = loss_of(tiny_weights, style_loss)
@@ -243,7 +241,7 @@ def test_a_style_of_hardly_any_vector(
     assert torch.isfinite(gradient_of(result)).all()
 
 
-def test_a_style_without_a_vector_is_refused(tiny_weights: BackboneWeights) -> None:
+def test_style_without_vectors_is_refused(tiny_weights: BackboneWeights) -> None:
     with pytest.raises(ImageError, match="The style is used at 200 x 3 pixels, too few to match"):
         loss_of(tiny_weights, "nnfm").targets.of_style(Style.of(picture(3, 200)), (100, 80))
     without_full_size = loss_of(tiny_weights, "nnfm", coarsest=40, scales=ScaleWeights((0.0, 1.0)))
@@ -278,7 +276,7 @@ def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
     assert relative_error(vectors.units, expected / expected.norm(dim=1, keepdim=True)) < 1e-12
 
 
-def test_layers_are_those_that_a_loss_reads() -> None:
+def test_layers_depend_on_the_style_loss() -> None:
     small, large = make_tiny_weights("vgg16"), make_tiny_weights("vgg19")
     assert layers_of("sos", large, content=True) == (*STYLE_LAYERS, CONTENT_LAYER)
     assert layers_of("sos", comparing_pixels(small), content=False) == (PIXELS, *STYLE_LAYERS)

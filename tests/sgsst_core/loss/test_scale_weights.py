@@ -34,11 +34,11 @@ def evaluate(
     network = FeatureNetwork(weights, dtype=dtype)
     seen, forward = [], network.forward
 
-    def looked(rgb: torch.Tensor, *, cache: bool = True) -> object:
+    def record_size(rgb: torch.Tensor, *, cache: bool = True) -> object:
         seen.append((int(rgb.shape[0]), int(rgb.shape[1])))
         return forward(rgb, cache=cache)
 
-    network.forward = looked  # type: ignore[method-assign, assignment]
+    network.forward = record_size  # type: ignore[method-assign, assignment]
     loss = SosLoss(network, tile_size=tile_size, coarsest=COARSEST, scales=ScaleWeights(values))
     targets = loss.targets.of_style(Style.of(painting), SIZE)
     result = loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
@@ -63,7 +63,7 @@ def test_float64_agrees_with_the_definition(
     assert relative_error(found.image_gradient, gradient) < 1e-9
 
 
-def test_scales_without_weight_do_not_go_through_the_network(tiny_weights: BackboneWeights) -> None:
+def test_scales_without_weight_are_not_computed(tiny_weights: BackboneWeights) -> None:
     result, seen = evaluate(tiny_weights, (0.0, 1.0))
     assert result.scales == (1,)
     assert all(height <= SIZE[0] // 2 and width <= SIZE[1] // 2 for height, width in seen)
@@ -71,7 +71,7 @@ def test_scales_without_weight_do_not_go_through_the_network(tiny_weights: Backb
 
 
 @pytest.mark.parametrize("values", [(1.0, 1.0, 1.0), (7.0, 7.0, 7.0)])
-def test_equal_weights_give_the_bits_of_none(tiny_weights: BackboneWeights, values: tuple[float, ...]) -> None:
+def test_equal_weights_are_bit_identical_to_none(tiny_weights: BackboneWeights, values: tuple[float, ...]) -> None:
     found, _ = evaluate(tiny_weights, values, dtype=torch.float32)
     expected, _ = evaluate(tiny_weights, (), dtype=torch.float32)
     assert found.image_gradient is not None
@@ -84,7 +84,7 @@ def test_equal_weights_give_the_bits_of_none(tiny_weights: BackboneWeights, valu
         torch.testing.assert_close(found.image_gradient, expected.image_gradient)
 
 
-def test_shares_add_up_and_none_is_a_mistake() -> None:
+def test_fractions_sum_to_one_and_need_a_weighted_scale() -> None:
     weights = ScaleWeights((1.0, 0.0, 3.0))
     assert weights.chosen(5) == [0, 2]
     assert EVEN.chosen(3) == [0, 1, 2]
@@ -95,12 +95,12 @@ def test_shares_add_up_and_none_is_a_mistake() -> None:
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (-1.0, 1.0), (math.nan,), (math.inf, 1.0), (1e13,), (1.0,) * 17])
-def test_weights_that_mean_nothing_are_refused(values: tuple[float, ...]) -> None:
+def test_invalid_weights_are_refused(values: tuple[float, ...]) -> None:
     with pytest.raises(SettingsError, match="scales"):
         make_settings(scales=values)
 
 
-def test_scales_that_no_view_has_are_refused() -> None:
+def test_scales_beyond_those_of_the_views_are_refused() -> None:
     views = cameras(2, 128, 96)
     check_scales((1.0, 0.0, 0.5), views, 24)
     check_scales((1.0, 0.0, 0.0, 0.0), views, 96)

@@ -58,7 +58,7 @@ def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, gray
     check_against_untiled_autograd(weights, (129, 190), [None, 64], covered, 100)
 
 
-def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny_weights):
+def test_compared_pixels_are_the_first_layer_without_gram_matrix(tiny_weights):
     """The pixel loss compares means and standard deviations of values from 0 to 256, times the squared factor."""
     weights = comparing_pixels(tiny_weights, 3.0)
     network = FeatureNetwork(weights, (PIXELS, "relu1_1"))
@@ -82,7 +82,7 @@ def test_compared_pixels_are_the_first_layer_of_all_and_have_no_gram_matrix(tiny
     assert matched.loss < 1e-9 * found.loss
 
 
-def test_the_real_network_agrees_with_untiled_autograd(vgg16_weights):
+def test_real_network_agrees_with_untiled_autograd(vgg16_weights):
     check_against_untiled_autograd(vgg16_weights, (80, 131), [64], True, 40)
 
 
@@ -138,7 +138,7 @@ class DecisionsOf(FeatureNetwork):
         return own
 
 
-def test_float32_differs_from_float64_by_flips_and_little_else(vgg16_weights):
+def test_float32_differs_from_float64_mostly_by_flips(vgg16_weights):
     case = setting((112, 163))
     image, style, content, _ = case
     _, exact = sos_reference(vgg16_weights, image, style, content)
@@ -165,7 +165,7 @@ def test_memory_budget_changes_no_result(tiny_weights, held):
     assert relative_error(tight.image_gradient, whole.image_gradient) < FLOAT32_TOLERANCE
 
 
-def test_content_features_kept_or_computed_again(tiny_weights):
+def test_cached_and_recomputed_content_agree(tiny_weights):
     network = FeatureNetwork(tiny_weights)
     image, style, content, _ = (None if t is None else t.float() for t in setting((200, 300)))
     loss = SosLoss(network)
@@ -177,7 +177,7 @@ def test_content_features_kept_or_computed_again(tiny_weights):
     assert kept.terms[0]["content"] > 0
 
 
-def test_left_out_content_and_layers(tiny_weights):
+def test_unneeded_content_and_layers_are_not_computed(tiny_weights):
     """Without content weight, the content layer and layers beyond the deepest used one are not computed."""
     image, style, content, _ = (None if t is None else t.float() for t in setting((200, 300)))
     full = SosLoss(FeatureNetwork(tiny_weights, (*STYLE_LAYERS, CONTENT_LAYER)), content_weight=0)
@@ -191,7 +191,7 @@ def test_left_out_content_and_layers(tiny_weights):
     assert len(shallow.forward(image).outputs) == 4  # conv1_1, conv1_2, pool1, conv2_1
 
 
-def test_loss_only_is_the_same_loss(tiny_weights):
+def test_loss_without_gradient_is_identical(tiny_weights):
     network = FeatureNetwork(tiny_weights)
     image, style, content, coverage = (t.float() for t in setting((200, 300), covered=True))
     loss = SosLoss(network)
@@ -202,14 +202,14 @@ def test_loss_only_is_the_same_loss(tiny_weights):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (15, 17), (16, 16), (3, 200)])
-def test_tiny_views_use_the_layers_that_they_reach(tiny_weights, size):
+def test_tiny_views_have_finite_gradients(tiny_weights, size):
     case = (picture(*size, seed=1), picture(40, 30, seed=2), picture(*size, seed=3), None)
     result = evaluate(FeatureNetwork(tiny_weights), case, None)
     assert torch.isfinite(result.image_gradient).all()
     assert result.image_gradient.abs().max() > 0
 
 
-def test_uncovered_pixels_get_no_gradient_of_their_own(tiny_weights):
+def test_pixels_far_from_covered_cells_have_zero_gradient(tiny_weights):
     """Pixels beyond the receptive field of every covered cell have zero gradient."""
     size = (400, 300)
     coverage = torch.zeros(size)

@@ -38,7 +38,7 @@ def test_style_gradient_agrees_with_autograd(weighted, dtype, tolerance):
     assert relative_error(gradient.apply(x, a), expected_gradient) < tolerance
 
 
-def test_zero_at_the_target():
+def test_loss_is_zero_at_the_target():
     x = make_features(17, 23, 12, 1)
     terms, gradient = style_loss(layer_statistics(x), LayerTarget.of(layer_statistics(x)))
     assert not terms.any()
@@ -60,7 +60,7 @@ def test_dead_channels_give_finite_gradients(dead_in):
         assert relative_error(result, expected) < 1e-5
 
 
-def test_a_map_about_the_rounded_mean_is_the_same_map():
+def test_map_about_the_rounded_mean_is_equivalent():
     """It matters if features differ by less than the rounding error of their mean, as in pixels of nearly one color."""
     x, target = nearly_one_color(), LayerTarget.of(layer_statistics(make_features(30, 20, 3, 2)))
     _, gradient = style_loss(layer_statistics(x), target, weights=TermWeights(gram=0.0))
@@ -91,7 +91,7 @@ def test_content_gradient_agrees_with_autograd(weighted):
     torch.testing.assert_close(found.gradient(), torch.autograd.grad(expected, x)[0], rtol=1e-12, atol=0)
 
 
-def test_without_any_position_loss_and_gradient_are_nothing():
+def test_loss_and_gradient_are_zero_without_positions():
     x = make_features(17, 23, 12, 1, torch.float32)
     nowhere = torch.zeros((17, 23))
     terms, gradient = style_loss(layer_statistics(x, nowhere), LayerTarget.of(layer_statistics(x)))
@@ -104,7 +104,7 @@ def test_without_any_position_loss_and_gradient_are_nothing():
     assert not content.gradient().any()
 
 
-def test_terms_are_added_up_in_their_order_to_the_bit():
+def test_terms_are_summed_in_their_order():
     """An exact sum (`math.fsum`, or `sum` in later versions of Python) has another last digit."""
     terms = LossTerms(content=3.0, std=1e16, mean=1.0, gram=1.0)
     assert list(terms) == list(TERMS)
@@ -120,14 +120,14 @@ def test_terms_add_divide_and_compare_by_name():
     assert LossTerms().total == 0.0
 
 
-def test_terms_travel_between_processes_and_cannot_be_changed():
+def test_terms_are_picklable_and_immutable():
     terms = LossTerms(gram=1 / 3, content=2.5e-30)
     assert pickle.loads(pickle.dumps(terms)) == copy.deepcopy(terms) == terms
     with pytest.raises(TypeError):
         terms["gram"] = 1.0
 
 
-def test_a_term_that_is_not_declared_is_refused():
+def test_undeclared_terms_are_refused():
     with pytest.raises(TypeError, match="no term color; it has gram, mean"):
         LossTerms(color=1.0)
     with pytest.raises(KeyError):

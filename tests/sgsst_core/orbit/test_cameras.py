@@ -23,7 +23,7 @@ from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.orbit.objects import UP, box, figure, joined, moved, scene_of
 
 PIXELS = RESOLUTION**2 * 3 / 4
-TURN = Rotation.from_euler("xyz", [40, 65, -130], degrees=True)
+ROTATION = Rotation.from_euler("xyz", [40, 65, -130], degrees=True)
 
 
 def project(view: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,7 +47,7 @@ def elevation(view: Camera, middle: Tensor, up: Tensor) -> float:
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (1, 0, 0), (0.3, -2, 0.9)])
 @pytest.mark.parametrize("size", [0.01, 1.0, 300.0])
 @pytest.mark.parametrize("shape", [None, (360, 480)])
-def test_every_frame_shows_the_whole_object_and_is_filled_by_it(
+def test_every_frame_contains_the_object_and_is_filled_by_it(
     up: tuple[float, float, float], size: float, shape: tuple[int, int] | None
 ) -> None:
     means = box((-0.5, -1.5, -0.3), (0.5, 1.5, 0.3), 3000) * size + torch.tensor([5.0, -7.0, 2.0]) * size
@@ -106,9 +106,9 @@ def test_cameras_are_distributed_over_rings_by_circumference() -> None:
 
 
 def test_cameras_follow_rotation_and_scale_of_the_scene() -> None:
-    scene, matrix = figure(), torch.from_numpy(TURN.as_matrix())
+    scene, matrix = figure(), torch.from_numpy(ROTATION.as_matrix())
     before = orbit(scene, 9, up=UP, elevations=[10.0, 40.0])
-    after = orbit(moved(scene, TURN, 3.0, (5, -2, 7)), 9, up=TURN.apply(UP).tolist(), elevations=[10.0, 40.0])
+    after = orbit(moved(scene, ROTATION, 3.0, (5, -2, 7)), 9, up=ROTATION.apply(UP).tolist(), elevations=[10.0, 40.0])
     shift = torch.tensor([5.0, -2.0, 7.0], dtype=torch.float64)
     size = 3 * find_subject(scene).size
     for old, new in zip(before, after, strict=True):
@@ -148,8 +148,8 @@ ODD = {
     "a stick": scene_of(torch.linspace(-2, 2, 300)[:, None] * torch.tensor([0.0, 1.0, 0.0])),
     "a sheet": scene_of(box((-2, 0, -2), (2, 0, 2), 2000)),
     "a far outlier": joined(figure(), scene_of(torch.tensor([[1e5, 0.0, 0.0]]))),
-    "small": moved(figure(), TURN, 1e-6),
-    "large": moved(figure(), TURN, 1e6),
+    "small": moved(figure(), ROTATION, 1e-6),
+    "large": moved(figure(), ROTATION, 1e6),
 }
 
 
@@ -192,7 +192,7 @@ def fill(scene: Scene, views: list[Camera]) -> list[float]:
     return [float(rasterizer.coverage(resized(view, 256)).mean()) for view in views]
 
 
-def test_biker_views_are_portraits_that_it_fills(shared_data: Path) -> None:
+def test_biker_fills_its_portrait_views(shared_data: Path) -> None:
     scene = read_scene(shared_data / "scenes" / "biker" / "point_cloud.ply").scene
     views = orbit(scene, 8, elevations=[10.0, 40.0])
     shares = fill(scene, views)

@@ -80,7 +80,7 @@ def test_degenerate_scenes_have_a_finite_extent_that_contains_them(scene: object
     assert len(subject.points)
 
 
-def test_a_zero_quaternion_counts_as_no_rotation() -> None:
+def test_zero_quaternion_counts_as_no_rotation() -> None:
     scene = scene_of(OBJECT.means)
     scene.quats[0] = 0
     assert torch.allclose(extent(scene), extent(OBJECT))
@@ -94,7 +94,7 @@ def test_subject_of_a_large_scene_is_estimated_from_a_sample() -> None:
     assert len(find_subject(many).points) <= 20_000
 
 
-def test_weighted_quantiles_and_directions() -> None:
+def test_quantiles_are_weighted_and_directions_spread() -> None:
     values, weights = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([1.0, 1.0, 2.0])
     assert [quantile(values, weights, fraction) for fraction in (0.0, 0.25, 0.5, 0.75, 1.0)] == [1, 1, 2, 2, 3]
     directions = spread_directions(300)

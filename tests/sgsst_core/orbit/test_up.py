@@ -13,16 +13,20 @@ from sgsst_core.orbit.up import Up, find_up
 from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.orbit.objects import UP, ball, box, figure, ground, joined, moved, scene_of
 
-TURNS = [Rotation.identity(), Rotation.from_euler("xyz", [40, 65, -130], degrees=True), Rotation.from_rotvec([2, 1, 1])]
+ROTATIONS = [
+    Rotation.identity(),
+    Rotation.from_euler("xyz", [40, 65, -130], degrees=True),
+    Rotation.from_rotvec([2, 1, 1]),
+]
 
 
 def found(scene: Scene) -> Up:
     return find_up(find_subject(scene))
 
 
-def degrees(up: Up, turn: Rotation) -> float:
+def degrees(up: Up, rotation: Rotation) -> float:
     """Return the angle in degrees between the estimated and the true up direction."""
-    expected = torch.from_numpy(turn.apply(UP))
+    expected = torch.from_numpy(rotation.apply(UP))
     return math.degrees(math.acos(min(1.0, float(up.direction @ expected))))
 
 
@@ -32,19 +36,19 @@ def lamp() -> Scene:
     return joined(ground(), scene_of(torch.cat([pole, ball((0, -1.2, 0), 0.3, 900)])))
 
 
-@pytest.mark.parametrize("turn", TURNS)
-def test_up_follows_from_the_ground_for_any_rotation(turn: Rotation) -> None:
-    up = found(moved(lamp(), turn, 3.0, (5, -2, 7)))
-    assert degrees(up, turn) < 1.5
+@pytest.mark.parametrize("rotation", ROTATIONS)
+def test_up_follows_from_the_ground_for_any_rotation(rotation: Rotation) -> None:
+    up = found(moved(lamp(), rotation, 3.0, (5, -2, 7)))
+    assert degrees(up, rotation) < 1.5
     assert up.ground
     assert up.sure
     assert "flat layer" in up.reason
 
 
-@pytest.mark.parametrize("turn", TURNS)
-def test_standing_subject_has_its_foot_below(turn: Rotation) -> None:
-    up = found(moved(figure(), turn, 0.2))
-    assert degrees(up, turn) < 5
+@pytest.mark.parametrize("rotation", ROTATIONS)
+def test_standing_subject_has_its_foot_below(rotation: Rotation) -> None:
+    up = found(moved(figure(), rotation, 0.2))
+    assert degrees(up, rotation) < 5
     assert up.sure
     assert not up.ground
     assert "times as tall as wide" in up.reason

@@ -43,14 +43,14 @@ def test_every_pixel_belongs_to_one_rank(height: int, width: int, scales: int, s
     ("height", "width", "scales", "ranks", "least"),
     [(720, 1280, 2, 2, 1.8), (2048, 2048, 3, 2, 1.89), (3361, 5187, 4, 8, 7.0), (545, 980, 2, 4, 2.9)],
 )
-def test_shares_are_even_and_halos_few(height: int, width: int, scales: int, ranks: int, least: float) -> None:
+def test_loads_are_even_and_halos_small(height: int, width: int, scales: int, ranks: int, least: float) -> None:
     pieces = view(height, width, scales)
     shared = loads(divide(pieces, HALO, (1.0,) * ranks), HALO)
     assert min(shared) > 0.9 * max(shared)
     assert loads(divide(pieces, HALO, (1.0,)), HALO)[0] / max(shared) > least
 
 
-def test_faster_ranks_get_more() -> None:
+def test_faster_ranks_get_more_work() -> None:
     slow, fast = loads(divide(view(1024, 1024, 2), HALO, (1.0, 3.0)), HALO)
     assert fast / slow == pytest.approx(3.0, rel=0.05)
 
@@ -64,7 +64,7 @@ def test_ranks_without_work_have_no_pieces() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(height=st.integers(1, 500), count=st.integers(1, 40), data=st.data())
-def test_bands_follow_each_other_over_all_rows(height: int, count: int, data: st.DataObject) -> None:
+def test_bands_partition_all_rows(height: int, count: int, data: st.DataObject) -> None:
     top = data.draw(st.integers(0, height - 1))
     bottom = data.draw(st.integers(top + 1, height))
     bands = divide_rows(height, count, (top, bottom))
@@ -75,10 +75,10 @@ def test_bands_follow_each_other_over_all_rows(height: int, count: int, data: st
     assert all(start % 16 == 0 for start, _ in bands if start < height)
 
 
-def test_covered_rows_are_shared_equally() -> None:
+def test_covered_rows_are_divided_equally() -> None:
     assert divide_rows(480, 2, (320, 384)) == [(0, 352), (352, 480)]
 
 
-def test_several_ranks_hold_all_scales_at_once() -> None:
+def test_several_ranks_evaluate_all_scales_together() -> None:
     assert rounds([0, 1, 2], 1) == [[0], [1], [2]]
     assert rounds([0, 1, 2], 2) == [[0, 1, 2]]

@@ -10,7 +10,7 @@ from sgsst_core.parallel.shown import DENSE_FRACTION, ShownGaussians, gaussians_
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("gaussians", [0, 1, 7, 8, 9, 1001])
-def test_a_set_holds_what_its_mask_says(gaussians: int, share: float) -> None:
+def test_set_contains_the_gaussians_of_its_mask(gaussians: int, share: float) -> None:
     mask = torch.rand(gaussians, generator=torch.Generator().manual_seed(gaussians)) < share
     shown = ShownGaussians(mask)
     for found in (shown.indices(), shown._device_indices()):
@@ -19,7 +19,7 @@ def test_a_set_holds_what_its_mask_says(gaussians: int, share: float) -> None:
     assert shown._bits.nbytes == ShownGaussians.nbytes(gaussians)
 
 
-def test_a_gradient_travels_whole_where_nearly_all_are_shown() -> None:
+def test_whole_gradient_is_sent_if_nearly_all_are_shown() -> None:
     assert gaussians_sent(300, 1000) == 300
     assert gaussians_sent(DENSE_FRACTION * 1000 + 1, 1000) == 1000
     assert gaussians_sent(2000, 1000) == 1000, "a survey counts pruned ones too"

@@ -101,7 +101,9 @@ def test_unseen_gaussians_are_left_out_unless_requested() -> None:
         (0, 0, (), "no view directions are computed: the scene has degree 0"),
     ],
 )
-def test_spherical_harmonics(degree: int, used: int, keep: tuple[Any, ...], expected: str | None) -> None:
+def test_unused_spherical_harmonics_are_skipped(
+    degree: int, used: int, keep: tuple[Any, ...], expected: str | None
+) -> None:
     plan = plan_of(probe(sh_degree=degree, used_degree=used), keep=keep)
     assert (text_of(plan, "spherical harmonics") if expected else line(plan, "spherical harmonics")) == expected
 

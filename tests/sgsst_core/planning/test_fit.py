@@ -54,11 +54,11 @@ def verdict(scene: Scene, views: list[Camera]) -> str:
 
 
 @pytest.mark.parametrize("scene", [wall(), ball()])
-def test_cameras_of_the_scene_are_fine(scene: Scene) -> None:
+def test_cameras_of_the_scene_give_no_warning(scene: Scene) -> None:
     assert frame_warnings(scene, cameras(), NEAR) == []
 
 
-def test_a_scene_that_is_partly_in_view_is_reported() -> None:
+def test_gaussians_with_centers_in_the_frame_count_as_shown() -> None:
     """A Gaussian counts as shown if its center is in the frame."""
     shown = shown_by(torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0], [0.0, 0.0, 0.1], [1.4, 0, 3]]), cameras(3), NEAR)
     assert shown.typical == 0.5  # the views at the sides show the point at x = 1.4 or do not
@@ -70,7 +70,7 @@ def test_cameras_that_see_nothing_are_refused() -> None:
         frame_warnings(wall(), [blind_camera()], NEAR)
 
 
-def test_the_plush_is_fine_and_its_cameras_in_other_frames_are_not(shared_data: Path) -> None:
+def test_real_cameras_are_reported_only_in_other_frames(shared_data: Path) -> None:
     folder = shared_data / "scenes" / "snowmiku_plush"
     scene, own = read_scene(folder / "point_cloud.ply").scene, read_cameras(folder / "cameras.json")
     for count in (1, 2, 3, 8, 97):
@@ -92,7 +92,7 @@ def test_the_plush_is_fine_and_its_cameras_in_other_frames_are_not(shared_data: 
         ("playbot_synthetic_sh2", []),  # around the origin, every rotation shows it
     ],
 )
-def test_orbits_of_scans_are_fine(shared_data: Path, name: str, away: list[str]) -> None:
+def test_orbits_of_scans_give_no_warning(shared_data: Path, name: str, away: list[str]) -> None:
     (path,) = (shared_data / "scenes" / name).iterdir()
     scene = read_scene(path, drop_invalid=True).scene
     views = make_orbit(scene, OrbitRequest(24, None, None, None, NEAR)).cameras
@@ -113,7 +113,7 @@ def rendered(folder: Path, scene: Scene, views: list[Camera]) -> list[Photo]:
     return [photo for photo in check_photos(folder, views) if photo]
 
 
-def test_photos_of_the_views_are_fine(tmp_path: Path) -> None:
+def test_matching_photos_give_no_warning(tmp_path: Path) -> None:
     scene, views = wall(), cameras()
     photos = rendered(tmp_path, scene, views)
     assert compare_photos(scene, views, photos, NEAR) == (photos, [])
@@ -131,7 +131,7 @@ def test_cropped_photos_are_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("applied", [False, True])
-def test_the_orientation_that_resembles_the_scene_is_used(tmp_path: Path, applied: bool) -> None:
+def test_orientation_that_resembles_the_scene_is_used(tmp_path: Path, applied: bool) -> None:
     scene, views = wall(), cameras()
     for photo in rendered(tmp_path, scene, views):
         exif = Image.Exif()
@@ -144,7 +144,7 @@ def test_the_orientation_that_resembles_the_scene_is_used(tmp_path: Path, applie
     assert line.decision == f"the EXIF orientation of 3 photos is {'applied' if applied else 'ignored'}"
 
 
-def test_real_photos_are_fine_and_cropped_ones_are_not(shared_data: Path, tmp_path: Path) -> None:
+def test_real_photos_are_reported_only_if_cropped(shared_data: Path, tmp_path: Path) -> None:
     scenes, folder = shared_data / "scenes" / "snowmiku_plush", shared_data / "photos" / "snowmiku_plush"
     scene, views = read_scene(scenes / "point_cloud.ply").scene, spread(read_cameras(folder / "cameras.json"), 4)
     photos = [photo for photo in check_photos(folder / "images", views) if photo]
@@ -162,7 +162,7 @@ def test_real_photos_are_fine_and_cropped_ones_are_not(shared_data: Path, tmp_pa
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["biker", "broche", "playbot_synthetic_sh2"])
 def test_photos_of_scans_may_have_a_background(shared_data: Path, tmp_path: Path, name: str) -> None:
-    """Photos are darker renders at 1024 pixels before a picture, with noise."""
+    """Photos are darker renders at 1024 pixels in front of an image, with noise."""
     (path,) = (shared_data / "scenes" / name).iterdir()
     scene = read_scene(path, drop_invalid=True).scene
     views = [resized(view, 1024) for view in make_orbit(scene, OrbitRequest(3, None, None, None, NEAR)).cameras]
@@ -191,7 +191,7 @@ def reference_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:
     return -10 * math.log10(error / (3 * float(weight.double().sum())))
 
 
-def test_psnr_ignores_exposure_and_what_is_uncovered() -> None:
+def test_psnr_ignores_exposure_and_uncovered_pixels() -> None:
     render, noise = (picture(20, 30, seed=seed, dtype=torch.float32) for seed in (1, 2))
     photo, weight = 0.9 * render + 0.1 * noise, noise[..., 0]
     assert fitted_psnr(photo, render, weight) == pytest.approx(reference_psnr(photo, render, weight), abs=1e-6)

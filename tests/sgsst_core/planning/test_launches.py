@@ -72,7 +72,7 @@ def test_launch_cost_without_graph_states_the_problem(
 @pytest.mark.parametrize(
     ("version", "problem"), [("2.12.1", "PyTorch 2.13 or later is needed"), ("2.13.0", "not here")]
 )
-def test_a_failed_capture_does_not_break_the_process(
+def test_failed_capture_does_not_break_the_process(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, version: str, problem: str
 ) -> None:
     network = FeatureNetwork(tiny_weights, device="cuda")
@@ -92,7 +92,7 @@ def test_a_failed_capture_does_not_break_the_process(
 
 
 @pytest.mark.parametrize(("capability", "chosen"), [((7, 5), "float32"), ((8, 0), "bfloat16")])
-def test_bfloat16_is_not_used_where_it_is_emulated(
+def test_bfloat16_is_not_used_if_it_is_emulated(
     counts: Counts,
     tiny_weights: BackboneWeights,
     monkeypatch: pytest.MonkeyPatch,

@@ -39,7 +39,7 @@ def expected(plan: Plan) -> Prediction:
 
 
 @pytest.mark.parametrize("total", [1, 2, 3, 24, 300, 20_000])
-def test_levels_measure_the_end_and_never_more_than_the_level_before(total: int) -> None:
+def test_levels_measure_the_end_and_decrease_in_cost(total: int) -> None:
     prices = Prices(3.0, 0.5, 0.25)
     costs = [prices.of(level, len(level.moments(total))) for level in LEVELS]
     assert all(level.moments(total)[-1] == total for level in LEVELS[:NOTHING])

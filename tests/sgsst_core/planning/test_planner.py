@@ -45,7 +45,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_what_is_left_out_changes_nothing(tiny_weights: BackboneWeights, name: str) -> None:
+def test_skipped_work_does_not_change_results(tiny_weights: BackboneWeights, name: str) -> None:
     scene, views = SCENES[name], [resized(camera, 120) for camera in cameras(2)]
     lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
     first = [stylizer.run_step() for stylizer in (lean, full)]
@@ -59,7 +59,7 @@ def test_what_is_left_out_changes_nothing(tiny_weights: BackboneWeights, name: s
 
 
 @pytest.mark.parametrize("item", EVERYTHING)
-def test_each_item_alone_changes_nothing(tiny_weights: BackboneWeights, item: Item) -> None:
+def test_skipping_a_single_item_does_not_change_results(tiny_weights: BackboneWeights, item: Item) -> None:
     """There are enough steps to cache blend weights, and every item has something to leave out."""
     scene, views = higher_bands_of_zeros(behind(ball())), cameras(1)
     lean, other = (make(scene, views, tiny_weights, steps_sos=5, keep=keep) for keep in ((), (item,)))
@@ -97,7 +97,7 @@ def test_rendering_without_unseen_gaussians_is_bit_identical(tiny_weights: Backb
         assert torch.equal(*images)
 
 
-def test_decisions_name_what_is_left_out(tiny_weights: BackboneWeights) -> None:
+def test_decisions_name_skipped_work(tiny_weights: BackboneWeights) -> None:
     near = ball()
     scene = higher_bands_of_zeros(behind(replace(near, means=near.means + torch.tensor([0.0, 0, 4]))))
     views = [resized(camera, 320) for camera in cameras(2)]

@@ -129,7 +129,7 @@ def test_progress_assumes_that_other_ranks_are_as_fast() -> None:
     assert progress_of(3, 5, 2, 6.0) == PlanningProgress(5, 5, 0.0)
 
 
-def test_a_plan_needs_cameras_that_see_something(tiny_weights: BackboneWeights) -> None:
+def test_plan_requires_cameras_that_see_the_scene(tiny_weights: BackboneWeights) -> None:
     for views, message in (([], "There are no cameras"), ([blind_camera()], "None of the 1 cameras sees")):
         with pytest.raises(CameraError, match=message):
             make_plan(wall(), views, make_settings(), weights=tiny_weights)

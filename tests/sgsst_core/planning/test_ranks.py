@@ -88,7 +88,7 @@ def test_large_numbers_of_ranks_are_tried_in_increasing_steps() -> None:
     assert len(found.seconds) < 25
 
 
-def test_pixels_that_do_not_fit_pass_forward_twice() -> None:
+def test_pixels_beyond_memory_are_recomputed() -> None:
     """Two ranks on one machine have half of its memory each, and cache the activations of all scales."""
     pixels = 1.25 * 720 * 1280
     roomy = replace(work(), forward=1e-6, held=2 * pixels, working=0.1, sharing=2)

@@ -157,7 +157,7 @@ def test_pixels_of_a_plane_move_by_its_homography(first: Camera, tolerance: floa
     torch.testing.assert_close(z, (DEPTH - other.center[2]) / slope, rtol=tolerance / 20, atol=0)
 
 
-def test_warp_shows_the_plane_as_the_other_camera_would_see_it():
+def test_warp_reproduces_the_image_of_the_other_camera():
     scene = plane(5, 4, DEPTH)
     cameras = [camera((0.4, -0.1, 0)), camera((1.0, -0.4, 0.4))]
     rasterizer = make_rasterizer("cpu", scene)
@@ -174,7 +174,7 @@ def test_warp_shows_the_plane_as_the_other_camera_would_see_it():
     assert not warped[~valid].any()
 
 
-def test_bands_of_rows_change_nothing(monkeypatch):
+def test_row_bands_do_not_change_results(monkeypatch):
     scene = plane(5, 4, DEPTH)
     cameras = ring(2)
     rasterizer = make_rasterizer("cpu", scene)
@@ -187,7 +187,7 @@ def test_bands_of_rows_change_nothing(monkeypatch):
         assert torch.equal(getattr(whole, part), getattr(banded, part))
 
 
-def test_what_the_other_view_cannot_see_is_masked():
+def test_pixels_hidden_in_the_other_view_are_masked():
     red, blue = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])
     scene = joined(plane(6, 4, DEPTH, blue), plane(0.4, 0.4, 2.0, red))
     cameras = [camera((0, 0, 0)), camera((1, 0, 0), (1, 0, DEPTH))]
@@ -224,7 +224,7 @@ def test_identical_cameras_give_zero(lpips):
     assert measure(scene, [camera((0.3, 0.2, 0))] * 2).compared == 1.0
 
 
-def test_inconsistent_colors_give_large_values_and_consistent_ones_small(lpips):
+def test_inconsistent_colors_give_larger_values(lpips):
     scene = plane(5, 4, DEPTH)
     cameras = ring(3)
     rasterizer = make_rasterizer("cpu", scene)
@@ -242,7 +242,7 @@ def test_inconsistent_colors_give_large_values_and_consistent_ones_small(lpips):
     assert different.compared == same.compared > 0.8
 
 
-def test_rmse_is_that_of_the_compared_pixels_and_pictures_are_clamped():
+def test_rmse_covers_compared_pixels_of_clamped_images():
     scene = plane(5, 4, DEPTH)
     cameras = ring(2)
     rasterizer = make_rasterizer("cpu", scene)
@@ -251,7 +251,7 @@ def test_rmse_is_that_of_the_compared_pixels_and_pictures_are_clamped():
     assert result.lpips is None
 
 
-def test_pairs_that_see_nothing_in_common_have_no_value(lpips):
+def test_pairs_without_overlap_have_no_value(lpips):
     scene = plane(2, 2, DEPTH)
     behind = camera((0, 0, 0), (0, 0, -DEPTH))  # looks away from the plane and sees nothing
     other_side = camera((0, 0, 3 * DEPTH))  # sees the plane from behind, which is the same surface
@@ -285,7 +285,7 @@ def test_depth_does_not_depend_on_the_background():
     torch.testing.assert_close(black.depth, white.depth, rtol=1e-6, atol=0)
 
 
-def test_a_world_moved_far_away_gives_the_same_values():
+def test_distance_from_the_origin_does_not_change_values():
     scene = plane(5, 4, DEPTH)
     offset = torch.tensor([2.0**18, -(2.0**17), 2.0**19])
     moved = replace(scene, means=scene.means + offset)
@@ -319,7 +319,7 @@ def test_pairs_are_compared_in_their_order():
     assert all(pair.rmse == pytest.approx(0.2, rel=1e-5) for pair in result.pairs)
 
 
-def test_pictures_that_cannot_be_compared_are_named():
+def test_incomparable_images_are_refused_by_name():
     scene = plane(1, 1, DEPTH)
     rasterizer = make_rasterizer("cpu", scene)
     with pytest.raises(ValueError, match=r"'view': shape \(48, 63, 3\), not \(48, 64, 3\)"):
@@ -328,7 +328,7 @@ def test_pictures_that_cannot_be_compared_are_named():
         consistency_of(lambda i: torch.full((48, 64, 3), math.nan), ring(2), rasterizer, scene, 1)
 
 
-def test_a_real_scene_is_more_consistent_at_short_than_at_long_range(shared_data, lpips):
+def test_real_scene_is_more_consistent_at_short_than_at_long_range(shared_data, lpips):
     folder = shared_data / "scenes" / "snowmiku_plush"
     scene = read_scene(folder / "point_cloud.ply").scene
     cameras = [resized(c, 200) for c in read_cameras(folder / "cameras.json")]

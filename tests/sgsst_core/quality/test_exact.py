@@ -34,7 +34,7 @@ def make(weights: BackboneWeights, scene: object = None, **values: Any) -> Styli
     return Stylizer.planned(scene or ball(500), cameras(2), style(), settings, weights=weights)  # type: ignore[arg-type]
 
 
-def test_an_exact_job_agrees_with_its_reference(tiny_weights: BackboneWeights) -> None:
+def test_float32_job_agrees_with_its_reference(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, wall(sh_degree=2))
     stylizer.run_step()
     reference = Float32Reference(stylizer)
@@ -56,7 +56,7 @@ def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights
     assert error.seconds_exact > 0
 
 
-def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeights) -> None:
+def test_initial_error_can_be_measured_later(tiny_weights: BackboneWeights) -> None:
     """The error has the same value as if it was measured before the first step, and colors are not affected."""
     stylizer = make(tiny_weights, cached_weights="half")
     reference = Float32Reference(stylizer)
@@ -75,7 +75,7 @@ def test_the_error_at_the_start_can_be_measured_late(tiny_weights: BackboneWeigh
     assert reference.gradient_error().relative_error != first.relative_error
 
 
-def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -> None:
+def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) -> None:
     """The plan is constructed by hand, and TF32 is emulated, because a CPU would use float32."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12, warm_start=False)
     plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)
@@ -93,7 +93,7 @@ def test_tf32_is_measured_against_whole_float32(tiny_weights: BackboneWeights) -
     assert errors[1].cosine > 0.98
 
 
-def test_bfloat16_has_an_error_between_rounding_and_nonsense(tiny_weights: BackboneWeights) -> None:
+def test_bfloat16_error_is_plausible(tiny_weights: BackboneWeights) -> None:
     """The plan is constructed by hand, so that the precision does not depend on the processor."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12)
     plan, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)

@@ -45,27 +45,27 @@ def seen_by(folder: Path, scene: Scene, views: list[Camera]) -> dict[str, Findin
     return {finding.what: finding for finding in view_findings(file, views, rasterizer, near=NEAR)}
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_a_survey_takes_the_place_of_another_look(tmp_path: Path, turned: bool) -> None:
+@pytest.mark.parametrize("looks_away", [False, True])
+def test_existing_survey_gives_the_same_findings(tmp_path: Path, looks_away: bool) -> None:
     """Findings have the same text as without an existing survey. One camera looks away and sees nothing."""
     file, views = stored(tmp_path, wall()), cameras()
-    if turned:
+    if looks_away:
         away = views[0].world_to_camera.clone()
-        away[[0, 2]] *= -1  # half a turn about the camera's own vertical axis
+        away[[0, 2]] *= -1  # rotation by 180 degrees about the camera's own vertical axis
         views[0] = replace(views[0], world_to_camera=away)
     survey = survey_views(file.scene, views, make_rasterizer("cpu", file.scene, near=NEAR))
     reread = findings_of(file, views, style(), near=NEAR)
     assert findings_of(file, views, style(), near=NEAR, survey=survey) == reread
-    assert any("see no Gaussian" in finding.what for finding in reread) == turned
+    assert any("see no Gaussian" in finding.what for finding in reread) == looks_away
     assert any("in no view" in finding.what for finding in reread)
 
 
-def the(found: dict[str, Finding], text: str) -> Finding:
+def finding_about(found: dict[str, Finding], text: str) -> Finding:
     (match,) = [finding for what, finding in found.items() if text in what]
     return match
 
 
-def test_nothing_extreme_is_found_in_an_ordinary_scene(tmp_path: Path) -> None:
+def test_ordinary_scene_has_no_findings(tmp_path: Path) -> None:
     scene = replace(wall(), opacities=torch.full((len(wall()),), -1.0))
     assert found_in(tmp_path, scene) == {}
     # The wall extends beyond what its cameras see of it.
@@ -93,13 +93,13 @@ def test_extreme_gaussians_are_counted_and_the_worst_is_named(
 ) -> None:
     scene = replace(wall(sh_degree=1), opacities=torch.full((len(wall()),), 2.0))
     getattr(scene, column)[rows] = value
-    finding = the(found_in(tmp_path, scene), what)
+    finding = finding_about(found_in(tmp_path, scene), what)
     assert (finding.count, finding.total) == (len(rows), len(scene))
     assert finding.worst.startswith(worst)
     assert finding.done
 
 
-def test_a_scene_is_looked_at_in_parts_of_any_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_findings_do_not_depend_on_the_slice_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Findings do not depend on the slice size; among equal values, the first one is reported."""
     scene = wall(sh_degree=1)
     for column, values in (("quats", (1e-20, 1e20)), ("scales", (200.0, 5.0, -1e6)), ("sh_dc", (-1e4, 1e4))):
@@ -114,7 +114,7 @@ def test_a_scene_is_looked_at_in_parts_of_any_size(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.parametrize("far", [0.0, 1e6])
 @pytest.mark.parametrize("distance", [1e-3, 0.3, 10.0])
-def test_gaussians_close_to_cameras_are_those_of_all_distances(distance: float, far: float) -> None:
+def test_gaussians_close_to_cameras_match_all_distances(distance: float, far: float) -> None:
     generator = torch.Generator().manual_seed(0)
     means = (torch.randn((500, 3), generator=generator) + far).float()
     centers = torch.cat([means[:40].double(), torch.randn((20, 3), generator=generator, dtype=torch.float64) + far])
@@ -124,30 +124,30 @@ def test_gaussians_close_to_cameras_are_those_of_all_distances(distance: float, 
     assert max(expected) > 0
 
 
-def test_needles_are_found_and_discs_are_not(tmp_path: Path) -> None:
+def test_needles_are_reported_and_discs_are_not(tmp_path: Path) -> None:
     scene = wall()
     scene.scales[:] = torch.tensor([0.1, 0.1, 1e-6]).log()
     scene.scales[6] = torch.tensor([0.5, 1e-5, 1e-6]).log()
-    finding = the(found_in(tmp_path, scene), "needles")
+    finding = finding_about(found_in(tmp_path, scene), "needles")
     assert (finding.count, finding.worst) == (1, "Gaussian 6: 5e+04")
 
 
-def test_invalid_rows_are_told_and_indices_are_those_of_the_file(tmp_path: Path) -> None:
+def test_invalid_rows_are_reported_with_file_indices(tmp_path: Path) -> None:
     scene = wall()
     scene.means[2, 1] = math.nan
     scene.sh_dc[5, 0] = math.inf
     scene.quats[20] = 0
     scene.scales[21, 1] = 5.0
     found = found_in(tmp_path, scene)
-    invalid = the(found, "NaN or infinite")
+    invalid = finding_about(found, "NaN or infinite")
     assert (invalid.count, invalid.total, invalid.worst) == (3, len(scene), "first: Gaussian 2")
     assert "--drop-invalid" in invalid.done
-    assert the(found, "longer than the scene's extent").worst.startswith("Gaussian 21: ")
+    assert finding_about(found, "longer than the scene's extent").worst.startswith("Gaussian 21: ")
 
 
-def test_a_world_far_from_its_origin_is_told_with_what_is_lost(tmp_path: Path) -> None:
+def test_scene_far_from_origin_is_reported_with_its_resolution(tmp_path: Path) -> None:
     scene = replace(wall(), means=wall().means + torch.tensor([1e6, 0.0, 0.0]))
-    finding = the(found_in(tmp_path, scene), "far from its origin")
+    finding = finding_about(found_in(tmp_path, scene), "far from its origin")
     assert "positions are 0.0625 apart" in finding.worst
 
 
@@ -159,7 +159,7 @@ def test_extent_ignores_a_few_floaters() -> None:
     assert after < 1.5 * before
 
 
-def test_unseen_and_hardly_seen_gaussians_are_those_of_the_blend_weights(tmp_path: Path) -> None:
+def test_unseen_and_hardly_seen_gaussians_follow_blend_weights(tmp_path: Path) -> None:
     scene = wall()
     scene.means[:10, 2] = -3.0  # behind every camera
     scene.means[10:12] = torch.tensor([0.0, 0.0, 5.0])  # faint, behind two opaque layers
@@ -169,20 +169,20 @@ def test_unseen_and_hardly_seen_gaussians_are_those_of_the_blend_weights(tmp_pat
     file = stored(tmp_path, scene)
     rasterizer = make_rasterizer("reference", file.scene)
     weights: Any = sum(rasterizer.color_gradient(torch.ones(c.height, c.width, 3), c)[:, 0] for c in cameras())
-    unseen = the(found, "in no view")
+    unseen = finding_about(found, "in no view")
     assert unseen.count == int((weights == 0).sum()) >= 10
-    hardly = the(found, "hardly seen")
+    hardly = finding_about(found, "hardly seen")
     assert hardly.count == int(((weights > 0) & (weights < 1 / 255)).sum()) > 0
 
 
-def test_views_of_an_object_are_told_apart_from_views_of_nothing(tmp_path: Path) -> None:
+def test_blind_views_are_distinguished_from_uncovered_views(tmp_path: Path) -> None:
     found = seen_by(tmp_path, ball(), [*cameras(), blind_camera()])
-    assert the(found, "see no Gaussian").worst.startswith("'blind'")
-    uncovered = the(found, "uncovered")
+    assert finding_about(found, "see no Gaussian").worst.startswith("'blind'")
+    uncovered = finding_about(found, "uncovered")
     assert (uncovered.count, uncovered.total) == (3, 4)
 
 
-def test_extreme_lenses_and_sizes_are_told(tmp_path: Path) -> None:
+def test_extreme_lenses_and_sizes_are_reported(tmp_path: Path) -> None:
     view = cameras(1)[0]
     views = [
         replace(view, name="wide", fx=3.0, fy=3.0),
@@ -191,29 +191,29 @@ def test_extreme_lenses_and_sizes_are_told(tmp_path: Path) -> None:
         replace(view, name="small", height=9, cy=4.5),
     ]
     found = seen_by(tmp_path, wall(), views)
-    assert the(found, "above 140 degrees").worst.startswith("'wide': 169")
-    assert the(found, "below 1 degree").worst.startswith("'narrow'")
-    assert the(found, "principal point").worst.startswith("'shifted'")
-    assert the(found, "fewer than 16 pixels on a side").worst == "'small': 9"
+    assert finding_about(found, "above 140 degrees").worst.startswith("'wide': 169")
+    assert finding_about(found, "below 1 degree").worst.startswith("'narrow'")
+    assert finding_about(found, "principal point").worst.startswith("'shifted'")
+    assert finding_about(found, "fewer than 16 pixels on a side").worst == "'small': 9"
 
 
-def test_cameras_inside_the_scene_are_told(tmp_path: Path) -> None:
+def test_cameras_inside_the_scene_are_reported(tmp_path: Path) -> None:
     scene = wall()
     scene.means[:4] = cameras()[1].center.float() + 0.05
-    finding = the(seen_by(tmp_path, scene, cameras()), "inside the scene")
+    finding = finding_about(seen_by(tmp_path, scene, cameras()), "inside the scene")
     assert (finding.count, finding.worst) == (1, "'view_1': 4")
 
 
-def test_a_view_with_too_many_intersections_is_told_not_raised(tmp_path: Path) -> None:
+def test_view_with_too_many_intersections_is_reported(tmp_path: Path) -> None:
     scene = wall(50, 43)
     scene.scales[:] = 6.0
     scene.opacities[:] = 2.0
     view = replace(cameras(1)[0], width=16384, height=16384, fx=8e3, fy=8e3, cx=8192, cy=8192)
-    finding = the(seen_by(tmp_path, scene, [view]), "cannot be rendered")
+    finding = finding_about(seen_by(tmp_path, scene, [view]), "cannot be rendered")
     assert "can be addressed" in finding.worst
 
 
-def test_extreme_styles_are_told() -> None:
+def test_extreme_styles_are_reported() -> None:
     views = cameras()
     (flat,) = style_findings(torch.full((60, 60, 3), 0.4), views)
     assert flat.what == "one color throughout"

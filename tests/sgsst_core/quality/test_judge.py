@@ -93,7 +93,7 @@ def test_agrees_with_plain_formulas_in_float64(alex: Lpips, scene: Scene) -> Non
     assert found.features == pytest.approx(features, rel=1e-3)
 
 
-def test_the_unstylized_scene_has_its_whole_content(alex: Lpips) -> None:
+def test_unstylized_scene_has_no_content_difference(alex: Lpips) -> None:
     scene = ball()
     found = judged(judge_of(alex, scene, cameras(2)), scene.sh_dc)
     assert found.content == 0
@@ -101,7 +101,7 @@ def test_the_unstylized_scene_has_its_whole_content(alex: Lpips) -> None:
     assert found.background_sensitivity > 0  # an object has a background
 
 
-def test_a_scene_of_the_style_is_near_the_style(alex: Lpips) -> None:
+def test_scene_that_shows_the_style_is_close_to_it(alex: Lpips) -> None:
     """Distances fall from a scene of noise to one that shows the style image itself."""
     scene, view = wall(56, 44), cameras(1)[0]
     scene = replace(scene, scales=scene.scales - 0.69)
@@ -115,20 +115,20 @@ def test_a_scene_of_the_style_is_near_the_style(alex: Lpips) -> None:
     assert like.content > 0.1
 
 
-def test_views_that_show_nothing_are_left_out(alex: Lpips) -> None:
+def test_blind_views_are_skipped(alex: Lpips) -> None:
     scene = ball()
     assert [camera.name for camera in judge_of(alex, scene, [blind_camera(), *cameras(1)]).cameras] == ["view_0"]
     assert judge_of(alex, scene, [blind_camera()]).judge(scene.sh_dc) is None
     assert judge_of(alex, scene, cameras(1, 30, 20)).judge(scene.sh_dc) is None  # too small for AlexNet
 
 
-def test_large_views_are_judged_at_one_size(alex: Lpips) -> None:
+def test_large_views_are_judged_at_a_fixed_size(alex: Lpips) -> None:
     found = judge_of(alex, ball(), cameras(1, 3000, 2250)).cameras[0]
     assert (found.width, found.height) == (JUDGED_SIDE, JUDGED_SIDE * 3 // 4)
 
 
 @pytest.mark.parametrize("picture", [torch.full((1, 1, 3), 0.5), torch.zeros(40, 40, 3), torch.ones(5, 900, 3)])
-def test_extreme_styles_give_finite_figures(alex: Lpips, picture: Tensor) -> None:
+def test_extreme_styles_give_finite_values(alex: Lpips, picture: Tensor) -> None:
     """The styles are a single pixel, a black image without variance, and a line."""
     scene = ball()
     found = judged(judge_of(alex, scene, cameras(1), picture), torch.full_like(scene.sh_dc, -50.0))
@@ -136,7 +136,7 @@ def test_extreme_styles_give_finite_figures(alex: Lpips, picture: Tensor) -> Non
     assert found.saturated == 1
 
 
-def test_interior_features_are_those_that_see_no_background(alex: Lpips) -> None:
+def test_interior_features_do_not_depend_on_the_background(alex: Lpips) -> None:
     """A change of uncovered pixels changes every other feature of a layer, and none inside."""
     generator = torch.Generator().manual_seed(5)
     image, other = torch.rand(2, 200, 240, 3, generator=generator)
@@ -204,7 +204,7 @@ def test_frechet_distance_of_known_distributions() -> None:
     assert frechet_distance((zero, 0.04 * eye), (zero, 0.01 * eye)) == pytest.approx(255 * 0.1 * 3**0.5)
 
 
-def test_colors_that_no_screen_shows_are_saturated() -> None:
+def test_out_of_range_colors_are_saturated() -> None:
     colors = torch.tensor([[-0.01, 0.5, 0.5], [0.5, 0.5, 0.5], [0.2, 1.3, 0.4], [0.9, 0.1, 0.5]])
     assert saturated((colors - 0.5) / SH_C0) == 0.5
 
@@ -231,7 +231,7 @@ def test_regions_are_judged_by_their_own_styles(alex: Lpips) -> None:
     assert found[0].content == found[1].content
 
 
-def test_what_is_kept_has_no_style_to_be_judged_by(alex: Lpips) -> None:
+def test_frozen_gaussians_are_not_judged_by_a_style(alex: Lpips) -> None:
     scene, views = wall(), cameras(2)
     bright = torch.full((64, 64, 3), 0.9)
     right = (scene.means[:, 0] > 0)[:, None]
@@ -241,7 +241,7 @@ def test_what_is_kept_has_no_style_to_be_judged_by(alex: Lpips) -> None:
     assert judged(judge_of(alex, scene, views, bright), colors).color_distance > 80
 
 
-def test_equal_pictures_are_judged_as_one(alex: Lpips) -> None:
+def test_equal_style_images_are_judged_as_one(alex: Lpips) -> None:
     scene, views = wall(), cameras(2)
     mixture = Style.weighted([style(), style()], [1, 3])
     one, two = (

@@ -99,7 +99,7 @@ def test_agrees_with_the_published_code(alex: Lpips, name, changed, expected):
     assert float(result.map.mean()) == pytest.approx(expected, rel=2e-3)  # upsampling weighs the border differently
 
 
-def test_prefers_a_small_warp_to_a_blur_where_squared_error_prefers_the_blur(alex: Lpips):
+def test_prefers_a_small_warp_to_a_blur_unlike_squared_error(alex: Lpips):
     """In figure 1 of the paper, people prefer the warped patch, whereas L2 and PSNR prefer the blurred one."""
     image = photo("coffee")[100:300, 150:450]
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, 200), torch.linspace(-1, 1, 300), indexing="ij")
@@ -175,7 +175,7 @@ def test_constant_images_are_finite(alex: Lpips):
 
 
 @pytest.mark.parametrize("network", ["alex", "vgg16"])
-def test_smallest_images(vgg16_weights, network):
+def test_minimum_image_size_is_enforced(vgg16_weights, network):
     lpips = Lpips(network)
     side = lpips.minimum_side
     first, second = picture(side, 64, seed=7), picture(side, 64, seed=8)
@@ -193,14 +193,14 @@ def test_wrong_arguments_are_named(alex: Lpips, tmp_path):
         Lpips("alex", folder=tmp_path)
 
 
-def test_a_vgg16_of_other_channels_is_refused(vgg16_weights, tiny_cache, tmp_path):
+def test_vgg16_with_other_channels_is_refused(vgg16_weights, tiny_cache, tmp_path):
     shutil.copy(tiny_cache / "vgg16.safetensors", tmp_path)
     shutil.copy(cache_folder() / "lpips_vgg16.safetensors", tmp_path)
     with pytest.raises(WeightsError, match="channels of the published VGG16"):
         Lpips("vgg16", folder=tmp_path)
 
 
-def test_lpips_is_left_out_where_its_weights_are_not_installed(vgg16_weights, tmp_path):
+def test_lpips_is_skipped_without_installed_weights(vgg16_weights, tmp_path):
     assert load_lpips_or_none(folder=tmp_path) is None
     installed = load_lpips_or_none()
     assert installed is not None

@@ -45,7 +45,7 @@ def measured(stylizer: Stylizer) -> list[int]:
     return [entry["step"] for entry in stylizer.measured]
 
 
-def test_all_moments_where_they_are_cheap(tiny_weights: BackboneWeights) -> None:
+def test_cheap_measurements_cover_all_moments(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights)
     assert measured(stylizer) == [0, 1, 2, 4, 8, 16]
     first = stylizer.measured[0]
@@ -66,7 +66,7 @@ def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: Ba
     assert all(terms["nearest"] > 0 for terms in other.history[-1].terms.values())
 
 
-def test_what_the_first_view_takes_thins_the_rest_out(tiny_weights: BackboneWeights) -> None:
+def test_expensive_measurements_are_reduced_to_start_and_end(tiny_weights: BackboneWeights) -> None:
     """No time is allowed for measurements, so only the start, which is already measured, and the end are measured."""
     stylizer = make(tiny_weights, EXPENSIVE)
     assert measured(stylizer) == [0, 16]
@@ -76,7 +76,7 @@ def test_what_the_first_view_takes_thins_the_rest_out(tiny_weights: BackboneWeig
     assert len(stylizer.measured[0]["novel_view_names"]) == 1
 
 
-def test_the_end_alone_is_compared_with_nothing(tiny_weights: BackboneWeights) -> None:
+def test_final_measurement_alone_has_no_relative_value(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, level=NOTHING - 1)
     assert measured(stylizer) == [16]
     moment = stylizer.measured[0]["novel_views"]
@@ -84,11 +84,11 @@ def test_the_end_alone_is_compared_with_nothing(tiny_weights: BackboneWeights) -
     assert all(value > 0 for value in moment["gram"].values())
 
 
-def test_what_nothing_pays_for_is_not_measured(tiny_weights: BackboneWeights) -> None:
+def test_nothing_is_measured_at_the_lowest_level(tiny_weights: BackboneWeights) -> None:
     assert measured(make(tiny_weights, level=NOTHING)) == []
 
 
-def test_the_first_step_does_not_wait_for_the_start(tiny_weights: BackboneWeights) -> None:
+def test_initial_quality_is_measured_after_the_first_step(tiny_weights: BackboneWeights) -> None:
     """The initial quality is measured after the first step from the initial colors, with the same result as before."""
     before, late = make(tiny_weights), make(tiny_weights)
     Measurements(before)(before)
@@ -103,7 +103,7 @@ def test_the_first_step_does_not_wait_for_the_start(tiny_weights: BackboneWeight
     assert before.measured[0]["novel_views"] == late.measured[0]["novel_views"]
 
 
-def test_a_job_that_ends_before_the_first_moment_has_its_start_and_its_end(tiny_weights: BackboneWeights) -> None:
+def test_interrupted_job_is_measured_at_its_start_and_end(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, level=2)  # moments 0, 1, 4 and 16
     asked = iter([True])
     measure = Measurements(stylizer)
@@ -118,7 +118,7 @@ def test_a_job_that_ends_before_the_first_moment_has_its_start_and_its_end(tiny_
     assert [entry["step"] for entry in stylizer.measured] == [0, 2]
 
 
-def test_nothing_is_measured_without_a_share_and_colors_are_the_same(tiny_weights: BackboneWeights) -> None:
+def test_measuring_can_be_disabled_and_does_not_change_colors(tiny_weights: BackboneWeights) -> None:
     nothing, everything, least = (
         make(tiny_weights, measure=0.0),
         make(tiny_weights),
@@ -131,7 +131,7 @@ def test_nothing_is_measured_without_a_share_and_colors_are_the_same(tiny_weight
         assert torch.equal(nothing.stylized(), other.stylized())
 
 
-def test_a_resumed_job_is_measured_as_it_was(tiny_weights: BackboneWeights) -> None:
+def test_resumed_job_keeps_its_moments(tiny_weights: BackboneWeights) -> None:
     """A new plan or other measured costs do not change the number of measurements that was decided initially."""
     for prediction, steps in ((LONG, [0, 1, 2, 4, 8, 16]), (EXPENSIVE, [0, 16])):
         stopped = make(tiny_weights, prediction)
@@ -140,15 +140,15 @@ def test_a_resumed_job_is_measured_as_it_was(tiny_weights: BackboneWeights) -> N
         run(stopped, Callbacks(measure=measure, stop=asked.__next__))
         before = list(stopped.measured)
         resumed = make(tiny_weights, LONG, level=2)
-        going_on = Measurements(resumed)
+        continued = Measurements(resumed)
         resumed.load_state(stopped.state())
-        assert going_on.moments == measure.moments
-        run(resumed, Callbacks(measure=going_on))
+        assert continued.moments == measure.moments
+        run(resumed, Callbacks(measure=continued))
         assert [entry["step"] for entry in resumed.measured] == steps
         assert resumed.measured[: len(before)] == before
 
 
-def test_seconds_left_of_measuring(tiny_weights: BackboneWeights) -> None:
+def test_remaining_measuring_time_is_predicted(tiny_weights: BackboneWeights) -> None:
     """A moment's time is first the plan's, then the measured time of a repeated view, then the median of past moments.
 
     The final loss is added.

@@ -46,15 +46,15 @@ def rotation(angle: float, axis: Tensor = AXIS) -> Tensor:
     return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
-def posed(turned: Tensor, center: tuple[float, float, float] | Tensor, name: str = "a", width: int = 60) -> Camera:
-    """Return a camera with a world-to-camera rotation `turned` and a center."""
+def posed(orientation: Tensor, center: tuple[float, float, float] | Tensor, name: str = "a", width: int = 60) -> Camera:
+    """Return a camera with a world-to-camera rotation `orientation` and a center."""
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = turned
-    pose[:3, 3] = -turned @ torch.as_tensor(center, dtype=torch.float64)
+    pose[:3, :3] = orientation
+    pose[:3, 3] = -orientation @ torch.as_tensor(center, dtype=torch.float64)
     return Camera(name, width, 40, 55.0, 56.0, 31.0, 19.0, pose)
 
 
-def held_out_cameras(views: list[Camera], covered: Sequence[int]) -> list[Camera]:
+def cameras_between(views: list[Camera], covered: Sequence[int]) -> list[Camera]:
     """Return a camera between each pair of neighbors among the views with the indices `covered`."""
     return [between(*pair) for pair in neighbors([views[index] for index in covered])]
 
@@ -100,7 +100,7 @@ def names(found: list[Camera]) -> list[str]:
         (3.0, -3.0, math.pi),
     ],
 )
-def test_halfway_is_half_of_the_shortest_turn_and_of_the_way(first: float, second: float, middle: float):
+def test_midpoint_halves_shortest_rotation_and_translation(first: float, second: float, middle: float):
     found = between(posed(rotation(first), (1, -2, 3), "left"), posed(rotation(second), (2, 4, -5), "right", width=90))
     assert found.name == "left–right"
     torch.testing.assert_close(found.world_to_camera[:3, :3], rotation(middle), rtol=0, atol=1e-13)
@@ -109,56 +109,56 @@ def test_halfway_is_half_of_the_shortest_turn_and_of_the_way(first: float, secon
     assert found.world_to_camera[3].tolist() == [0, 0, 0, 1]
 
 
-def test_opposite_cameras_have_one_of_their_two_middles_and_equal_ones_themselves():
+def test_midpoints_of_opposite_and_of_equal_cameras_are_valid():
     ends = posed(rotation(0.0), (0, 0, 0)), posed(rotation(math.pi), (2, 0, 0))
     found = between(*ends)
     assert [angle_between(found, end) for end in ends] == pytest.approx([math.pi / 2] * 2, abs=1e-7)
-    turned = found.world_to_camera[:3, :3]
-    torch.testing.assert_close(turned @ turned.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
-    assert float(torch.linalg.det(turned)) == pytest.approx(1)
+    orientation = found.world_to_camera[:3, :3]
+    torch.testing.assert_close(orientation @ orientation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
+    assert float(torch.linalg.det(orientation)) == pytest.approx(1)
     assert found.center.tolist() == pytest.approx([1, 0, 0])
     same = posed(rotation(2.0), (0.3, 0.2, 0.1))
     torch.testing.assert_close(between(same, same).world_to_camera, same.world_to_camera, rtol=0, atol=1e-14)
 
 
-def test_halfway_on_a_ring_looks_at_its_center():
-    for found in held_out_cameras(ring(9), range(9)):
+def test_midpoint_on_a_ring_looks_at_its_center():
+    for found in cameras_between(ring(9), range(9)):
         direction = found.world_to_camera[2, :3]
         torch.testing.assert_close(direction, -found.center / found.center.norm(), rtol=0, atol=1e-7)
         assert float(found.center.norm()) == pytest.approx(3 * math.cos(math.pi / 9))
 
 
-def test_one_camera_between_each_and_the_next():
+def test_one_novel_camera_lies_between_neighbors():
     row = cameras(5)
-    assert names(held_out_cameras(row, range(5))) == [f"view_{i}–view_{i + 1}" for i in range(4)]
-    assert names(held_out_cameras(row, [0, 1, 3])) == ["view_0–view_1", "view_1–view_3"]
-    assert names(held_out_cameras(row[:2], [0, 1])) == ["view_0–view_1"]
-    assert held_out_cameras(row, [2]) == held_out_cameras(row, []) == held_out_cameras([], []) == []
-    assert held_out_cameras([row[0]] * 3, range(3)) == []
-    assert names(held_out_cameras([row[0], *row], range(6)))[0] == "view_0–view_1"
+    assert names(cameras_between(row, range(5))) == [f"view_{i}–view_{i + 1}" for i in range(4)]
+    assert names(cameras_between(row, [0, 1, 3])) == ["view_0–view_1", "view_1–view_3"]
+    assert names(cameras_between(row[:2], [0, 1])) == ["view_0–view_1"]
+    assert cameras_between(row, [2]) == cameras_between(row, []) == cameras_between([], []) == []
+    assert cameras_between([row[0]] * 3, range(3)) == []
+    assert names(cameras_between([row[0], *row], range(6)))[0] == "view_0–view_1"
 
 
-def test_no_camera_across_a_jump_or_a_wide_turn():
+def test_no_novel_camera_spans_a_jump_or_a_wide_rotation():
     near, far = ring(20), [replace(c, name="far " + c.name) for c in ring(20, radius=30)]
-    found = names(held_out_cameras([*near[:8], *far[:8]], range(16)))
+    found = names(cameras_between([*near[:8], *far[:8]], range(16)))
     assert found == [f"{i}–{i + 1}" for i in range(7)] + [f"far {i}–far {i + 1}" for i in range(7)]
-    assert len(held_out_cameras(ring(6), range(6))) == 5  # 60 degrees between neighbors
-    assert held_out_cameras(ring(5), range(5)) == []
-    assert held_out_cameras([cameras(1)[0], blind_camera()], [0, 1]) == []
+    assert len(cameras_between(ring(6), range(6))) == 5  # 60 degrees between neighbors
+    assert cameras_between(ring(5), range(5)) == []
+    assert cameras_between([cameras(1)[0], blind_camera()], [0, 1]) == []
     upright = cameras(4)
     lying = [
         posed(rotation(math.pi / 2, torch.tensor([0.0, 0, 1])) @ c.world_to_camera[:3, :3], c.center)
         for c in upright[2:]
     ]
-    assert names(held_out_cameras([*upright[:2], *lying], range(4))) == ["view_0–view_1", "a–a"]
+    assert names(cameras_between([*upright[:2], *lying], range(4))) == ["view_0–view_1", "a–a"]
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_an_unordered_list_is_put_in_order(seed: int):
+def test_unordered_cameras_are_sorted(seed: int):
     shuffled = ring(40)
     random.Random(seed).shuffle(shuffled)
     by_name = {camera.name: camera for camera in shuffled}
-    found = held_out_cameras(shuffled, range(40))
+    found = cameras_between(shuffled, range(40))
     assert len(found) >= 38
     for camera in found:
         parents = [by_name[name] for name in camera.name.split("–")]
@@ -177,7 +177,7 @@ def test_an_unordered_list_is_put_in_order(seed: int):
         (0, [0]),
     ],
 )
-def test_moments_are_geometric_and_hold_both_ends(total: int, expected: list[int]):
+def test_moments_are_geometric_and_include_both_ends(total: int, expected: list[int]):
     assert LEVELS[0].moments(total) == expected
 
 
@@ -238,7 +238,7 @@ def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | 
 
 
 @pytest.mark.parametrize(("scene", "weighted"), [(wall(sh_degree=1), False), (ball(), True)], ids=["wall", "ball"])
-def test_gram_distance_is_that_of_float64(tiny_weights, network, scene: Scene, weighted: bool):
+def test_gram_distance_agrees_with_float64(tiny_weights, network, scene: Scene, weighted: bool):
     views = cameras(6)
     measured = novel_views(scene, views, network, coarsest=COARSEST, weighted=weighted)
     assert measured.views == [0, 1, 2, 3]
@@ -256,7 +256,7 @@ def test_gram_distance_is_that_of_float64(tiny_weights, network, scene: Scene, w
     assert measured.measure(sh_dc).gram == pytest.approx(expected, rel=1e-4)
 
 
-def test_the_first_measurement_is_the_measure_of_the_others(network):
+def test_gram_distance_is_relative_to_the_first_measurement(network):
     scene, views = wall(), cameras(4)
     measured = novel_views(scene, views, network)
     first = measured.measure(scene.sh_dc)
@@ -269,7 +269,7 @@ def test_the_first_measurement_is_the_measure_of_the_others(network):
     assert resumed.measure(torch.zeros_like(scene.sh_dc)) == gray
 
 
-def test_what_is_kept_changes_nothing_and_the_job_s_loss_is_left_alone(network, lpips):
+def test_caching_does_not_change_measurements(network, lpips):
     scene, views = wall(sh_degree=1), cameras(10)
     kept = novel_views(scene, views, network, weighted=True, lpips=lpips)
     nothing_kept = novel_views(scene, views, network, weighted=True, lpips=lpips, memory=0)
@@ -278,7 +278,7 @@ def test_what_is_kept_changes_nothing_and_the_job_s_loss_is_left_alone(network, 
     assert {gap: len(pairs) for gap, pairs in kept.pairs.items()} == {SHORT_RANGE: MOST_VIEWS, LONG_RANGE: 2}
 
 
-def test_consistency_does_not_see_what_cannot_be_seen(network, lpips):
+def test_consistency_ignores_unseen_gaussians(network, lpips):
     front, back = wall(), wall()
     back = replace(back, means=back.means * torch.tensor([1.0, 1, -1]))  # behind all cameras
     both = Scene(*(torch.cat([getattr(front, f), getattr(back, f)]) for f in TENSORS))
@@ -292,7 +292,7 @@ def test_consistency_does_not_see_what_cannot_be_seen(network, lpips):
     assert seen.short.rmse != before.short.rmse
 
 
-def test_colors_that_depend_on_the_view_are_less_consistent(network, lpips):
+def test_view_dependent_colors_are_less_consistent(network, lpips):
     views = cameras(10)
     plain = wall(sh_degree=1)
     smooth = torch.sin(plain.means @ torch.tensor([[1.5, 0.3, -1], [0.5, 1, 1], [0, 0, 0]]))
@@ -307,7 +307,7 @@ def test_colors_that_depend_on_the_view_are_less_consistent(network, lpips):
     assert rough.long.rmse > rough.short.rmse
 
 
-def test_a_view_inside_of_something_is_not_measured(network):
+def test_view_inside_an_object_is_not_measured(network):
     up = torch.tensor([0.0, -1.0, 0.0])
     positions = [(-0.65, 0, 0), (0.65, 0, 0), (0.65, 0.35, 0), (0.65, 0.7, 0)]
     views = [
@@ -325,7 +325,7 @@ def test_a_view_inside_of_something_is_not_measured(network):
     assert (filled.views, filled.pairs[SHORT_RANGE]) == ([1], [(1, 2)])
 
 
-def test_jobs_of_one_and_of_two_cameras(network, lpips):
+def test_jobs_with_one_or_two_cameras_are_measured(network, lpips):
     scene = wall()
     alone = novel_views(scene, cameras(1), network)
     nothing = alone.measure(scene.sh_dc)
@@ -344,7 +344,7 @@ def test_jobs_of_one_and_of_two_cameras(network, lpips):
     assert two.short is two.long is None
 
 
-def test_a_moment_is_plain_json(network, lpips):
+def test_moment_is_plain_json(network, lpips):
     scene = wall()
     measured = novel_views(scene, cameras(9), network, lpips=lpips)
     moment = measured.measure(scene.sh_dc)
@@ -367,7 +367,7 @@ def test_a_moment_is_plain_json(network, lpips):
 
 
 @pytest.mark.slow
-def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, vgg16_weights, lpips):
+def test_real_scene_approaches_its_style_in_novel_views(shared_data, vgg16_weights, lpips):
     folder = shared_data / "scenes" / "snowmiku_plush"
     scene = read_scene(folder / "point_cloud.ply").scene
     views = [resized(camera, 120) for camera in spread(read_cameras(folder / "cameras.json"), 10)]
@@ -396,7 +396,7 @@ def test_a_real_scene_moves_towards_its_style_between_the_cameras(shared_data, v
     assert after.short.rmse < 0.4
 
 
-def test_a_part_of_a_large_scene_covers_as_much_and_lies_as_deep() -> None:
+def test_sample_of_a_large_scene_preserves_coverage_and_depth() -> None:
     """The sample of a ball of small Gaussians has about every fourth of them, at twice the size."""
     camera = cameras()[0]
     scene = ball(4001)

@@ -60,7 +60,7 @@ def test_order_of_images_on_the_page_differs_between_views(tmp_path: Path) -> No
     assert 5 < sum(first) < 35  # outside with a probability of 2e-6
 
 
-def test_tokens_stand_for_the_variants_own_images(study: tuple[Path, Path]) -> None:
+def test_tokens_identify_the_images_of_the_variants(study: tuple[Path, Path]) -> None:
     page, key = study
     found = re.search(r"const study = (.*);$", page.read_text(), re.MULTILINE)
     assert found is not None
@@ -72,7 +72,7 @@ def test_tokens_stand_for_the_variants_own_images(study: tuple[Path, Path]) -> N
     assert on_page == {}
 
 
-def test_shares_of_votes_are_counted_over_all_voters(study: tuple[Path, Path], tmp_path: Path) -> None:
+def test_fractions_of_votes_cover_all_voters(study: tuple[Path, Path], tmp_path: Path) -> None:
     key = study[1]
     files = [save_votes(tmp_path / "1.json", key, [0, 0, 1]), save_votes(tmp_path / "2.json", key, [0, 0])]
     first, second = count_votes(key, files)
