@@ -26,7 +26,7 @@ PUBLIC += [Camera.from_matrix, Stylizer.planned, make_rasterizer, orbit, scene_o
 
 
 @pytest.mark.parametrize("item", PUBLIC, ids=lambda item: item.__qualname__)
-def test_example(item: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_docstring_example_runs(item: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_files(tmp_path, wall())
     monkeypatch.chdir(tmp_path)
     names = {each.__name__: each for each in PUBLIC} | EXPORTED | {"Path": Path, "torch": torch}

@@ -19,7 +19,7 @@ print(next(line.split()[1] for line in open("/proc/self/smaps_rollup") if line.s
 
 
 @pytest.mark.parametrize("switch", ["0", None])
-def test_large_tensors_lie_in_huge_pages(switch: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_tensors_use_huge_pages(switch: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """The user's environment variables take precedence over the default."""
     if not _ENABLED.exists() or "[madvise]" not in _ENABLED.read_text():
         pytest.skip("this system gives no huge pages, or gives them to everybody")

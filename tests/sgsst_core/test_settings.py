@@ -20,19 +20,19 @@ def test_paper_is_the_published_schedule() -> None:
     assert (settings.training_background, settings.background) == ("background", (0, 0, 0))
 
 
-def test_single_values_go_on_top_and_none_leaves_the_preset() -> None:
+def test_values_override_the_preset_unless_none() -> None:
     settings = make_settings("preview", steps_sos=7, seed=None, max_resolution=None)
     assert settings.steps_sos == 7
     assert settings.steps_coarse == make_settings("preview").steps_coarse
     assert settings.max_resolution == 640
 
 
-def test_a_learning_rate_given_by_hand_is_constant_unless_its_end_is_given() -> None:
+def test_explicit_learning_rate_is_constant_without_an_end() -> None:
     assert make_settings("standard", learning_rate=0.2).learning_rate_end == 0.2
     assert make_settings("standard", learning_rate=0.2, learning_rate_end=0.1).learning_rate_end == 0.1
 
 
-def test_learning_rate_is_exponential_in_the_share_of_steps() -> None:
+def test_learning_rate_is_exponential_in_the_fraction_of_steps() -> None:
     settings = make_settings(learning_rate=0.1, learning_rate_end=0.001)
     assert [settings.learning_rate_at(fraction) for fraction in (0, 0.5, 1)] == pytest.approx([0.1, 0.01, 0.001])
 
@@ -55,7 +55,7 @@ def test_values_out_of_range_are_refused_by_name(values: dict[str, object], name
         make_settings(**values)  # type: ignore[arg-type]
 
 
-def test_words_for_a_strength_are_weights() -> None:
+def test_strength_names_are_content_weights() -> None:
     weights = [
         make_settings("standard", content_weight=word).content_weight for word in ("strong", "balanced", "light")
     ]
@@ -65,11 +65,11 @@ def test_words_for_a_strength_are_weights() -> None:
     assert {"number", "string"} == {kind["type"] for kind in schema["anyOf"]}
 
 
-def test_an_unknown_preset_is_refused_with_the_known_ones() -> None:
+def test_unknown_preset_error_lists_the_presets() -> None:
     with pytest.raises(SettingsError, match="preview, standard, paper"):
         make_settings("fast")  # type: ignore[arg-type]
 
 
-def test_settings_do_not_change() -> None:
+def test_settings_are_immutable() -> None:
     with pytest.raises(ValueError, match="frozen"):
         make_settings().seed = 3  # type: ignore[misc]

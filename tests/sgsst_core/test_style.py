@@ -33,7 +33,7 @@ def assert_same(found, wanted, **tolerances):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), **tolerances)
 
 
-def test_a_mixture_has_the_moments_of_all_positions_together():
+def test_mixture_has_the_moments_of_all_positions():
     """Images with positions in proportion to their weights have the moments of their union."""
     parts = [features(1, 40), features(2, 10, offset=0.3)]
     statistics = [layer_statistics_reference(part) for part in parts]
@@ -41,7 +41,7 @@ def test_a_mixture_has_the_moments_of_all_positions_together():
     assert_same(mixed, LayerTarget.of(merge_all(statistics)), rtol=1e-12, atol=1e-14)
 
 
-def test_digits_do_not_cancel_at_large_means():
+def test_mixture_is_precise_at_large_means():
     """Deviations of 1e-6 about means of 1e6 would vanish in E[x^2] - mean^2."""
     targets = [
         LayerTarget(torch.eye(2).double(), torch.full((2,), 1e6).double(), torch.tensor(s, dtype=torch.float64))
@@ -51,12 +51,12 @@ def test_digits_do_not_cancel_at_large_means():
     torch.testing.assert_close(mixed.std, torch.tensor([2.5**0.5 * 1e-6, 0], dtype=torch.float64), rtol=1e-9, atol=0)
 
 
-def test_equal_pictures_are_one_picture():
+def test_equal_images_count_as_one_image():
     target = LayerTarget.of(layer_statistics_reference(features(3)))
     assert_same(LayerTarget.mixed([target] * 3, normalized([0.2, 3, 1])), target, rtol=1e-13, atol=1e-15)
 
 
-def test_one_picture_is_itself(tiny_weights):
+def test_single_image_has_its_own_targets(tiny_weights):
     loss, style = SosLoss(FeatureNetwork(tiny_weights), coarsest=40), picture(90, 70)
     alone = loss.targets.of_style(Style.of(style), (100, 80))
     weighted = loss.targets.of_style(Style.weighted([style], [0.3]), (100, 80))
@@ -66,7 +66,7 @@ def test_one_picture_is_itself(tiny_weights):
             assert torch.equal(weighted[scale][0].layers[layer].std, wanted.std)
 
 
-def test_targets_are_those_of_each_picture_at_its_own_size(tiny_weights):
+def test_targets_use_each_image_at_its_own_size(tiny_weights):
     pictures, weights = [picture(300, 90, seed=1), picture(40, 64, seed=2)], [3.0, 1.0]
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64), coarsest=40)
     mixed = loss.targets.of_style(Style.weighted(pictures, weights), (64, 80))
@@ -78,7 +78,7 @@ def test_targets_are_those_of_each_picture_at_its_own_size(tiny_weights):
             assert_same(found, wanted, rtol=1e-13, atol=1e-15)
 
 
-def test_a_tiny_picture_leaves_layers_without_cells_to_the_others(tiny_weights):
+def test_tiny_image_is_ignored_in_layers_without_cells(tiny_weights):
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64))
     large, tiny = picture(64, 64), picture(7, 7, seed=2)
     mixed = loss.targets.of_style(Style.weighted([large, tiny], [1, 9]), (64, 64))[0][0].layers
@@ -87,7 +87,7 @@ def test_a_tiny_picture_leaves_layers_without_cells_to_the_others(tiny_weights):
     assert not torch.equal(mixed["relu1_1"].mean, alone["relu1_1"].mean)
 
 
-def test_features_are_matched_with_those_of_all_pictures(tiny_weights):
+def test_features_are_matched_with_those_of_all_images(tiny_weights):
     network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights, content=False))
     loss = SosLoss(network, style_loss="nnfm", content_weight=0)
     pictures = [picture(40, 48, seed=1), picture(64, 32, seed=2)]
@@ -96,7 +96,7 @@ def test_features_are_matched_with_those_of_all_pictures(tiny_weights):
     assert torch.equal(mixed, torch.cat(single))
 
 
-def test_too_many_vectors_are_shared_out_by_weight():
+def test_number_of_vectors_is_limited_in_proportion_to_weights():
     assert positions_per_image([MOST_VECTORS, MOST_VECTORS], [0.75, 0.25], MOST_VECTORS) == [6144, 2048]
     assert positions_per_image([3, 10**6], [0.9, 0.1], MOST_VECTORS) == [3, 819]
     assert positions_per_image([10**6, 10**6], [1 - 1e-9, 1e-9], MOST_VECTORS)[1] == 1
@@ -104,18 +104,18 @@ def test_too_many_vectors_are_shared_out_by_weight():
 
 
 @pytest.mark.parametrize("weights", [[], [1.0, 0.0], [1.0, -1.0], [float("nan")], [float("inf"), 1.0]])
-def test_weights_that_are_no_shares(weights):
+def test_invalid_weights_are_refused(weights):
     with pytest.raises(SettingsError, match="style image"):
         normalized(weights)
 
 
-def test_weights_of_any_size_add_up_to_one():
+def test_weights_of_any_size_are_normalized():
     assert normalized([1e308, 1e308]) == (0.5, 0.5)
     assert normalized([1e-300, 3e-300]) == pytest.approx((0.25, 0.75))
     assert normalized([0.3]) == (1.0,)
 
 
-def test_color_moments_of_a_mixture():
+def test_mixture_has_the_color_moments_of_its_images():
     pixels = [torch.rand(30, 3, generator=torch.Generator().manual_seed(s)).double() for s in (1, 2)]
     moments = [(part.mean(0), part.T.cov(correction=0)) for part in pixels]
     mean, covariance = mixed_moments(moments, [0.5, 0.5])
@@ -143,7 +143,7 @@ FLOATS = BYTES / 255
     ],
     ids=["uint8", "numpy", "floats", "double", "big-endian", "CHW", "negative-strides", "gradient", "RGBA"],
 )
-def test_arrays_are_converted_to_the_image_that_they_hold(given):
+def test_arrays_are_converted_to_float_images(given):
     converted = image_of(given)
     torch.testing.assert_close(converted, FLOATS, rtol=0, atol=1e-7)
     assert converted.is_contiguous()
@@ -151,7 +151,7 @@ def test_arrays_are_converted_to_the_image_that_they_hold(given):
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
-def test_arrays_give_the_image_that_load_image_reads(tmp_path, mode):
+def test_arrays_are_converted_as_by_load_image(tmp_path, mode):
     image = Image.fromarray(BYTES.numpy()).convert(mode)
     if mode == "RGBA":
         image.putalpha(Image.linear_gradient("L").resize(image.size))
@@ -161,7 +161,7 @@ def test_arrays_give_the_image_that_load_image_reads(tmp_path, mode):
     torch.testing.assert_close(image_of(np.asarray(image)), read, rtol=0, atol=tolerance + 1e-7)
 
 
-def test_images_in_the_right_form_are_not_copied():
+def test_valid_images_are_not_copied():
     style = Style((FLOATS,))
     assert Style.given(style) is style
     assert image_of(FLOATS) is FLOATS
@@ -183,7 +183,7 @@ def test_images_in_the_right_form_are_not_copied():
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_other_arrays_are_refused_in_a_sentence(given, problem):
+def test_invalid_arrays_are_refused_with_a_message(given, problem):
     with pytest.raises(ImageError, match=problem):
         image_of(given)
 

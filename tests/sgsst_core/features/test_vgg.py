@@ -69,7 +69,7 @@ def test_convolutions_run_in_channels_last(tiny_weights: BackboneWeights, dtype:
     assert all(network.layouts)
 
 
-# --- what holds around the passes on a GPU -------------------------------------------------------------------------
+# --- flags of cuDNN on a GPU ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(autouse=True)

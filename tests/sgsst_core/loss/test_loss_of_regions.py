@@ -122,7 +122,7 @@ def test_statistics_of_united_regions_are_merged():
         torch.testing.assert_close(getattr(parts, name), getattr(whole, name), rtol=1e-12, atol=1e-13)
 
 
-# --- which Gaussians -----------------------------------------------------------------------------------------------
+# --- resolved regions ----------------------------------------------------------------------------------------------
 
 
 def regions(labels, **frozen):

@@ -58,7 +58,7 @@ def test_rounding_is_to_nearest_and_even() -> None:
     assert to_tf32(values).tolist() == [1.0, 1 + step, 1.0, 1 + 2 * step, -2.0, 0.0]
 
 
-# --- what it gains -------------------------------------------------------------------------------------------------
+# --- speedup -------------------------------------------------------------------------------------------------------
 
 
 def test_convolutions_are_timed_in_available_precisions() -> None:

@@ -114,7 +114,7 @@ def test_extreme_shapes_are_drawn_or_counted() -> None:
     assert np.isfinite(make_rasterizer("cpu", scene).coverage(camera()).numpy()).all()
 
 
-def test_rendering_stays_with_selected_and_changed_scenes() -> None:
+def test_derived_scenes_keep_the_rendering() -> None:
     scene = replace(cloud(20, degree=1), rendering=Rendering("antialiased", 0.1))
     for changed in (
         scene.subset(torch.arange(3)),
@@ -125,7 +125,7 @@ def test_rendering_stays_with_selected_and_changed_scenes() -> None:
         assert changed.rendering == scene.rendering
 
 
-def test_requested_rendering() -> None:
+def test_requested_rendering_overrides_mode_and_eps2d() -> None:
     mip, flat = Rendering("antialiased", 0.1), Rendering("2dgs")
     assert mip.requested("auto", None) == mip.requested("antialiased", None) == mip
     assert mip.requested("classic", None) == CLASSIC

@@ -80,7 +80,7 @@ def test_gaussian_on_the_near_plane_is_visible() -> None:
         project(scene, camera(), near=0.0)
 
 
-def test_opacities_around_the_cutoff() -> None:
+def test_opacities_below_the_cutoff_are_dropped() -> None:
     logit = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
     scene = together([((0, 0, 4), 0.5, (2.0,) * 3, (1, 0, 0, 0))] * 5)
     scene.opacities[:] = torch.tensor([logit - 1e-3, logit + 1e-3, -200.0, 200.0, -1e4])
@@ -108,7 +108,7 @@ def test_gaussians_without_a_projection_are_dropped_and_counted() -> None:
     assert splat(scene, camera()).gaussians.tolist() == [0, 2]
 
 
-def test_huge_gaussians_and_an_empty_scene() -> None:
+def test_huge_gaussians_and_empty_scenes_are_projected() -> None:
     found = project(single((0, 0, 4), scales=(1e12, 1e12, 1e12)), camera())
     assert found.outcomes[Outcome.VISIBLE] == 1
     assert np.isfinite(found.values).all()

@@ -273,7 +273,7 @@ def test_equal_depths_blend_in_the_order_of_the_file(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_gaussian_that_would_finish_a_pixel_is_not_blended(name: str) -> None:
+def test_gaussian_that_would_saturate_a_pixel_is_not_blended(name: str) -> None:
     """Two opaque Gaussians would leave (1 - 0.99)^2 = TRANSMITTANCE_MIN, so the second one is already skipped."""
     scene = together([((0, 0, z), 0.9999, (50.0,) * 3, (1, 0, 0, 0)) for z in (3.0, 4.0, 5.0)])
     image = make_rasterizer(name, scene).render(torch.eye(3), camera(20, 20))
@@ -282,7 +282,7 @@ def test_gaussian_that_would_finish_a_pixel_is_not_blended(name: str) -> None:
     assert float((make_rasterizer(name, scene).coverage(camera(20, 20)) - 0.99).abs().max()) < 1e-6
 
 
-def test_distant_center_keeps_its_digits() -> None:
+def test_distant_center_keeps_its_precision() -> None:
     """The edge of a Gaussian of a billion pixels crosses the view; float32 offsets would be off by tens of pixels."""
     scene = single((-4e6, 0, 4.0), scales=(2e6, 1e-3, 1e-3), opacity=0.9)
     view = camera(64, 16, focal=1e3)
@@ -408,7 +408,7 @@ def test_unknown_rasterizers_and_devices_are_refused() -> None:
         make_rasterizer("cpu", cloud(10), device="cuda")
 
 
-def test_error_about_too_many_intersections_has_figures() -> None:
+def test_too_many_intersections_error_has_figures() -> None:
     check_intersections(MAX_INTERSECTIONS, 5, camera())
     with pytest.raises(TooManyIntersectionsError, match=r"'test' \(70x45\): its 5 visible .* 2,147,483,648 times"):
         check_intersections(MAX_INTERSECTIONS + 1, 5, camera())

@@ -63,7 +63,7 @@ def test_projected_values_are_in_depth_order(threads: None) -> None:
     assert np.array_equal(found.values[0], alone.values[0])
 
 
-def listed_in_turn(scene: Scene, view: Camera) -> list[list[int]]:
+def intersections_one_by_one(scene: Scene, view: Camera) -> list[list[int]]:
     """Return the depth-order indices in each raster tile, from intersections of one Gaussian at a time."""
     gaussians = project(scene, view).gaussians
     tiles: list[list[int]] = [[] for _ in range(-(-view.width // 16) * -(-view.height // 16))]
@@ -88,7 +88,7 @@ def test_tile_intersections_equal_a_loop_over_gaussians(count: int, threads: Non
     scene, view = cloud(count, seed=32), camera(97, 61)
     scene.scales[:10] += 4  # as large as the view
     isects = build_tile_intersections(scene, view)
-    expected = listed_in_turn(scene, view)
+    expected = intersections_one_by_one(scene, view)
     assert np.array_equal(np.diff(isects.starts), [len(tile) for tile in expected])
     assert isects.ranks.tolist() == [rank for tile in expected for rank in tile]
     check_slots(isects)

@@ -249,7 +249,7 @@ def test_steps_of_a_job_agree_with_the_cpu(tiny_weights: BackboneWeights, one_th
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_error_without_a_gpu_says_what_to_do() -> None:
+def test_error_without_a_gpu_gives_advice() -> None:
     with pytest.raises(SettingsError, match="PyTorch sees no GPU"):
         make_rasterizer("triton", cloud(10), device="cuda")
     code = (

@@ -7,7 +7,7 @@ from sgsst_core.regions.masks import count_votes, decide_by_votes
 from tests.small_scenes import cameras, wall
 
 
-def test_votes_are_the_blend_weights_where_masks_are_white():
+def test_votes_are_blend_weights_in_white_mask_pixels():
     """The reference is the image of one Gaussian with color 1."""
     scene, views = wall(8, 6), cameras(2)
     rasterizer = make_rasterizer("cpu", scene)
@@ -22,7 +22,7 @@ def test_votes_are_the_blend_weights_where_masks_are_white():
         torch.testing.assert_close(float(total[index]), float(sum(own.sum() for own in shown)), rtol=1e-4, atol=1e-5)
 
 
-def test_a_half_of_a_wall():
+def test_mask_of_one_half_selects_half_of_the_wall():
     scene, views = wall(), cameras(1)
     mask = torch.zeros(views[0].height, views[0].width)
     mask[:, views[0].width // 2 :] = 1
@@ -33,7 +33,7 @@ def test_a_half_of_a_wall():
     assert not bool(found[x < -0.2].any())
 
 
-def test_those_between_and_those_unseen_follow_their_neighbors():
+def test_undecided_and_unseen_gaussians_follow_their_neighbors():
     places = torch.arange(12.0)[:, None] * torch.tensor([1.0, 0, 0])
     total = torch.ones(12, dtype=torch.float64)
     inside = torch.tensor([0.0] * 3 + [1.0] * 9, dtype=torch.float64)
@@ -45,7 +45,7 @@ def test_those_between_and_those_unseen_follow_their_neighbors():
     assert not bool(decide_by_votes(places, inside, total)[5])
 
 
-def test_where_nothing_is_decided_the_larger_share_is():
+def test_majority_decides_without_decided_neighbors():
     places = torch.randn(3, 3)
     inside, total = torch.tensor([0.55, 0.45, 0.0]).double(), torch.tensor([1.0, 1.0, 0.0]).double()
     assert decide_by_votes(places, inside, total).tolist() == [True, False, False]

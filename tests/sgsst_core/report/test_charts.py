@@ -21,9 +21,7 @@ def colors_in(path: Path) -> set[tuple[int, ...]]:
 
 
 @pytest.mark.parametrize(("coarse", "sos", "scales"), [(0, 1, 1), (1, 0, 2), (3, 0, 2), (2, 2, 2), (40, 60, 3)])
-def test_the_picture_has_a_line_for_each_scale_that_was_stepped_on(
-    coarse: int, sos: int, scales: int, tmp_path: Path
-) -> None:
+def test_chart_has_a_line_for_each_optimized_scale(coarse: int, sos: int, scales: int, tmp_path: Path) -> None:
     write_loss_chart(tmp_path / "c.png", sample_report(coarse, sos, scales))
     found = colors_in(tmp_path / "c.png")
     there = range(scales) if sos else [scales - 1]
@@ -31,14 +29,14 @@ def test_the_picture_has_a_line_for_each_scale_that_was_stepped_on(
         assert (ImageColor.getrgb(color) in found) == (place in there), f"scale {place}"
 
 
-def test_the_picture_of_no_step_has_axes_alone(tmp_path: Path) -> None:
+def test_chart_without_steps_has_only_axes(tmp_path: Path) -> None:
     write_loss_chart(tmp_path / "c.png", sample_report(0, 0))
     found = colors_in(tmp_path / "c.png")
     assert ImageColor.getrgb(INK) in found
     assert not found & {ImageColor.getrgb(color) for color in COLORS}
 
 
-def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:
+def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         write_loss_chart(tmp_path / "missing" / "c.png", sample_report())
     assert list(tmp_path.iterdir()) == []

@@ -49,20 +49,20 @@ def sources(tiny_weights: BackboneWeights) -> Sources:
     return Sources(Path("a/scene.ply"), 2, (Path("style.png"),), Path("cameras.json"), None, tiny_weights)
 
 
-def test_evaluation_views_are_spread_over_those_that_see_anything(
+def test_evaluation_views_are_spread_over_covered_views(
     finished: tuple[Stylizer, Evaluation, Evaluation],
 ) -> None:
     assert finished[0].job.evaluation_views == [0, 1, 4, 5]
 
 
-def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:
+def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:
     stylizer, before, after = finished
     report = build_report(stylizer, sources, "finished", before, after)
     assert report["version"] == REPORT_VERSION
     assert report["graphs"] is None  # there are no graphs on a CPU
     assert report["steps"] == {"coarse": {"planned": 0, "done": 0}, "sos": {"planned": 7, "done": 7}}
-    told = {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2, "refined": None}
-    assert report["scene"] == told
+    described = {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2, "refined": None}
+    assert report["scene"] == described
     assert report["style"] == {"path": "style.png", "width": 80, "height": 96}
     assert report["cameras"]["count"] == 6
     assert report["cameras"]["sizes"] == [[64, 48]]
@@ -77,7 +77,7 @@ def test_report_says_what_happened(finished: tuple[Stylizer, Evaluation, Evaluat
     assert 0.5 * report["seconds"] < parts <= report["seconds"] + 0.01
 
 
-def test_first_and_later_visits_are_told_apart(
+def test_first_and_later_visits_are_distinguished(
     finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Steps take 9, 5, 2, 4 and 2 s; the first one includes the style.
@@ -99,7 +99,7 @@ def test_first_and_later_visits_are_told_apart(
     assert (measured["seconds"], measured["first_visit"]) == (1.5, None)
 
 
-def test_what_was_measured_and_its_share(
+def test_report_has_measurements_and_their_fraction_of_time(
     finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stylizer, before, after = finished
@@ -123,7 +123,7 @@ def test_what_was_measured_and_its_share(
     }
 
 
-def test_losses_in_the_report_are_those_of_the_steps(
+def test_report_has_the_losses_of_the_steps(
     finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources
 ) -> None:
     stylizer, before, after = finished
@@ -144,7 +144,7 @@ def test_losses_in_the_report_are_those_of_the_steps(
     assert report["loss"]["views"] == ["view_0", "view_1", "view_0", "view_1"]
 
 
-def test_what_the_time_bought(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
+def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
     """With two views per round, the mean of the last two losses counts."""
     stylizer = finished[0]
     kept, seconds, covered = stylizer.history, stylizer.seconds, stylizer.job.views.covered
@@ -164,7 +164,7 @@ def test_what_the_time_bought(finished: tuple[Stylizer, Evaluation, Evaluation])
     assert found["last_tenth"] == {"seconds": pytest.approx(7.0), "from": pytest.approx(0.06), "to": found["relative"]}
 
 
-def test_what_no_step_bought(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
+def test_loss_over_time_needs_steps(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
     stylizer = finished[0]
     kept, stylizer.history = stylizer.history, []
     try:

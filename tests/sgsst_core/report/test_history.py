@@ -32,7 +32,7 @@ def test_thinning_keeps_range_and_mean() -> None:
     np.testing.assert_allclose(line.mean, wanted, rtol=1e-10)
 
 
-def test_thinning_leaves_far_points_as_they_are() -> None:
+def test_thinning_preserves_distant_points() -> None:
     x, values = np.array([1.0, 2.0, 4.0, 8.0]), np.array([4.0, math.nan, 2.0, 0.0])
     line = thinned(x, values, 1, 0.01)
     np.testing.assert_allclose(line.x, [1, 4])

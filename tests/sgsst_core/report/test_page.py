@@ -122,7 +122,7 @@ def losses_alone(coarse: int = 6, sos: int = 12) -> dict[str, Any]:
     return {**report, "novel_views": None, "approximations": None}
 
 
-def test_page_is_whole_and_refers_to_nothing_outside() -> None:
+def test_page_is_complete_and_self_contained() -> None:
     page = parsed(sample_report(), sample_sheet())
     assert page.html.startswith("<!DOCTYPE html>")
     assert "http:" not in page.html
@@ -131,7 +131,7 @@ def test_page_is_whole_and_refers_to_nothing_outside() -> None:
     assert "default-src 'none'; img-src data:; style-src 'unsafe-inline'" in policies
 
 
-def test_sheet_is_in_the_page_byte_for_byte() -> None:
+def test_sheet_is_embedded_unchanged() -> None:
     def pictures(sheet: bytes | None) -> list[str]:
         page = parsed(sample_report(0, 0), sheet)
         return [attributes["src"] or "" for tag, attributes in page.elements if tag == "img"]
@@ -158,7 +158,7 @@ def test_sections_are_in_order() -> None:
     assert places == sorted(places)
 
 
-def test_heading_says_what_came_out() -> None:
+def test_heading_summarizes_the_result() -> None:
     text = parsed_without_figures(sample_report()).text
     assert "VGG16 preset preview 123,456 Gaussians 5 views, up to 1280 × 720 pixels" in text
     assert "Relative loss 0.1 after 3.6 s and 18 steps: all planned steps are done." in text
@@ -176,14 +176,14 @@ def test_heading_says_what_came_out() -> None:
         ("some-other-word", "some-other-word"),
     ],
 )
-def test_heading_says_how_it_stopped(stopped: str, words: str) -> None:
+def test_heading_states_why_the_job_stopped(stopped: str, words: str) -> None:
     report = sample_report()
     report["stopped"] = stopped
     report["steps"]["sos"]["planned"] += 100
     assert words in parsed_without_figures(report).text
 
 
-def test_every_figure_is_there_against_seconds_and_against_steps() -> None:
+def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
     page = parsed(sample_report())
     figures = [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
     assert figures == ["loss", "split", "consistency", "approximations", "memory"]
@@ -215,7 +215,7 @@ def test_split_has_a_panel_for_each_scale() -> None:
     assert all(name in words for name in TERMS.values())
 
 
-def test_terms_that_a_loss_does_not_have_are_not_drawn() -> None:
+def test_unused_loss_terms_are_not_drawn() -> None:
     report = sample_report(scales=2)
     for record in report["history"]:
         for terms in record["scales"].values():
@@ -248,7 +248,7 @@ def test_both_axes_of_the_loss_are_logarithmic() -> None:
     assert (steps > 1).all()
 
 
-def test_hostile_names_are_text() -> None:
+def test_hostile_names_are_escaped() -> None:
     report = sample_report()
     report["scene"]["path"] = f"folder/{HOSTILE.replace('/', '∕')}.ply"
     report["style"]["path"] = "<img src=x onerror=alert(1)>.jpg"
@@ -268,7 +268,7 @@ def test_hostile_names_are_text() -> None:
     assert "<img src=x onerror=alert(1)>.jpg" in page.text
 
 
-def test_names_that_are_no_unicode_cost_nothing_but_themselves(tmp_path: Path) -> None:
+def test_non_unicode_names_are_replaced(tmp_path: Path) -> None:
     report = sample_report()
     report["scene"]["path"] = "caf\udce9.ply"  # Python's name for a file in another encoding
     write_page(tmp_path / "page.html", report, None)
@@ -286,7 +286,7 @@ def test_every_decision_and_finding_is_in_a_table() -> None:
     assert {"1,200 of 5,000", "Gaussian 7", "1 of 1"} <= set(cells)
 
 
-def test_prediction_stands_beside_the_measurement() -> None:
+def test_prediction_is_shown_next_to_the_measurement() -> None:
     cells = parsed_without_figures(sample_report()).cells
     place = cells.index("step on all scales")
     assert cells[place : place + 8] == [
@@ -301,7 +301,7 @@ def test_prediction_stands_beside_the_measurement() -> None:
     ]
 
 
-def test_memory_of_a_gpu_stands_apart() -> None:
+def test_gpu_memory_is_shown_separately() -> None:
     report = losses_alone()
     cells, captions = parsed(report).cells, []
     assert "peak memory of the GPU" not in cells
@@ -317,7 +317,7 @@ def test_memory_of_a_gpu_stands_apart() -> None:
     assert captions == [False, True]
 
 
-def test_speed_up_of_several_ranks_stands_beside_its_prediction() -> None:
+def test_speedup_of_ranks_is_shown_next_to_its_prediction() -> None:
     report = sample_report()
     report["plan"]["prediction"] |= {"seconds_one_rank": 3.6, "communication": 0.1}
     report["plan"]["measured"] |= {"communication": 0.2, "speed_up": 1.44}
@@ -335,14 +335,14 @@ def test_speed_up_of_several_ranks_stands_beside_its_prediction() -> None:
     ]
 
 
-def test_approximations_stand_beside_the_exact_ones() -> None:
+def test_approximations_are_shown_next_to_exact_values() -> None:
     page = parsed_without_figures(sample_report())
     place = page.cells.index("0.21")
     assert page.cells[place - 2 : place + 5] == ["3", "b", "0.21", "0.97", "0.5 s", "1.25 s", "2.5"]
     assert "bfloat16 features, half-precision blend weights" in page.text
 
 
-def test_time_is_split_in_percent_with_the_rest() -> None:
+def test_time_is_divided_in_percent_with_a_remainder() -> None:
     page = parsed_without_figures(sample_report())
     widths = [attributes["style"] for tag, attributes in page.elements if tag == "i"]
     assert widths == ["width: 50.0%", "width: 20.0%", "width: 10.0%", "width: 20.0%"]
@@ -350,7 +350,7 @@ def test_time_is_split_in_percent_with_the_rest() -> None:
     assert "everything else 20.0 % 0.72 s" in page.text
 
 
-def test_held_out_moments_are_in_a_table() -> None:
+def test_novel_view_moments_are_in_a_table() -> None:
     page = parsed_without_figures(sample_report())
     titles = ["scale 0, absolute", "RMSE, short range", "LPIPS, short range", "RMSE, long range"]
     assert all(title in page.text for title in titles)
@@ -360,7 +360,7 @@ def test_held_out_moments_are_in_a_table() -> None:
     assert page.cells[place - 1 : place + 9] == row
 
 
-def test_what_the_result_is_judged_to_be_stands_beside_the_start() -> None:
+def test_judgment_of_the_result_is_shown_next_to_the_start() -> None:
     report = sample_report()
     page = parsed_without_figures(report)
     place = page.cells.index("distance to the style")
@@ -373,7 +373,7 @@ def test_what_the_result_is_judged_to_be_stands_beside_the_start() -> None:
     assert "distance to the style" not in parsed_without_figures(report).text
 
 
-def test_folded_part_holds_all_other_fields() -> None:
+def test_collapsed_section_has_all_other_fields() -> None:
     report = sample_report()
     report["a_field_of_later"] = {"deep": [{"inside": True}], "bytes": 5_000_000}
     text = parsed_without_figures(report).text
@@ -385,7 +385,7 @@ def test_folded_part_holds_all_other_fields() -> None:
     assert "views c lpips alex" in text
 
 
-def test_reports_without_the_optional_parts() -> None:
+def test_reports_without_optional_parts_are_shown() -> None:
     report = sample_report()
     report.update(novel_views=None, approximations=None, bought=None, findings=[], seconds_by_part={})
     report["plan"] = {"decisions": [], "prediction": None, "measured": {"seconds": None, "peak_bytes": 1}}
@@ -397,7 +397,7 @@ def test_reports_without_the_optional_parts() -> None:
     assert "Loss over time" not in page.text
 
 
-def test_held_out_views_without_numbers() -> None:
+def test_novel_views_without_values_are_shown() -> None:
     report = sample_report()
     for moment in report["novel_views"]["moments"]:
         moment["consistency"] = {
@@ -415,7 +415,7 @@ def test_held_out_views_without_numbers() -> None:
 
 
 @pytest.mark.parametrize("missing", ["short", "long"])
-def test_views_of_one_reach_alone_leave_both_panels_their_room(missing: str) -> None:
+def test_missing_range_leaves_panel_sizes_unchanged(missing: str) -> None:
     """Four cameras give too few novel views for the long range, which then appears in no panel and no legend."""
     report = sample_report()
     for moment in report["novel_views"]["moments"]:
@@ -440,7 +440,7 @@ def panel_borders(svg: str) -> list[tuple[float, float]]:
     return sorted({(float(line[1]), float(line[3])) for line in axes if float(line[2]) == lowest})
 
 
-def test_probes_that_no_axis_shows_are_not_drawn() -> None:
+def test_probes_before_the_first_step_are_not_drawn() -> None:
     """A logarithmic axis cannot show a probe before the first step."""
     report = sample_report()
     report["approximations"]["moments"] = [{**report["approximations"]["moments"][0], "step": 0}]
@@ -448,7 +448,7 @@ def test_probes_that_no_axis_shows_are_not_drawn() -> None:
     assert panel_borders(figure.svg["steps"])[0][0] > 20, "there is no room left for the axis's name"
 
 
-def test_every_color_of_a_figure_has_one_for_dark_screens() -> None:
+def test_figure_colors_have_counterparts_for_dark_screens() -> None:
     page = parsed({**sample_report(1, 2, len(COLORS)), "novel_views": None, "approximations": None})
     used = set(re.findall(r"var\(--c-([0-9a-f]{6}), #\1\)", page.html))
     assert {color[1:] for color in (*COLORS, INK, GRID)} <= used
@@ -458,7 +458,7 @@ def test_every_color_of_a_figure_has_one_for_dark_screens() -> None:
 
 
 @pytest.mark.parametrize(("coarse", "sos"), [(1, 0), (0, 1), (1, 1), (0, 2), (3, 0)])
-def test_short_histories(coarse: int, sos: int) -> None:
+def test_single_steps_are_drawn_as_markers(coarse: int, sos: int) -> None:
     page = parsed(losses_alone(coarse, sos))
     assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"] == ["loss", "split"]
     styles = [attributes.get("style") or "" for tag, attributes in page.elements if tag == "use"]
@@ -466,7 +466,7 @@ def test_short_histories(coarse: int, sos: int) -> None:
     assert bool(marks) == (1 in (coarse, sos))  # a single step is a marker, because a line would be invisible
 
 
-def test_no_step_at_all() -> None:
+def test_report_without_steps_has_no_figures() -> None:
     report = sample_report(0, 0)
     page = parsed(report)
     assert "No steps were run." in page.text
@@ -477,7 +477,7 @@ def test_no_step_at_all() -> None:
 @pytest.mark.parametrize(
     ("wrong", "where"), [(math.nan, "one"), (0.0, "all"), (math.nan, "all"), (math.inf, "all"), (-1.0, "all")]
 )
-def test_losses_that_a_logarithmic_axis_cannot_show(wrong: float, where: str) -> None:
+def test_losses_outside_of_logarithmic_axes_are_counted(wrong: float, where: str) -> None:
     report = losses_alone()
     for record in report["history"][:1] if where == "one" else report["history"]:
         record.update(loss=wrong, relative=wrong)
@@ -488,7 +488,7 @@ def test_losses_that_a_logarithmic_axis_cannot_show(wrong: float, where: str) ->
     assert f"Not shown: {count} of 30 values" in parsed(report).text
 
 
-def test_loss_that_starts_at_zero() -> None:
+def test_initial_loss_of_zero_is_shown() -> None:
     report = losses_alone()
     for terms in report["loss"]["before"]["scales"].values():
         terms["total"] = 0.0
@@ -496,7 +496,7 @@ def test_loss_that_starts_at_zero() -> None:
 
 
 @pytest.mark.parametrize("size", [1e-320, 1e-200, 1e200, 1e308])
-def test_extreme_losses(size: float) -> None:
+def test_extreme_losses_are_shown(size: float) -> None:
     report = losses_alone()
     for index, record in enumerate(report["history"]):
         record.update(loss=size, relative=size if index % 2 else 1.0)
@@ -513,7 +513,7 @@ def test_long_history_stays_small() -> None:
     assert max(path.count("L") for path in points) < 2 * BINS + 10
 
 
-def test_page_of_a_real_job(tiny_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
+def test_page_of_a_real_job_is_self_contained(tiny_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
     stylizer = Stylizer.planned(
         ball(), cameras(3), style(), make_settings(steps_sos=4, learning_rate=0.3), weights=tiny_weights
     )
@@ -531,7 +531,7 @@ def test_page_of_a_real_job(tiny_weights: BackboneWeights, tmp_path: Path, one_t
     assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"][:2] == ["loss", "split"]
 
 
-def test_a_page_that_cannot_be_written_is_an_output_error(tmp_path: Path) -> None:
+def test_unwritable_page_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         write_page(tmp_path / "missing" / "page.html", sample_report(0, 0), None)
     with pytest.raises(OutputError, match="contact sheet"):

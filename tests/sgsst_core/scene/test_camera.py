@@ -101,7 +101,7 @@ def viewmat() -> Tensor:
 
 
 @pytest.mark.parametrize("form", [torch.Tensor.float, torch.Tensor.numpy, torch.Tensor.tolist, lambda view: view[:3]])
-def test_cameras_are_made_from_matrices(form: Any) -> None:
+def test_cameras_are_created_from_matrices(form: Any) -> None:
     found = Camera.from_matrix(form(viewmat()), form(K.double()), 990, 742, name="a")
     assert (found.name, found.width, found.height) == ("a", 990, 742)
     assert (found.fx, found.fy, found.cx, found.cy) == (820, 810, 490, 380)
@@ -125,7 +125,7 @@ WRONG: dict[str, tuple[Any, Any, Any, str]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_matrices_that_are_no_camera_are_refused(case: str) -> None:
+def test_invalid_camera_matrices_are_refused(case: str) -> None:
     view, intrinsics, width, problem = WRONG[case]
     with pytest.raises(CameraError, match=problem):
         Camera.from_matrix(view, intrinsics, width, 742)

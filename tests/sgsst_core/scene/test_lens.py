@@ -51,7 +51,7 @@ def pattern(height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_rays_hit_the_photo_where_colmap_says(model: str) -> None:
+def test_projected_rays_match_colmap(model: str) -> None:
     rays = np.random.default_rng(3).uniform(-0.6, 0.6, (200, 2))
     rays[0] = 0
     expected = np.array([of_colmap(model).img_from_cam(np.array([*ray, 1.0])) for ray in rays])
@@ -61,7 +61,7 @@ def test_rays_hit_the_photo_where_colmap_says(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_undistorted_photos_are_those_of_colmap(model: str) -> None:
+def test_undistorted_photos_match_colmap(model: str) -> None:
     """Compare pixels in the frame that both show; COLMAP samples at 8 bits."""
     view = undistorted(camera(lens(model)))
     options = pycolmap.UndistortCameraOptions()
@@ -132,7 +132,7 @@ def test_lenses_that_leave_no_image_are_refused(values: tuple[float, ...]) -> No
         undistorted(camera(hostile))
 
 
-def test_folded_borders_are_cut_off() -> None:
+def test_folded_borders_are_cropped() -> None:
     """Beyond a radius of 0.58, this lens maps the image back onto itself, and its corners lie inside the photo."""
     folding = camera(radial_lens("RADIAL", (-1.0,), (WIDTH, HEIGHT), (200.0, 200.0, 160.0, 120.0)))
     u, v = corners(folding)
@@ -142,7 +142,7 @@ def test_folded_borders_are_cut_off() -> None:
     assert 0.5 < radius <= 1 / np.sqrt(3) + 0.01
 
 
-def test_lenses_without_a_formula_say_so() -> None:
+def test_lenses_without_a_formula_are_refused() -> None:
     view = camera(lens("FOV", [260.0, 260.0, 160.0, 120.0, 0.9]))
     with pytest.raises(CameraError, match=r"photos of the camera model FOV cannot be undistorted here.*image_undist"):
         undistorted(view)

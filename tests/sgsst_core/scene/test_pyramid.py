@@ -8,7 +8,7 @@ from sgsst_core.scene.pyramid import add_upscaled_, downscale, scale_count, styl
     ("size", "count"),
     [((1, 1), 1), ((511, 4000), 1), ((512, 512), 2), ((1023, 2000), 2), ((1024, 1024), 3), ((3361, 5187), 4)],
 )
-def test_scale_count(size, count):
+def test_scale_count_follows_from_the_shorter_side(size, count):
     assert scale_count(*size) == count
     assert scale_count(*size[::-1]) == count
     if count > 1:

@@ -36,7 +36,7 @@ def test_half_space_lies_on_the_side_of_its_normal():
         ("!=", [True, False, True, False]),
     ],
 )
-def test_comparisons(sign, wanted):
+def test_comparisons_use_float32_and_exclude_nan(sign, wanted):
     """0.1 is compared as float32 too; comparisons with NaN are false."""
     values = torch.tensor([0.0, 0.1, 0.2, NAN])
     assert where_property(values, sign, 0.1).tolist() == wanted

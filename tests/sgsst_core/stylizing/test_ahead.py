@@ -112,7 +112,7 @@ def on_host(tensor: Tensor) -> Tensor:
 
 
 @pytest.mark.slow
-def test_a_step_reads_the_next_photo_and_waits_once(
+def test_step_prefetches_the_next_photo_and_synchronizes_once(
     tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the first of two rounds, cached data of each view are computed."""
@@ -141,7 +141,7 @@ def test_a_step_reads_the_next_photo_and_waits_once(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("steps", "views_per_step"), [(3, 1), (2, 2)])
-def test_losses_are_those_of_photos_read_when_they_are_needed(
+def test_losses_are_identical_without_prefetching(
     tiny_weights: BackboneWeights,
     counts: Counts,
     tmp_path: Path,
@@ -162,7 +162,7 @@ def test_losses_are_those_of_photos_read_when_they_are_needed(
 
 
 @pytest.mark.slow
-def test_photos_whose_features_are_kept_are_read_once(
+def test_photos_with_cached_features_are_read_once(
     tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
 ) -> None:
     photos = Photos(tmp_path)
@@ -170,7 +170,7 @@ def test_photos_whose_features_are_kept_are_read_once(
     assert sorted(photos.asked) == list(range(VIEWS))
 
 
-def test_a_photo_that_cannot_be_read_ends_the_job_in_the_step_that_needs_it(
+def test_unreadable_photo_fails_the_step_that_needs_it(
     tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
 ) -> None:
     stylizer = make(tiny_weights, Photos(tmp_path, broken=drawn()[1]))
@@ -180,13 +180,13 @@ def test_a_photo_that_cannot_be_read_ends_the_job_in_the_step_that_needs_it(
     assert not threads()
 
 
-def test_on_a_cpu_there_is_no_thread(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_no_thread_is_started_on_a_cpu(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
     photos = Photos(tmp_path)
     run(make(tiny_weights, photos))
     assert photos.here == photos.asked == drawn()
 
 
-def test_photos_come_out_as_they_were_read(counts: Counts, tmp_path: Path) -> None:
+def test_prefetched_photos_are_unchanged(counts: Counts, tmp_path: Path) -> None:
     photos = Photos(tmp_path, side=160)  # CUDA transfers up to 64 KB without waiting, pinned or not
     ahead = PhotosAhead(photos, DEVICE)
     ahead.start(1)
@@ -201,7 +201,7 @@ def test_photos_come_out_as_they_were_read(counts: Counts, tmp_path: Path) -> No
     assert not threads()
 
 
-def test_a_photo_that_nobody_asks_for_is_given_up_with_its_error(counts: Counts, tmp_path: Path) -> None:
+def test_error_of_a_photo_is_raised_only_on_request(counts: Counts, tmp_path: Path) -> None:
     photos = Photos(tmp_path, broken=0)
     ahead = PhotosAhead(photos, DEVICE)
     ahead.start(0)

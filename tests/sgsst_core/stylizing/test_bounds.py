@@ -48,7 +48,7 @@ def bright_wall() -> Scene:
     ids=str,
 )
 @pytest.mark.parametrize("make_scene", [bright_wall, ball])
-def test_no_color_that_changes_leaves_what_screens_show(
+def test_changed_colors_stay_in_the_range_of_screens(
     tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any]
 ) -> None:
     scene = make_scene()
@@ -65,7 +65,7 @@ def test_no_color_that_changes_leaves_what_screens_show(
         assert bool(changed.all())
 
 
-def test_luminance_alone_keeps_chroma_within_the_bounds(tiny_weights: BackboneWeights) -> None:
+def test_luminance_mode_preserves_chroma_within_the_bounds(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
     stylizer = make(tiny_weights, scene, bounded=True, preserve_colors="luminance")
     run(stylizer)
@@ -78,7 +78,7 @@ def test_luminance_alone_keeps_chroma_within_the_bounds(tiny_weights: BackboneWe
     assert bool((~fits).any()), "a color that no luminance brings into the bounds belongs to this test"
 
 
-def test_kept_gaussians_may_be_what_no_screen_shows(tiny_weights: BackboneWeights) -> None:
+def test_frozen_gaussians_may_be_out_of_range(tiny_weights: BackboneWeights) -> None:
     scene = bright_wall()
     right = (scene.means[:, 0] > 0).to(torch.uint8)
     regions = Regions((Region("rest"), Region("right", freeze=True)), right)
@@ -91,7 +91,7 @@ def test_kept_gaussians_may_be_what_no_screen_shows(tiny_weights: BackboneWeight
     assert saturated(found[~kept]) == 0
 
 
-def test_what_is_not_left_out_is_bounded_alike(tiny_weights: BackboneWeights) -> None:
+def test_rendering_unseen_gaussians_does_not_change_bounds(tiny_weights: BackboneWeights) -> None:
     """Rendering unseen Gaussians gives bit-identical results, although their colors start out of bounds."""
     lean, full = (
         make(tiny_weights, bright_wall(), bounded=True, cached_weights="none", keep=keep) for keep in ((), ("unseen",))
@@ -112,7 +112,7 @@ def adam(start: Tensor, gradients: list[Tensor], rate: float) -> Tensor:
     return colors
 
 
-def test_steps_are_those_of_projected_adam() -> None:
+def test_steps_match_projected_adam() -> None:
     generator = torch.Generator().manual_seed(3)
     start = torch.randn((200, 3), generator=generator)
     gradients = [torch.randn((200, 3), generator=generator) + 0.5 for _ in range(20)]
@@ -125,7 +125,7 @@ def test_steps_are_those_of_projected_adam() -> None:
     torch.testing.assert_close(colors.detach().double(), expected, rtol=0, atol=1e-5)
 
 
-def test_a_step_that_is_not_made_brings_nothing_back() -> None:
+def test_rejected_step_clamps_no_colors() -> None:
     colors = torch.full((4, 3), 5.0)
     ColorOptimizer(colors, bounded=True).update(torch.full((4, 3), 10 * LARGEST_GRADIENT), 0.1)
     assert bool((colors == 5).all())

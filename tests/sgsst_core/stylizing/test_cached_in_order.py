@@ -46,7 +46,9 @@ def steps(stylizer: Stylizer, count: int) -> Stylizer:
 
 @pytest.mark.parametrize("form", ["float32", "half"])
 @pytest.mark.parametrize("views_per_step", [1, 2])
-def test_looks_in_between_change_no_bit(form: str, views_per_step: int, tiny_weights: BackboneWeights) -> None:
+def test_evaluations_between_steps_do_not_change_results(
+    form: str, views_per_step: int, tiny_weights: BackboneWeights
+) -> None:
     alone, watched = (job(tiny_weights, form, views_per_step=views_per_step) for _ in range(2))
     everything = list(range(len(VIEWS)))
     watched.evaluate(everything)
@@ -63,7 +65,7 @@ def test_looks_in_between_change_no_bit(form: str, views_per_step: int, tiny_wei
 @pytest.mark.parametrize("form", ["float32", "half"])
 @pytest.mark.parametrize("views_per_step", [1, 2])
 @pytest.mark.parametrize("before", [2, STEPS])
-def test_a_resumed_job_keeps_the_same_views(
+def test_resumed_job_caches_the_same_views(
     form: str, views_per_step: int, before: int, tiny_weights: BackboneWeights
 ) -> None:
     whole, first, rest = (job(tiny_weights, form, views_per_step=views_per_step) for _ in range(3))
@@ -84,7 +86,7 @@ def test_job_resumed_in_either_phase_caches_the_same_views(before: int, tiny_wei
     assert cached_views(rest) == cached_views(whole)
 
 
-def test_keeping_is_left_to_the_caller() -> None:
+def test_caller_decides_which_views_are_cached() -> None:
     scene, view = wall(), VIEWS[0]
     cached, cpu = CachedRasterizer(scene, at_first_use=False), CpuRasterizer(scene)
     pixels = torch.ones(view.height, view.width, 3)
@@ -96,7 +98,7 @@ def test_keeping_is_left_to_the_caller() -> None:
     assert not CachedRasterizer(scene, at_first_use=False, max_bytes=10).cache_weights(view)
 
 
-def test_lent_weights_are_those_that_are_cached() -> None:
+def test_temporary_weights_match_cached_weights() -> None:
     scene, view = wall(), VIEWS[0]
     lender, keeper = (CachedRasterizer(scene, at_first_use=False, precision="half") for _ in range(2))
     pixels = torch.ones(view.height, view.width, 3)

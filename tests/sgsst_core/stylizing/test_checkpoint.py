@@ -58,7 +58,7 @@ def state() -> StylizerState:
 
 
 @pytest.fixture
-def kept(state: StylizerState) -> Checkpoint:
+def full_checkpoint(state: StylizerState) -> Checkpoint:
     seen = torch.tensor([True, True, False, True, True])
     survey = Survey(torch.rand(5, dtype=torch.float64), [0, 2], [Rectangle(0, 1, 2, 3), Rectangle(4, 5, 6, 7)], 1 / 3)
     plan = Plan(
@@ -93,40 +93,42 @@ def assert_same(expected: object, found: object) -> None:
             assert one == other, name
 
 
-def test_everything_comes_back_exactly(kept: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", kept, "job")
+def test_checkpoint_round_trips_exactly(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
     loaded = load_checkpoint(tmp_path / "c", "job")
-    assert_same(kept, loaded)
+    assert_same(full_checkpoint, loaded)
     torch.Generator().set_state(loaded.state.generator)
 
 
-def test_the_memory_of_a_gpu_comes_back(kept: Checkpoint, tmp_path: Path) -> None:
-    history = [replace(record, device_memory=10**11) for record in kept.state.history]
-    plan = replace(kept.plan, device="cuda", precision="tf32", prediction=Prediction(0.1, 0.2, 3, device_bytes=10**12))
-    kept = replace(kept, state=replace(kept.state, history=history), plan=plan)
-    save_checkpoint(tmp_path / "c", kept, "job")
-    assert_same(kept, load_checkpoint(tmp_path / "c", "job"))
+def test_gpu_memory_round_trips(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
+    history = [replace(record, device_memory=10**11) for record in full_checkpoint.state.history]
+    plan = replace(
+        full_checkpoint.plan, device="cuda", precision="tf32", prediction=Prediction(0.1, 0.2, 3, device_bytes=10**12)
+    )
+    full_checkpoint = replace(full_checkpoint, state=replace(full_checkpoint.state, history=history), plan=plan)
+    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
+    assert_same(full_checkpoint, load_checkpoint(tmp_path / "c", "job"))
 
 
-def test_a_refined_scene_is_known_again(kept: Checkpoint, tmp_path: Path) -> None:
+def test_refinement_round_trips(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     pieces = torch.tensor([[1, 1, 1], [3, 1, 1]], dtype=torch.uint8)
     made = Refinement(pieces, 1, 4, 1 / 3, 44.4, 41.1, 2, torch.rand(4, 3))
-    refined = replace(kept, plan=replace(kept.plan, refinement=made))
+    refined = replace(full_checkpoint, plan=replace(full_checkpoint.plan, refinement=made))
     save_checkpoint(tmp_path / "c", refined, "job")
     found = load_checkpoint(tmp_path / "c", "job")
     assert_same(refined, found)
     assert found.plan.refinement is not None
 
 
-def test_checkpoint_of_an_earlier_version_is_refused(kept: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", kept, "job")
+def test_checkpoint_of_an_earlier_version_is_refused(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
     (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"7"', b'"version":"6"'))
     with pytest.raises(CheckpointError, match="another version of this program"):
         load_checkpoint(tmp_path / "c", "job")
 
 
-def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", kept, "job")
+def test_storage_format_of_losses_is_stable(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
     with safe_open(tmp_path / "c", "pt") as file:
         metadata = file.metadata()
     history = json.loads(metadata["history"])
@@ -138,31 +140,29 @@ def test_losses_are_stored_as_they_have_been_since_the_format_was_made(kept: Che
     }
 
 
-def with_terms(kept: Checkpoint, **terms: float) -> Checkpoint:
+def with_terms(full_checkpoint: Checkpoint, **terms: float) -> Checkpoint:
     """Return a copy of a checkpoint whose history has a single step with these loss terms."""
-    record = replace(kept.state.history[0], terms={0: LossTerms(**terms)})
-    return replace(kept, state=replace(kept.state, history=[record]))
+    record = replace(full_checkpoint.state.history[0], terms={0: LossTerms(**terms)})
+    return replace(full_checkpoint, state=replace(full_checkpoint.state, history=[record]))
 
 
-def test_a_term_that_the_loss_did_not_have_yet_is_0(
-    kept: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_loss_term_is_0(full_checkpoint: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     last = list(TERMS)[-1]
     with monkeypatch.context() as patch:
         patch.delitem(TERMS, last)  # undoing the patch restores the order
-        save_checkpoint(tmp_path / "c", with_terms(kept, gram=1.0, mean=2.0, std=3.0), "job")
+        save_checkpoint(tmp_path / "c", with_terms(full_checkpoint, gram=1.0, mean=2.0, std=3.0), "job")
     (record,) = load_checkpoint(tmp_path / "c", "job").state.history
     assert record.terms == {0: LossTerms(gram=1.0, mean=2.0, std=3.0)}
     assert record.terms[0][last] == 0
     assert list(TERMS)[-1] == last
 
 
-def test_a_term_that_the_loss_does_not_have_is_refused_by_name(
-    kept: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_unknown_loss_term_is_refused_by_name(
+    full_checkpoint: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setitem(TERMS, "later", "a term of a later version")
-        save_checkpoint(tmp_path / "c", with_terms(kept, gram=1.0, later=2.0), "job")
+        save_checkpoint(tmp_path / "c", with_terms(full_checkpoint, gram=1.0, later=2.0), "job")
     with pytest.raises(CheckpointError, match="the loss has no term later"):
         load_checkpoint(tmp_path / "c", "job")
 
@@ -185,9 +185,9 @@ def flipped(data: bytes, at: int) -> bytes:
         lambda data: data.replace(b'"step":"2"', b'"step":"3"'),
     ],
 )
-def test_a_damaged_file_is_refused(kept: Checkpoint, tmp_path: Path, damage: Any) -> None:
+def test_damaged_file_is_refused(full_checkpoint: Checkpoint, tmp_path: Path, damage: Any) -> None:
     path = tmp_path / "c"
-    save_checkpoint(path, kept, "job")
+    save_checkpoint(path, full_checkpoint, "job")
     before = path.read_bytes()
     path.write_bytes(damage(before))
     assert path.read_bytes() != before
@@ -195,10 +195,10 @@ def test_a_damaged_file_is_refused(kept: Checkpoint, tmp_path: Path, damage: Any
         load_checkpoint(path, "job")
 
 
-def test_the_last_two_are_kept(kept: Checkpoint, tmp_path: Path) -> None:
+def test_last_two_checkpoints_are_preserved(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
     for step in (1, 2, 3):
-        checkpoints.save(replace(kept, state=replace(kept.state, step=step)), "job")
+        checkpoints.save(replace(full_checkpoint, state=replace(full_checkpoint.state, step=step)), "job")
     assert len(list(tmp_path.iterdir())) == 2
     assert load_checkpoint(checkpoints.latest, "job").state.step == 3
     assert load_checkpoint(checkpoints.previous, "job").state.step == 2
@@ -207,18 +207,16 @@ def test_the_last_two_are_kept(kept: Checkpoint, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("spoil", ["truncated", "missing", "foreign"])
-def test_the_one_before_takes_the_place_of_one_that_cannot_be_used(
-    kept: Checkpoint, tmp_path: Path, spoil: str
-) -> None:
+def test_previous_checkpoint_replaces_an_unusable_one(full_checkpoint: Checkpoint, tmp_path: Path, spoil: str) -> None:
     checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
-    checkpoints.save(kept, "job")
-    checkpoints.save(replace(kept, state=replace(kept.state, step=3)), "job")
+    checkpoints.save(full_checkpoint, "job")
+    checkpoints.save(replace(full_checkpoint, state=replace(full_checkpoint.state, step=3)), "job")
     if spoil == "truncated":
         checkpoints.latest.write_bytes(checkpoints.latest.read_bytes()[:1000])
     elif spoil == "missing":
         checkpoints.latest.unlink()
     else:
-        save_checkpoint(checkpoints.latest, kept, "another job")
+        save_checkpoint(checkpoints.latest, full_checkpoint, "another job")
     warnings: list[str] = []
     assert checkpoints.load("job", warnings.append).state.step == 2
     assert len(warnings) == 1
@@ -229,49 +227,49 @@ def test_the_one_before_takes_the_place_of_one_that_cannot_be_used(
         )
 
 
-def test_only_what_a_run_has_written_itself(kept: Checkpoint, tmp_path: Path) -> None:
+def test_checkpoint_of_another_run_is_refused(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
-    checkpoints.save(kept, "job")
+    checkpoints.save(full_checkpoint, "job")
     assert checkpoints.load("job", pytest.fail, "run").run == "run"
     with pytest.raises(CheckpointError, match="earlier run"):
         checkpoints.load("job", pytest.fail, "another run")
 
 
-def test_a_full_disk_is_an_output_error_and_what_is_there_stays(kept: Checkpoint, tmp_path: Path) -> None:
+def test_full_disk_is_an_output_error_and_preserves_checkpoint(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     resource = pytest.importorskip("resource")
     checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
-    checkpoints.save(kept, "job")
+    checkpoints.save(full_checkpoint, "job")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
         with pytest.raises(OutputError, match="Free some space"):
-            checkpoints.save(kept, "job")
+            checkpoints.save(full_checkpoint, "job")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert [path.name for path in tmp_path.iterdir()] == [checkpoints.latest.name]
     assert load_checkpoint(checkpoints.latest, "job").state.step == 2
 
 
-def test_another_safetensors_file_is_refused(tmp_path: Path) -> None:
+def test_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
     save_file({"a": torch.zeros(1)}, tmp_path / "c")
     with pytest.raises(CheckpointError, match="not a readable checkpoint"):
         load_checkpoint(tmp_path / "c", "job")
 
 
-def test_another_job_and_a_missing_file_are_refused(kept: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", kept, "job")
+def test_other_jobs_and_missing_files_are_refused(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
     with pytest.raises(CheckpointError, match="another job"):
         load_checkpoint(tmp_path / "c", "other")
     with pytest.raises(CheckpointError, match="no checkpoint"):
         load_checkpoint(tmp_path / "missing", "job")
 
 
-def test_a_folder_that_is_not_there_is_an_output_error(kept: Checkpoint, tmp_path: Path) -> None:
+def test_missing_folder_is_an_output_error(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     with pytest.raises(OutputError):
-        save_checkpoint(tmp_path / "missing" / "c", kept, "job")
+        save_checkpoint(tmp_path / "missing" / "c", full_checkpoint, "job")
 
 
-def test_fingerprint_tells_jobs_apart() -> None:
+def test_fingerprint_distinguishes_jobs() -> None:
     scene, views, image, settings = wall(), cameras(), style(), make_settings()
     base = fingerprint(scene, views, image, settings, "w")
     assert base == fingerprint(wall(), cameras(), style(), make_settings(), "w")
@@ -293,7 +291,7 @@ def test_fingerprint_tells_jobs_apart() -> None:
 
 @pytest.mark.parametrize("factor", ["EVEN_COLOR_SCALE", "EVEN_PIXEL_SCALE"])
 @pytest.mark.parametrize(("scale", "same"), [("even", False), ("paper", True)])
-def test_a_job_does_not_go_on_under_other_factors(
+def test_fingerprint_depends_on_the_feature_scale_factors(
     scale: str, same: bool, factor: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = (wall(), cameras(), style(), make_settings(feature_scale=scale), "w")
@@ -302,13 +300,13 @@ def test_a_job_does_not_go_on_under_other_factors(
     assert (fingerprint(*job) == before) == same
 
 
-def test_fingerprint_leaves_budgets_free() -> None:
+def test_fingerprint_ignores_budgets() -> None:
     scene, views, image = wall(), cameras(), style()
     free = make_settings(max_seconds=3, memory_limit=10**9, measure=0.0)
     assert fingerprint(scene, views, image, free, "w") == fingerprint(scene, views, image, make_settings(), "w")
 
 
-def test_the_fingerprint_of_several_styles_tells_them_and_their_weights_apart() -> None:
+def test_fingerprint_distinguishes_styles_and_their_weights() -> None:
     scene, views, settings = wall(), cameras(), make_settings()
     pictures = [style(), style().flip(0)]
     alone = fingerprint(scene, views, style(), settings, "w")

@@ -33,14 +33,14 @@ def plain(moved: Array, weight: Array, wanted: Array) -> Array:
     Along each direction, a value is replaced by the target value at the same cumulative weight.
     """
     moved = moved.copy()
-    for axes in (turn.numpy() for turn in _round_axes()):
-        turned, targets = moved @ axes, np.sort(wanted @ axes, axis=0)
+    for axes in (rotation.numpy() for rotation in _round_axes()):
+        rotated, targets = moved @ axes, np.sort(wanted @ axes, axis=0)
         for axis in range(3):
-            order = np.argsort(turned[:, axis])
+            order = np.argsort(rotated[:, axis])
             share = np.cumsum(weight[order]) - 0.5 * weight[order]
             places = np.linspace(0, weight.sum(), len(targets))
-            turned[order, axis] = np.interp(share, places, targets[:, axis])
-        moved = turned @ axes.T
+            rotated[order, axis] = np.interp(share, places, targets[:, axis])
+        moved = rotated @ axes.T
     return moved
 
 
@@ -55,25 +55,25 @@ def distance(first: Tensor, second: Tensor) -> float:
     return float(torch.stack(parts).mean())
 
 
-def test_turns_are_turns_and_all_differ() -> None:
-    turns = list(_round_axes())
-    assert len(turns) == color_transport.ROUNDS
-    for turn in turns:
-        torch.testing.assert_close(turn @ turn.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
-        assert torch.linalg.det(turn) == pytest.approx(1)
-    angles = [torch.arccos(((a.T @ b).trace() - 1) / 2) for i, a in enumerate(turns) for b in turns[:i]]
+def test_axes_are_distinct_rotations() -> None:
+    rotations = list(_round_axes())
+    assert len(rotations) == color_transport.ROUNDS
+    for rotation in rotations:
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
+        assert torch.linalg.det(rotation) == pytest.approx(1)
+    angles = [torch.arccos(((a.T @ b).trace() - 1) / 2) for i, a in enumerate(rotations) for b in rotations[:i]]
     assert min(angles) > 0.2
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
-def test_weighted_colors_get_the_distribution_that_is_wanted(scale: float) -> None:
+def test_weighted_colors_get_the_target_distribution(scale: float) -> None:
     own, count, wanted = colors(4000, 0), scale * weights(4000, 1), 1 - colors(3000, 2)
     found = transported(own, count, wanted)
     assert distance(own[_drawn(count)], wanted) > 0.1
     assert distance(found[_drawn(count)], wanted) < 0.01
 
 
-def test_samples_and_knots_are_near_a_transport_without_them() -> None:
+def test_transport_by_samples_and_knots_is_close_to_exact() -> None:
     own, count, wanted = colors(3000, 3), weights(3000, 4), 1 - colors(2000, 5)
     expected = torch.from_numpy(plain(own.numpy(), count.numpy(), wanted.numpy()))
     error = (transported(own, count, wanted) - expected).norm(dim=1)
@@ -83,14 +83,14 @@ def test_samples_and_knots_are_near_a_transport_without_them() -> None:
     assert float((own - expected).norm(dim=1).median()) > 0.2
 
 
-def test_a_distribution_that_is_there_already_stays() -> None:
+def test_matching_distribution_is_unchanged() -> None:
     own = colors(5000, 6)
     error = (transported(own, torch.ones(5000, dtype=torch.float64), own) - own).norm(dim=1)
     assert float(error.mean()) < 1e-3
     assert float(error.max()) < 0.06, "of the outermost ones, between which there is nothing"
 
 
-def test_equal_colors_stay_equal_and_what_has_no_weight_changes_nothing() -> None:
+def test_equal_colors_stay_equal_and_zero_weights_are_ignored() -> None:
     own, count, wanted = colors(500, 7), weights(500, 8), colors(500, 9)
     more = torch.cat([own, own[:100], 5 - own])
     less = torch.cat([count, torch.zeros(600, dtype=torch.float64)])
@@ -100,7 +100,7 @@ def test_equal_colors_stay_equal_and_what_has_no_weight_changes_nothing() -> Non
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 1e6, 1e30])
-def test_colors_of_any_size_end_near_the_wanted_ones(size: float) -> None:
+def test_colors_of_any_size_get_close_to_the_target(size: float) -> None:
     own, wanted = size * (colors(800, 10) - 0.5), colors(900, 11)
     found = transported(own, torch.ones(800, dtype=torch.float64), wanted)
     assert bool(found.isfinite().all())
@@ -109,7 +109,7 @@ def test_colors_of_any_size_end_near_the_wanted_ones(size: float) -> None:
     torch.testing.assert_close(found.mean(0), wanted.mean(0), rtol=0, atol=0.05)
 
 
-def test_one_color_becomes_the_mean_whatever_rounding_makes_of_it() -> None:
+def test_nearly_equal_colors_become_the_mean() -> None:
     wanted = colors(1000, 12)
     own = torch.full((100_000, 3), 0.1, dtype=torch.float64)
     own += 1e-9 * torch.randn(own.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -119,7 +119,7 @@ def test_one_color_becomes_the_mean_whatever_rounding_makes_of_it() -> None:
 
 
 @pytest.mark.parametrize("case", ["heaps", "far", "flat", "two"])
-def test_the_compiled_kernel_does_what_tensors_do(case: str) -> None:
+def test_compiled_kernel_agrees_with_tensor_operations(case: str) -> None:
     own, count, wanted = colors(3000, 13), weights(3000, 14), colors(700, 15)
     if case == "far":  # most knots fall into one cell
         own[::100] *= 50

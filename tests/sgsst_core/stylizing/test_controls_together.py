@@ -40,7 +40,7 @@ def stylized(stylizer: Stylizer) -> torch.Tensor:
     return stylizer.stylized()
 
 
-def test_what_is_kept_is_not_cut_and_parts_are_in_their_gaussians_region(tiny_weights: BackboneWeights) -> None:
+def test_frozen_gaussians_are_not_split_and_children_keep_regions(tiny_weights: BackboneWeights) -> None:
     settings, regions = make_settings("preview", refine=2.0), halves()
     free = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights)
     made = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights, regions=regions)
@@ -53,7 +53,7 @@ def test_what_is_kept_is_not_cut_and_parts_are_in_their_gaussians_region(tiny_we
 
 
 @pytest.mark.parametrize("colors", ["no", "luminance"])
-def test_all_at_once(tiny_weights: BackboneWeights, colors: str) -> None:
+def test_all_controls_work_together(tiny_weights: BackboneWeights, colors: str) -> None:
     values = {"refine": 2.0, "preserve_colors": colors, "scales": (1.0, 0.5), "warm_start": True}
     stylizer = job(tiny_weights, **values)
     before = stylizer.job.scene.sh_dc.clone()

@@ -81,7 +81,7 @@ def make(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scan", [False, True])
-def test_steps_with_graphs_are_the_same_to_the_bit(
+def test_steps_with_graphs_are_bit_identical(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, scan: bool
 ) -> None:
     """In both phases, the first of two views that share a graph prepares it, and the second is captured."""
@@ -104,7 +104,7 @@ def test_steps_with_graphs_are_the_same_to_the_bit(
 
 
 @pytest.mark.slow
-def test_a_color_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
+def test_one_graph_serves_every_background_color(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One graph serves every background color, which causes no wait and no copy."""
@@ -129,7 +129,7 @@ def test_a_color_drawn_behind_a_scan_goes_into_the_graph_with_the_picture(
     assert found["drawn"][-1][0] == 1
 
 
-def test_several_views_a_step_and_a_resumed_run(
+def test_graphs_support_several_views_per_step_and_resuming(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second view of a step does not change the first one's results, and a resumed run captures new graphs.

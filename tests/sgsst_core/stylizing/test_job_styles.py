@@ -29,7 +29,7 @@ def ramp(height: int, width: int, slope_y: float, slope_x: float) -> torch.Tenso
     return (0.5 + slope_y * y[:, None] + slope_x * x).unsqueeze(2).expand(-1, -1, 3).contiguous()
 
 
-def test_quarters_of_a_turn_move_pixels_only() -> None:
+def test_rotations_by_90_degrees_only_move_pixels() -> None:
     style = picture()
     assert torch.equal(rotated(style, 90), torch.rot90(style, 1, (0, 1)))
     assert torch.equal(rotated(style, -90), torch.rot90(style, -1, (0, 1)))
@@ -39,7 +39,7 @@ def test_quarters_of_a_turn_move_pixels_only() -> None:
 
 @pytest.mark.parametrize("degrees", [1, 17, 45, 89, 107, -30, 200])
 @pytest.mark.parametrize("size", [(80, 80), (60, 150), (150, 60)])
-def test_a_plane_of_brightness_turns_with_the_picture(degrees: float, size: tuple[int, int]) -> None:
+def test_brightness_ramp_rotates_with_the_image(degrees: float, size: tuple[int, int]) -> None:
     """Every pixel comes from inside the image: edges are not extended and nothing is filled in."""
     height, width = size
     found = rotated(ramp(height, width, 0.001, 0.002), degrees)[..., 0]
@@ -55,14 +55,14 @@ def test_a_plane_of_brightness_turns_with_the_picture(degrees: float, size: tupl
 
 @pytest.mark.parametrize("degrees", [0.5, 10, 30, 45, 60, 89.5])
 @pytest.mark.parametrize("size", [(100, 100), (80, 200), (300, 90)])
-def test_the_cut_is_the_largest_that_lies_inside(degrees: float, size: tuple[int, int]) -> None:
+def test_crop_is_the_largest_that_lies_inside(degrees: float, size: tuple[int, int]) -> None:
     (height, width), angle = size, math.radians(degrees)
     sine, cosine = math.sin(angle), math.cos(angle)
 
     def fits(across: float, down: float) -> bool:
         corners = ((across / 2, down / 2), (across / 2, -down / 2))
-        turned_back = [(x * cosine + y * sine, y * cosine - x * sine) for x, y in corners]
-        return all(abs(x) <= width / 2 + 1e-9 and abs(y) <= height / 2 + 1e-9 for x, y in turned_back)
+        rotated_back = [(x * cosine + y * sine, y * cosine - x * sine) for x, y in corners]
+        return all(abs(x) <= width / 2 + 1e-9 and abs(y) <= height / 2 + 1e-9 for x, y in rotated_back)
 
     down, across = _inside(height, width, angle)
     assert fits(across, down)
@@ -71,7 +71,7 @@ def test_the_cut_is_the_largest_that_lies_inside(degrees: float, size: tuple[int
     assert (across + 3) * (down + 3) >= best * 0.99
 
 
-def test_a_style_of_one_pixel_can_be_rotated() -> None:
+def test_style_of_one_pixel_can_be_rotated() -> None:
     assert rotated(torch.full((1, 1, 3), 0.25), 30).shape == (1, 1, 3)
 
 
@@ -93,20 +93,20 @@ def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
     torch.testing.assert_close(found.T.cov(correction=0), covariance, atol=1e-4, rtol=0)
 
 
-def test_a_flat_style_takes_the_scenes_mean() -> None:
+def test_uniform_style_gets_the_mean_of_the_scene() -> None:
     settings = make_settings("standard", preserve_colors="match")
     gray = Style.of(torch.full((4, 4, 3), 0.9))
     (found,) = prepared_style(gray, settings, torch.zeros(10, 3), torch.ones(10).double()).images
     torch.testing.assert_close(found, torch.full((4, 4, 3), 0.5))
 
 
-def test_without_wishes_the_style_is_itself() -> None:
+def test_default_settings_leave_the_style_unchanged() -> None:
     style = Style.of(picture())
     assert prepared_style(style, make_settings("standard"), torch.zeros(2, 3), torch.ones(2).double()) is style
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_larger_strokes_are_statistics_of_a_larger_style(tiny_weights: BackboneWeights, scale: float) -> None:
+def test_style_scale_uses_statistics_of_a_resized_style(tiny_weights: BackboneWeights, scale: float) -> None:
     style, view = picture(96, 120), (64, 96)
     size = style_size((96, 120), view, scale)
     assert size == (round(64 * scale), round(80 * scale))
@@ -117,13 +117,13 @@ def test_larger_strokes_are_statistics_of_a_larger_style(tiny_weights: BackboneW
         torch.testing.assert_close(found.layers[layer].gram, wanted.layers[layer].gram)
 
 
-def test_strokes_as_they_are_leave_a_small_style_alone() -> None:
+def test_small_style_is_not_enlarged_by_default() -> None:
     assert style_size((50, 70), (64, 96)) == (50, 70)
     assert style_size((50, 70), (64, 96), 2) == (100, 140)
     assert style_size((1, 1), (64, 96), 0.25) == (1, 1)
 
 
-def test_a_style_may_be_as_large_as_a_view_may_be() -> None:
+def test_style_size_has_the_limit_of_views() -> None:
     (view,) = cameras()[:1]
     line = Style.of(torch.zeros(1, 100, 3))
     most = MAX_RESOLUTION / 100
@@ -133,7 +133,7 @@ def test_a_style_may_be_as_large_as_a_view_may_be() -> None:
         check_style_size(line, [view], most + 0.1)
 
 
-def test_a_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
+def test_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("standard", style_rotation=90, preserve_colors="match", style_scale=2, coarsest_side=24)
     scene, style = wall(), picture()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)

@@ -49,11 +49,11 @@ def in_bfloat16(weights: BackboneWeights) -> Stylizer:
     )
 
 
-def told(plan: Plan) -> bool:
+def plan_mentions_transfer(plan: Plan) -> bool:
     return any("after the last step" in line.decision for line in plan.decisions)
 
 
-def test_results_have_the_styles_distribution_and_steps_go_on_without_it(tiny_weights: BackboneWeights) -> None:
+def test_transfer_changes_results_but_not_optimized_colors(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights)
     run(stylizer)
     optimized = stylizer.sh_dc.detach().clone()
@@ -66,13 +66,13 @@ def test_results_have_the_styles_distribution_and_steps_go_on_without_it(tiny_we
     assert float((wanted - optimized).abs().mean()) > 0.01
     assert torch.equal(stylizer.sh_dc, optimized)
     assert torch.equal(stylizer.shown(), found[stylizer.job.plan.seen])
-    assert told(stylizer.job.plan)
+    assert plan_mentions_transfer(stylizer.job.plan)
 
 
 @pytest.mark.parametrize(
     "values", [{"style_loss": "sos"}, {"style_loss": "mixed"}, {"warm_start": False}, {"steps_sos": 1, "steps": 0}]
 )
-def test_other_results_are_what_steps_have_found(tiny_weights: BackboneWeights, values: dict[str, Any]) -> None:
+def test_other_results_are_the_optimized_colors(tiny_weights: BackboneWeights, values: dict[str, Any]) -> None:
     """Cases are losses with statistics, a cold start, and a job without any step."""
     steps = values.pop("steps", None)
     stylizer = make(tiny_weights, **values)
@@ -80,10 +80,10 @@ def test_other_results_are_what_steps_have_found(tiny_weights: BackboneWeights, 
     rows = stylizer.job.plan.optimized
     assert torch.equal(stylizer.stylized()[rows], stylizer.sh_dc.detach()[rows[stylizer.job.plan.seen]])
     assert torch.equal(stylizer.shown(), stylizer.sh_dc)
-    assert told(stylizer.job.plan) == (steps == 0)
+    assert plan_mentions_transfer(stylizer.job.plan) == (steps == 0)
 
 
-def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights) -> None:
+def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights) -> None:
     whole, first = make(tiny_weights), make(tiny_weights)
     run(whole)
     for _ in range(3):
@@ -97,7 +97,7 @@ def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights) ->
     assert torch.equal(again.stylized(), whole.stylized())
 
 
-def test_each_region_has_the_colors_of_its_own_style_and_kept_ones_their_bits(tiny_weights: BackboneWeights) -> None:
+def test_regions_get_colors_of_their_styles_and_frozen_ones_none(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
     dark, bright = (Style.of(torch.full((40, 40, 3), gray)) for gray in (0.2, 0.7))
     labels = (scene.means[:, 0] > 0.5).to(torch.uint8)
@@ -116,7 +116,7 @@ def test_each_region_has_the_colors_of_its_own_style_and_kept_ones_their_bits(ti
 
 
 @pytest.mark.parametrize("bounded", [True, False])
-def test_chroma_is_kept_where_luminance_alone_changes(tiny_weights: BackboneWeights, bounded: bool) -> None:
+def test_luminance_mode_preserves_chroma(tiny_weights: BackboneWeights, bounded: bool) -> None:
     stylizer = make(tiny_weights, preserve_colors="luminance", warm_start=True, bounded=bounded, unseen="freeze")
     run(stylizer)
     rows, before = stylizer.job.plan.optimized, stylizer.job.scene.sh_dc
@@ -128,7 +128,7 @@ def test_chroma_is_kept_where_luminance_alone_changes(tiny_weights: BackboneWeig
     assert off < 1e-6 if bounded else off > 0.1
 
 
-def test_what_is_reported_is_what_is_written(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_reports_describe_the_written_colors(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
     """Loss and images belong to the colors in the file; the error of bfloat16 compares gradients at the same colors."""
     stylizer = in_bfloat16(tiny_weights)
     run(stylizer)

@@ -79,7 +79,7 @@ def test_every_gaussian_keeps_its_chroma(
         assert float((found - scene.sh_dc)[hidden].abs().max()) > 0
 
 
-def test_a_step_in_float64_is_the_derivative_of_luminance_alone(tiny_weights: BackboneWeights) -> None:
+def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) -> None:
     """The derivative is with respect to a value added to all channels of a Gaussian, by autograd from definitions."""
     scene, view = wall(), cameras(1)[0]
     settings = make_settings(preserve_colors="luminance", coarsest_side=24, steps_coarse=0, clamp_aware_gradient=False)
@@ -113,7 +113,7 @@ def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> Non
         assert relative_error(found.image_gradient, gradient) < 1e-9
 
 
-def test_colors_of_equal_luminance_are_the_same_to_the_loss(tiny_weights: BackboneWeights) -> None:
+def test_colors_of_equal_luminance_have_equal_features(tiny_weights: BackboneWeights) -> None:
     network = FeatureNetwork(replace(tiny_weights, gray=True), dtype=torch.float64)
     image = picture(40, 48, seed=1)
     other = image + torch.tensor([0.587, -0.299, 0.0], dtype=torch.float64) * picture(40, 48, seed=5)[..., :1]
@@ -122,7 +122,7 @@ def test_colors_of_equal_luminance_are_the_same_to_the_loss(tiny_weights: Backbo
         torch.testing.assert_close(features, second[layer])
 
 
-def test_the_style_takes_the_scenes_luminance() -> None:
+def test_style_gets_the_luminance_of_the_scene() -> None:
     generator = torch.Generator().manual_seed(1)
     colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=generator)
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
@@ -138,7 +138,7 @@ def test_the_style_takes_the_scenes_luminance() -> None:
     )
 
 
-def test_pictures_of_a_mixture_take_the_scenes_luminance_together() -> None:
+def test_mixture_as_a_whole_gets_the_luminance_of_the_scene() -> None:
     """Dark and bright images stay dark and bright; only the mixture has the scene's mean and deviation."""
     colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=torch.Generator().manual_seed(1))
     dark, bright = (0.2 + 0.1 * picture(40, 60, seed=2), 0.6 + 0.1 * picture(60, 40, seed=3))
@@ -174,7 +174,7 @@ def test_flat_styles_and_scenes_are_finite(value: float) -> None:
         assert -1e-6 <= float(brightness.min()) <= float(brightness.max()) <= 1 + 1e-6
 
 
-def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, tmp_path: Any) -> None:
+def test_resumed_run_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: Any) -> None:
     whole, first, second = (make(tiny_weights, wall()) for _ in range(3))
     run(whole)
     for _ in range(3):
@@ -186,7 +186,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, tm
     assert torch.equal(whole.stylized(), second.stylized())
 
 
-def test_where_no_step_can_be_made_nothing_changes() -> None:
+def test_rejected_step_changes_no_colors() -> None:
     original = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
     colors = original + 0.7 * torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
     before = colors.clone()
@@ -197,7 +197,7 @@ def test_where_no_step_can_be_made_nothing_changes() -> None:
     assert not torch.equal(colors.detach(), before)
 
 
-def test_a_run_that_diverges_keeps_its_colors(tiny_weights: BackboneWeights) -> None:
+def test_diverged_step_changes_no_colors(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, wall())
     stylizer.run_step()
     with torch.no_grad():

@@ -28,7 +28,7 @@ def rate(step: int) -> float:
     return float(0.3 * 0.7**step)
 
 
-def test_steps_are_those_of_pytorchs_class() -> None:
+def test_steps_are_bit_identical_to_pytorchs_adam() -> None:
     start = torch.randn((90, 3), generator=torch.Generator().manual_seed(2)).to(DEVICE)
     colors, theirs = start.clone(), start.clone().requires_grad_()
     optimizer = ColorOptimizer(colors)
@@ -44,7 +44,7 @@ def test_steps_are_those_of_pytorchs_class() -> None:
     assert torch.equal(second, adam.state[theirs]["exp_avg_sq"].cpu())
 
 
-def test_loaded_moments_go_on_to_the_bit() -> None:
+def test_steps_from_loaded_moments_are_bit_identical() -> None:
     start = torch.randn((90, 3), generator=torch.Generator().manual_seed(2)).to(DEVICE)
     whole = ColorOptimizer(colors := start.clone())
     for step, gradient in enumerate(gradients()):
@@ -57,7 +57,7 @@ def test_loaded_moments_go_on_to_the_bit() -> None:
     assert torch.equal(half.detach(), colors.detach())
 
 
-def test_a_step_does_not_load_pytorchs_compiler() -> None:
+def test_step_does_not_import_pytorchs_compiler() -> None:
     """The compiler would take two seconds and 140 MB in every process that optimizes."""
     code = (
         "import sys, torch\n"

@@ -20,7 +20,7 @@ def cameras_of(folder, scene, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["biker", "snowmiku_plush"])
-def test_sos_loss_halves_in_every_scale_and_falls_on_held_out_views(shared_data, vgg16_weights, name):
+def test_sos_loss_halves_at_every_scale_and_falls_on_novel_views(shared_data, vgg16_weights, name):
     folder = shared_data / "scenes" / name
     scene = read_scene(folder / "point_cloud.ply").scene
     cameras = cameras_of(folder, scene, 12)

@@ -129,7 +129,7 @@ def test_factor_of_one_turns_refinement_off(tiny_weights: BackboneWeights) -> No
     assert refined(scene, None) is scene
 
 
-def test_cameras_that_see_nothing_are_refused_by_the_plan(tiny_weights: BackboneWeights) -> None:
+def test_cameras_that_see_nothing_cause_no_splits(tiny_weights: BackboneWeights) -> None:
     found = refine(ball(), [blind_camera()], style(), settings(refine=2), weights=tiny_weights)
     assert found is not None
     assert found.split == 0

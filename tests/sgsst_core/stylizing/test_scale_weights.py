@@ -29,7 +29,7 @@ def line(stylizer: Stylizer, item: str) -> str:
     return next((each.decision for each in stylizer.job.plan.decisions if each.item == item), "")
 
 
-def test_phase_1_takes_the_coarsest_scale_that_counts(tiny_weights: BackboneWeights) -> None:
+def test_phase_1_uses_the_coarsest_weighted_scale(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, scales=(1.0, 0.5))
     assert stylizer.job.scale_count(0) == 3
     run(stylizer)
@@ -39,7 +39,7 @@ def test_phase_1_takes_the_coarsest_scale_that_counts(tiny_weights: BackboneWeig
     assert line(stylizer, "weights of scales") == "scale 0 1, scale 1 0.5; 1 of 3 scales are not computed"
 
 
-def test_the_judged_loss_is_that_of_the_scales_that_count(tiny_weights: BackboneWeights) -> None:
+def test_evaluated_loss_covers_the_weighted_scales(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, scales=(1.0, 0.0, 0.5), warm_start=False)
     found = stylizer.evaluate([0, 1])
     assert sorted(found) == [0, 2]
@@ -53,7 +53,7 @@ def test_the_judged_loss_is_that_of_the_scales_that_count(tiny_weights: Backbone
     assert set(map(int, stylizer.measured[-1]["novel_views"]["gram"])) == {0, 2}
 
 
-def test_one_scale_leaves_phase_1_out(tiny_weights: BackboneWeights) -> None:
+def test_single_scale_skips_phase_1(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, scales=(0.0, 1.0))
     assert stylizer.job.plan.steps_coarse == 0
     assert "skipped" in line(stylizer, "phase 1")
@@ -61,14 +61,14 @@ def test_one_scale_leaves_phase_1_out(tiny_weights: BackboneWeights) -> None:
     assert list(record.terms) == [1]
 
 
-def test_equal_weights_give_the_bits_of_none(tiny_weights: BackboneWeights) -> None:
+def test_equal_weights_are_bit_identical_to_none(tiny_weights: BackboneWeights) -> None:
     jobs = [make(tiny_weights), make(tiny_weights, scales=(1.0, 1.0, 1.0))]
     for job in jobs:
         run(job)
     assert torch.equal(jobs[0].stylized(), jobs[1].stylized())
 
 
-def test_the_plan_counts_what_is_computed(tiny_weights: BackboneWeights) -> None:
+def test_plan_predicts_only_computed_scales(tiny_weights: BackboneWeights) -> None:
     whole, coarse = make(tiny_weights, steps_coarse=0), make(tiny_weights, steps_coarse=0, scales=(0.0, 0.0, 1.0))
     expected = [job.job.plan.prediction for job in (whole, coarse)]
     assert expected[0] is not None
@@ -76,12 +76,12 @@ def test_the_plan_counts_what_is_computed(tiny_weights: BackboneWeights) -> None
     assert expected[1].style < 0.2 * expected[0].style  # a sixteenth of the pixels, plus halos
 
 
-def test_scales_that_the_views_have_not_are_refused_before_anything_is_looked_at(tiny_weights: BackboneWeights) -> None:
+def test_missing_scales_are_refused_before_the_survey(tiny_weights: BackboneWeights) -> None:
     with pytest.raises(SettingsError, match="the views have 3 scales"):
         make(tiny_weights, scales=(1.0, 0.0, 0.0, 1.0))
 
 
-def test_several_runs_repeat_and_the_loss_falls(tiny_weights: BackboneWeights) -> None:
+def test_runs_are_bit_identical_and_reduce_the_loss(tiny_weights: BackboneWeights) -> None:
     first, second = (make(tiny_weights, steps_sos=30, scales=(0.0, 1.0, 2.0), early_stop=False) for _ in range(2))
     start = mean_loss(first.start(), first.job.loss.weights)
     run(first)

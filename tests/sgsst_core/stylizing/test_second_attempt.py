@@ -64,7 +64,7 @@ def planned(weights: BackboneWeights, **values: Any) -> Stylizer:
     )
 
 
-def test_a_job_continues_with_half_of_its_activations(memory: Memory, tiny_weights: BackboneWeights) -> None:
+def test_job_continues_with_half_of_its_activations(memory: Memory, tiny_weights: BackboneWeights) -> None:
     expected, found = planned(tiny_weights), planned(tiny_weights)
     assert len(expected.job.loss.tiling.tiles((HEIGHT, WIDTH))) == 1
     for step in range(3):
@@ -79,7 +79,7 @@ def test_a_job_continues_with_half_of_its_activations(memory: Memory, tiny_weigh
     torch.testing.assert_close(found.sh_dc.cpu(), expected.sh_dc.cpu(), rtol=1e-3, atol=1e-4)
 
 
-def test_evaluations_get_a_second_attempt_too(memory: Memory, tiny_weights: BackboneWeights) -> None:
+def test_evaluations_get_a_second_attempt(memory: Memory, tiny_weights: BackboneWeights) -> None:
     stylizer = planned(tiny_weights)
     stylizer.run_step()  # computes the style's targets
     memory.pixels = TILE * HEIGHT

@@ -35,7 +35,7 @@ def line(stylizer: Stylizer) -> str:
 
 
 @pytest.mark.parametrize("attenuation", [0.4, 1.0])
-def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeights, attenuation: float) -> None:
+def test_job_is_bit_identical_to_that_of_an_attenuated_scene(tiny_weights: BackboneWeights, attenuation: float) -> None:
     scene = wall(sh_degree=2)
     stylizer = make(tiny_weights, scene, sh_attenuation=attenuation)
     came = replace(scene, sh_rest=held(scene.sh_rest) * torch.tensor(1 - attenuation, dtype=torch.float32))
@@ -54,7 +54,7 @@ def test_the_job_is_that_of_a_scene_which_came_faded(tiny_weights: BackboneWeigh
 
 @pytest.mark.parametrize("held_bytes", [0, None])
 @pytest.mark.parametrize("attenuation", [0.4, 1.0])
-def test_the_picture_of_the_result_is_what_was_optimized(
+def test_written_result_renders_as_optimized(
     tiny_weights: BackboneWeights, tmp_path: Path, held_bytes: int | None, attenuation: float
 ) -> None:
     write_scene(tmp_path / "scene.ply", wall(sh_degree=1))
@@ -76,7 +76,7 @@ def test_the_picture_of_the_result_is_what_was_optimized(
         assert torch.equal(*pictures)
 
 
-def test_the_plan_says_what_fades(tiny_weights: BackboneWeights) -> None:
+def test_plan_describes_the_attenuation(tiny_weights: BackboneWeights) -> None:
     assert "there is nothing to attenuate" in line(make(tiny_weights, wall(), sh_attenuation=0.5))
     assert "multiplied by 0.75" in line(make(tiny_weights, wall(sh_degree=1), sh_attenuation=0.25))
     out = make(tiny_weights, wall(sh_degree=1), sh_attenuation=1)

@@ -58,7 +58,7 @@ def copied(scene: Scene) -> Scene:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_scene_comes_back_in_its_form_with_new_colors(
+def test_result_has_the_form_of_the_scene_and_new_colors(
     tiny_weights: BackboneWeights, tmp_path: Path, form: str
 ) -> None:
     given = in_form(form, wall(sh_degree=1), tmp_path)
@@ -81,7 +81,7 @@ def test_a_scene_comes_back_in_its_form_with_new_colors(
 
 
 @pytest.mark.parametrize("form", ["ply", "spz", "scene", "numpy", "activated", "nerfstudio"])
-def test_split_and_attenuated_scenes_come_back_in_their_form(
+def test_split_and_attenuated_results_have_the_form_of_the_scene(
     tiny_weights: BackboneWeights, tmp_path: Path, form: str
 ) -> None:
     scene = large_wall()
@@ -111,7 +111,7 @@ def test_split_and_attenuated_scenes_come_back_in_their_form(
             run(result, tiny_weights, refine=2)
 
 
-def test_a_result_can_be_stylized_again(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_result_can_be_stylized_again(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
     source = in_form("ply", wall(sh_degree=1), tmp_path)
     twice = run(run(source, tiny_weights, sh_attenuation=0.5), tiny_weights, sh_attenuation=0.5)
     save(tmp_path / "out.ply", twice)
@@ -119,7 +119,7 @@ def test_a_result_can_be_stylized_again(tiny_weights: BackboneWeights, tmp_path:
     assert torch.equal(held(twice.scene.sh_rest), held(source.scene.sh_rest) * 0.25)
 
 
-def test_the_example_of_the_readme_runs(tiny_installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readme_example_runs(tiny_installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ply, _, image = write_files(tmp_path)
     image.rename(tmp_path / "style.jpg")
     monkeypatch.chdir(tmp_path)
@@ -151,14 +151,14 @@ WRONG: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_unusable_arguments_are_refused_in_a_sentence(tiny_weights: BackboneWeights, case: str) -> None:
+def test_unusable_arguments_are_refused_with_a_message(tiny_weights: BackboneWeights, case: str) -> None:
     given, error, problem = WRONG[case]
     arguments: dict[str, Any] = {"scene": wall(), "cameras": cameras(1), "style": style(), "preset": "preview"} | given
     with pytest.raises(error, match=problem):
         stylize(**arguments, weights=tiny_weights)
 
 
-def test_arrays_of_numpy_make_a_scene(tiny_weights: BackboneWeights) -> None:
+def test_numpy_arrays_are_accepted(tiny_weights: BackboneWeights) -> None:
     scene = wall(sh_degree=1)
     arrays = Scene(*(getattr(scene, name).double().numpy() for name in TENSORS))
     arrays = replace(arrays, opacities=arrays.opacities[:, None], sh_dc=arrays.sh_dc[:, None])

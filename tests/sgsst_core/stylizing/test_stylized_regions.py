@@ -54,7 +54,7 @@ def make(weights: BackboneWeights, scene: Scene, regions: Regions | None, image:
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.3, 1.0, 0.1)])
 @pytest.mark.parametrize("name", ["cpu", "cached", "reference"])
-def test_maps_add_up_to_the_coverage(name: Any, background: tuple[float, float, float]) -> None:
+def test_maps_sum_to_the_coverage(name: Any, background: tuple[float, float, float]) -> None:
     scene, (view, *_) = ball(), cameras()
     labels = torch.arange(len(scene), dtype=torch.uint8) % 5
     labels[labels == 4] = 200
@@ -68,7 +68,7 @@ def test_maps_add_up_to_the_coverage(name: Any, background: tuple[float, float, 
     assert bool((maps[rasterizer.coverage(view) == 0] == 0).all())
 
 
-def test_maps_of_a_region_are_exactly_0_where_it_is_not() -> None:
+def test_maps_are_exactly_0_outside_of_the_region() -> None:
     scene, (view, *_) = wall(), cameras()
     labels = (scene.means[:, 0] > 0.5).to(torch.uint8)
     rasterizer = make_rasterizer("cpu", scene, background=(0.2, 0.4, 0.6))
@@ -77,7 +77,7 @@ def test_maps_of_a_region_are_exactly_0_where_it_is_not() -> None:
     assert float(maps[:, -4:, 1].min()) > 0.9
 
 
-# --- what is kept --------------------------------------------------------------------------------------------------
+# --- frozen regions ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -89,11 +89,13 @@ def test_maps_of_a_region_are_exactly_0_where_it_is_not() -> None:
         {"cached_weights": "half", "preserve_colors": "match", "style_loss": "mixed"},
     ],
 )
-@pytest.mark.parametrize("kept", ["rest", "right"])
-def test_kept_gaussians_stay_to_the_bit(tiny_weights: BackboneWeights, kept: str, values: dict[str, Any]) -> None:
+@pytest.mark.parametrize("frozen_region", ["rest", "right"])
+def test_frozen_gaussians_stay_bit_identical(
+    tiny_weights: BackboneWeights, frozen_region: str, values: dict[str, Any]
+) -> None:
     scene = wall(60, 40, sh_degree=1)  # extends beyond the views
     scene.sh_dc[::7] = -0.0
-    keep = {"left": Region("rest", freeze=True)} if kept == "rest" else {"right": Region("right", freeze=True)}
+    keep = {"left": Region("rest", freeze=True)} if frozen_region == "rest" else {"right": Region("right", freeze=True)}
     regions = halves(scene, **keep)
     stylizer = make(tiny_weights, scene, regions, **values)
     assert run(stylizer) == "finished"
@@ -105,7 +107,7 @@ def test_kept_gaussians_stay_to_the_bit(tiny_weights: BackboneWeights, kept: str
     assert not bool((stylizer.job.plan.optimized & regions.frozen).any())
 
 
-def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> None:
+def test_freezing_everything_in_view_is_refused(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
     near = (scene.means[:, 0].abs() < 2.35) & (scene.means[:, 1].abs() < 1.8)
     regions = Regions((Region("rest"), Region("middle", freeze=True)), near.to(torch.uint8))
@@ -114,10 +116,10 @@ def test_everything_that_views_see_is_kept(tiny_weights: BackboneWeights) -> Non
         make(tiny_weights, scene, regions)
 
 
-# --- which style ---------------------------------------------------------------------------------------------------
+# --- styles of regions ---------------------------------------------------------------------------------------------
 
 
-def test_a_region_of_everything_is_a_job_with_its_style(tiny_weights: BackboneWeights) -> None:
+def test_region_of_everything_is_bit_identical_to_no_regions(tiny_weights: BackboneWeights) -> None:
     """Results are bit-identical, including unseen Gaussians."""
     scene = wall(60, 40, sh_degree=1)
     whole = Regions(
@@ -130,7 +132,7 @@ def test_a_region_of_everything_is_a_job_with_its_style(tiny_weights: BackboneWe
     assert [record.loss for record in found.history] == [record.loss for record in wanted.history]
 
 
-def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
+def test_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     labels = torch.zeros(len(scene), dtype=torch.uint8)
     empty = Regions((Region("rest"), Region("empty", style=Style.of(other_style()))), labels)
@@ -142,7 +144,7 @@ def test_an_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
     assert line.decision == "warning: ignored, because it has no Gaussians"
 
 
-def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights) -> None:
+def test_each_region_approaches_its_own_style(tiny_weights: BackboneWeights) -> None:
     """A region does not approach another region's style; the styles are a uniform dark and a uniform bright image."""
     scene = wall()
     dark, bright = torch.full((40, 40, 3), 0.1), torch.full((40, 40, 3), 0.9)
@@ -155,7 +157,7 @@ def test_each_region_comes_nearer_to_its_own_style(tiny_weights: BackboneWeights
     assert left < 0.4 < 0.6 < right
 
 
-def test_colors_of_a_warm_start_are_each_regions_own(tiny_weights: BackboneWeights) -> None:
+def test_warm_start_uses_the_style_of_each_region(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     dark, bright = torch.full((40, 40, 3), 0.2), torch.full((40, 40, 3), 0.7)
     regions = halves(scene, right=Region("right", style=Style.of(bright)))
@@ -169,7 +171,7 @@ def test_colors_of_a_warm_start_are_each_regions_own(tiny_weights: BackboneWeigh
     assert bool(seen.any())
 
 
-def test_the_names_and_order_of_disjoint_regions_do_not_matter(tiny_weights: BackboneWeights) -> None:
+def test_names_and_order_of_disjoint_regions_do_not_matter(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     one = halves(scene, left=Region("rest", style=Style.of(style())))
     two = Regions(
@@ -183,7 +185,7 @@ def test_the_names_and_order_of_disjoint_regions_do_not_matter(tiny_weights: Bac
     assert relative_error(gradients[1], gradients[0]) < 1e-6
 
 
-# --- around it -----------------------------------------------------------------------------------------------------
+# --- resuming, reference and plan ----------------------------------------------------------------------------------
 
 
 def test_unseen_gaussians_follow_their_own_region() -> None:
@@ -199,7 +201,7 @@ def test_unseen_gaussians_follow_their_own_region() -> None:
     assert found[2, 0] == 1.5  # nothing in its region is optimized
 
 
-def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
     scene = wall()
     regions = halves(scene, left=Region("rest", weight=2.0))
     whole, first = (make(tiny_weights, scene, regions) for _ in range(2))
@@ -218,7 +220,7 @@ def test_a_resumed_job_ends_with_the_same_bits(tiny_weights: BackboneWeights, tm
     assert torch.equal(again.stylized(), whole.stylized())
 
 
-def test_the_fingerprint_knows_regions() -> None:
+def test_fingerprint_depends_on_regions() -> None:
     scene, views, settings = wall(), cameras(), make_settings()
     regions = halves(scene)
     moved = replace(regions, labels=1 - regions.labels)
@@ -230,7 +232,7 @@ def test_the_fingerprint_knows_regions() -> None:
     assert found[0] == fingerprint(scene, views, style(), settings, "w")
 
 
-def test_the_reference_has_the_same_regions(tiny_weights: BackboneWeights) -> None:
+def test_float32_reference_has_the_same_regions(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     stylizer = make(tiny_weights, scene, halves(scene), warm_start=False)
     reference = Float32Reference(stylizer)
@@ -239,7 +241,7 @@ def test_the_reference_has_the_same_regions(tiny_weights: BackboneWeights) -> No
     assert relative_error(own, exact[stylizer.job.plan.seen]) < 1e-6
 
 
-def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
+def test_plan_includes_region_maps(tiny_weights: BackboneWeights) -> None:
     scene, settings = wall(), make_settings(steps_sos=20, coarsest_side=24)
     plan, _ = make_plan(scene, cameras(), settings, weights=tiny_weights, regions=halves(scene))
     lines = {line.item: line for line in plan.decisions}
@@ -248,7 +250,7 @@ def test_the_plan_counts_maps(tiny_weights: BackboneWeights) -> None:
     assert "use image 1" in lines["region right"].decision
 
 
-def test_a_view_that_was_not_prepared_for_regions_is_an_error(tiny_weights: BackboneWeights) -> None:
+def test_view_without_region_maps_is_an_error(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     stylizer = make(tiny_weights, scene, halves(scene))
     view = stylizer.job.view_targets.target(0, [0])

@@ -44,9 +44,7 @@ def make(
     return Stylizer.planned(scene, cameras(views), style(), settings, weights=weights)
 
 
-def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
-    tiny_weights: BackboneWeights, scene: Scene
-) -> None:
+def test_runs_with_the_same_seed_are_bit_identical(tiny_weights: BackboneWeights, scene: Scene) -> None:
     runs = [make(tiny_weights, scene, views=4, seed=seed) for seed in (3, 3, 4)]
     for stylizer in runs:
         assert run(stylizer) == "finished"
@@ -57,7 +55,7 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_order(
 
 
 @pytest.mark.parametrize("cached_weights", ["none", "float32"])
-def test_tile_intersections_of_the_survey_are_not_built_again(
+def test_tile_intersections_of_the_survey_are_reused(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, cached_weights: str
 ) -> None:
     """The job reduces the plan's intersections to rendered Gaussians, bit-identical to recomputed intersections."""
@@ -87,7 +85,7 @@ def test_tile_intersections_of_the_survey_are_not_built_again(
     assert torch.equal(*results)
 
 
-def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, scene: Scene, tmp_path: Path) -> None:
+def test_resumed_run_is_bit_identical(tiny_weights: BackboneWeights, scene: Scene, tmp_path: Path) -> None:
     """It stops in the middle of a round, so queue, random generator and Adam's moments must be restored."""
     whole = make(tiny_weights, scene, steps_sos=8)
     run(whole)
@@ -111,7 +109,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tiny_weights: BackboneWeights, sc
     assert found.seconds_by_part["vgg_forward"] > stopped.seconds_by_part["vgg_forward"]
 
 
-def test_every_view_comes_once_a_round(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_every_view_is_visited_once_per_round(tiny_weights: BackboneWeights, scene: Scene) -> None:
     stylizer = make(tiny_weights, scene, views=4, steps_sos=12)
     run(stylizer)
     rounds = [[record.view for record in stylizer.history[i : i + 4]] for i in (0, 4, 8)]
@@ -119,9 +117,7 @@ def test_every_view_comes_once_a_round(tiny_weights: BackboneWeights, scene: Sce
     assert len({tuple(views) for views in rounds}) > 1
 
 
-def test_the_first_step_moves_every_seen_value_by_the_learning_rate(
-    tiny_weights: BackboneWeights, scene: Scene
-) -> None:
+def test_first_step_changes_seen_values_by_the_learning_rate(tiny_weights: BackboneWeights, scene: Scene) -> None:
     """Adam's first update is lr * sign(gradient), whatever the gradient's size."""
     hidden = replace(scene, means=torch.cat([scene.means[:-10], scene.means[-10:] * torch.tensor([1.0, 1.0, -1.0])]))
     stylizer = make(tiny_weights, hidden, views=1, learning_rate=0.05, bounded=False, warm_start=False)
@@ -150,9 +146,7 @@ def test_learning_rate_falls_exponentially_to_its_end(
     assert rates == pytest.approx([0.1, 0.1**1.5, 0.01, 0.1**2.5, 0.001])
 
 
-def test_loss_falls_to_less_than_half_and_on_views_that_were_left_out(
-    tiny_weights: BackboneWeights, scene: Scene
-) -> None:
+def test_loss_halves_and_falls_on_unused_views(tiny_weights: BackboneWeights, scene: Scene) -> None:
     left_out = Stylizer.planned(scene, [cameras(4)[1]], style(), make_settings(), weights=tiny_weights)
     start = left_out.evaluate([0])[0].total
     stylizer = make(tiny_weights, scene, steps_sos=20, learning_rate=0.1)
@@ -165,7 +159,7 @@ def test_loss_falls_to_less_than_half_and_on_views_that_were_left_out(
 
 @pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_features_come_nearer_to_the_style(
+def test_features_approach_the_style(
     tiny_weights: BackboneWeights, scene: Scene, style_loss: str, precision: str
 ) -> None:
     values: dict[str, Any] = {"style_loss": style_loss, "precision": precision, "content_weight": 0.0}
@@ -191,7 +185,7 @@ def test_evaluating_changes_nothing(tiny_weights: BackboneWeights, scene: Scene)
     assert torch.equal(before.sh_dc, after.sh_dc)
 
 
-def test_time_budget_ends_the_run_with_a_checkpoint(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_time_budget_stops_the_run_with_a_checkpoint(tiny_weights: BackboneWeights, scene: Scene) -> None:
     stylizer = make(tiny_weights, scene, max_seconds=1e-6)
     saved: list[int] = []
     assert run(stylizer, Callbacks(checkpoint=lambda s: saved.append(s.step))) == "max-seconds"
@@ -199,7 +193,7 @@ def test_time_budget_ends_the_run_with_a_checkpoint(tiny_weights: BackboneWeight
     assert saved == [1]
 
 
-def test_stop_ends_the_run_between_steps(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_stop_request_ends_the_run_between_steps(tiny_weights: BackboneWeights, scene: Scene) -> None:
     stylizer = make(tiny_weights, scene)
     saved: list[int] = []
     seen: list[Progress] = []
@@ -212,7 +206,7 @@ def test_stop_ends_the_run_between_steps(tiny_weights: BackboneWeights, scene: S
     assert all(p.seconds_left > 0 for p in seen)
 
 
-def test_the_style_is_taken_for_no_views_price(
+def test_style_time_is_not_counted_as_time_of_a_view(
     tiny_weights: BackboneWeights, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The style takes a thousand seconds of the first step, which must not recur in the predicted remaining time."""
@@ -230,7 +224,7 @@ def test_the_style_is_taken_for_no_views_price(
     assert all(now.seconds_left < 1000 for now in seen)
 
 
-def test_a_result_is_made_once_for_the_same_colors(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_result_is_cached_for_the_same_colors(tiny_weights: BackboneWeights, scene: Scene) -> None:
     stylizer = make(tiny_weights, scene)
     first = stylizer.stylized()
     assert stylizer.stylized() is first
@@ -246,7 +240,7 @@ def test_a_result_is_made_once_for_the_same_colors(tiny_weights: BackboneWeights
     assert torch.equal(stylizer.stylized(), first)
 
 
-def test_a_target_is_a_share_of_the_loss_before(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_target_is_a_fraction_of_the_initial_loss(tiny_weights: BackboneWeights, scene: Scene) -> None:
     """The initial loss is known once every view has been visited; jobs without a target measure it on request."""
     stylizer = make(tiny_weights, scene, steps_sos=40, target_loss=0.8, early_stop=False)
     assert stylizer.start() == make(tiny_weights, scene, steps_sos=40).start()
@@ -257,7 +251,7 @@ def test_a_target_is_a_share_of_the_loss_before(tiny_weights: BackboneWeights, s
     assert rounds[-1] <= 0.8 * start < min(rounds[:-1], default=math.inf)
 
 
-def test_previews_and_checkpoints_come_as_often_as_asked(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_previews_and_checkpoints_follow_their_intervals(tiny_weights: BackboneWeights, scene: Scene) -> None:
     saved: list[int] = []
     shown: list[int] = []
     callbacks = Callbacks(
@@ -274,7 +268,7 @@ def test_previews_and_checkpoints_come_as_often_as_asked(tiny_weights: BackboneW
 
 
 @pytest.mark.parametrize(("preset", "phase_1"), [("standard", 0), ("paper", 5)])
-def test_phase_1_is_left_out_where_there_is_one_scale(
+def test_phase_1_is_skipped_with_one_scale(
     tiny_weights: BackboneWeights, scene: Scene, preset: PresetName, phase_1: int
 ) -> None:
     stylizer = make(tiny_weights, scene, preset=preset)
@@ -314,7 +308,7 @@ def test_position_weights_are_for_views_with_an_empty_background(
     assert (stylizer.job.view_targets.target(0, [0]).coverage is not None) is weighted
 
 
-def test_views_that_see_nothing_are_left_out(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_blind_views_are_skipped(tiny_weights: BackboneWeights, scene: Scene) -> None:
     settings = make_settings(steps_sos=3)
     stylizer = Stylizer.planned(scene, [blind_camera(), *cameras(2)], style(), settings, weights=tiny_weights)
     run(stylizer)
@@ -322,14 +316,14 @@ def test_views_that_see_nothing_are_left_out(tiny_weights: BackboneWeights, scen
     assert {record.view for record in stylizer.history} == {1, 2}
 
 
-def test_cameras_without_any_sight_of_the_scene_are_refused(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_cameras_that_see_nothing_are_refused(tiny_weights: BackboneWeights, scene: Scene) -> None:
     with pytest.raises(CameraError, match="None of the 1 cameras sees a Gaussian"):
         Stylizer.planned(scene, [blind_camera()], style(), make_settings(), weights=tiny_weights)
     with pytest.raises(CameraError, match="no cameras"):
         Stylizer.planned(scene, [], style(), make_settings(), weights=tiny_weights)
 
 
-def test_photos_are_the_content_where_they_are_given(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_given_photos_are_the_content(tiny_weights: BackboneWeights, scene: Scene) -> None:
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings(warm_start=False)
     own = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights)
@@ -338,7 +332,7 @@ def test_photos_are_the_content_where_they_are_given(tiny_weights: BackboneWeigh
     assert given.evaluate([0])[0]["content"] > 0
 
 
-def test_larger_views_are_brought_down_to_the_limit() -> None:
+def test_larger_views_are_reduced_to_the_limit() -> None:
     views = [*cameras(1), *cameras(1, width=200, height=150)]
     fitted = fit_cameras(views, make_settings(max_resolution=100))
     assert fitted[0] is views[0]
@@ -362,7 +356,7 @@ class ClockEvent:
         return 1000 * float(end_event.at - self.at)
 
 
-def test_a_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scene: Scene) -> None:
+def test_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scene: Scene) -> None:
     """The seconds of all parts are known when the step has finished, as with a GPU's events."""
     clock, events = (make(tiny_weights, scene) for _ in range(2))
     events.job.loss.timer = events.job.views.timer = Timer(event=ClockEvent)

@@ -32,10 +32,10 @@ def make(weights: BackboneWeights, scene: Scene, views: int = 3, **values: Any) 
     return Stylizer.planned(scene, cameras(views), style(), settings, weights=weights)
 
 
-# --- which color --------------------------------------------------------------------------------------------------
+# --- colors -------------------------------------------------------------------------------------------------------
 
 
-def test_a_color_follows_from_seed_step_and_view_alone() -> None:
+def test_color_depends_only_on_seed_step_and_view() -> None:
     """One color is hard-coded, because it must be the same on every machine and with every version."""
     image = Style.of(style())
     assert drawn_color("random", 5, 7, 11, image) == (0.659657205637411, 0.3164479498593752, 0.6750821160034983)
@@ -57,7 +57,7 @@ def test_random_colors_are_uniform() -> None:
     torch.testing.assert_close(torch.cov(drawn.T), torch.eye(3) / 12, rtol=0, atol=0.006)
 
 
-def test_colors_of_the_palette_are_those_of_the_styles_pixels() -> None:
+def test_palette_colors_are_those_of_style_pixels() -> None:
     image = Style.of(torch.tensor([[[0.1, 0.2, 0.3], [0.9, 0.5, 0.0], [0.9, 0.5, 0.0]], [[1.0, 1.0, 1.0]] * 3]))
     drawn = [drawn_color("palette", 0, step, 0, image) for step in range(3000)]
     shares = {color: drawn.count(color) / len(drawn) for color in set(drawn)}
@@ -66,11 +66,11 @@ def test_colors_of_the_palette_are_those_of_the_styles_pixels() -> None:
     assert shares == pytest.approx(expected, abs=0.03)
 
 
-# --- what becomes of the picture -----------------------------------------------------------------------------------
+# --- images on the background --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scale", [0, 2])
-def test_another_color_behind_is_what_is_rendered_with_it(scale: int) -> None:
+def test_replaced_background_matches_a_render_with_it(scale: int) -> None:
     scene, camera, present = ball(), cameras(1)[0], (0.7, 0.0, 0.3)
     colors = torch.rand(len(scene), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     over, expected = (ReferenceRasterizer(scene, background=color).render(colors, camera) for color in (present, COLOR))
@@ -89,12 +89,12 @@ def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Co
 
 
 @pytest.mark.parametrize("scales", [[0, 1], [1]])
-@pytest.mark.parametrize("kept", ["kept", "uncached"])
-def test_a_steps_gradient_is_that_of_a_job_with_this_background(
-    tiny_weights: BackboneWeights, scales: list[int], kept: Literal["kept", "uncached"]
+@pytest.mark.parametrize("content", ["cached", "uncached"])
+def test_step_gradient_matches_a_job_with_its_background(
+    tiny_weights: BackboneWeights, scales: list[int], content: Literal["cached", "uncached"]
 ) -> None:
     """The content also gets the step's background, whether or not its images are cached."""
-    keep = () if kept == "kept" else ("content",)
+    keep = () if content == "cached" else ("content",)
     drawn = make(tiny_weights, ball(), training_background="random", background=(0.1, 0.1, 0.5), keep=keep)
     fixed = make(tiny_weights, ball(), training_background="background", background=COLOR)
     with torch.no_grad():
@@ -109,7 +109,7 @@ def test_a_steps_gradient_is_that_of_a_job_with_this_background(
         assert relative_error(found, expected) < 1e-4
 
 
-def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeights) -> None:
+def test_photos_get_the_color_in_uncovered_pixels(tiny_weights: BackboneWeights) -> None:
     photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings(training_background="random", steps_sos=2)
     stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
@@ -121,7 +121,7 @@ def test_photos_have_the_color_where_no_gaussian_is(tiny_weights: BackboneWeight
         torch.testing.assert_close(found[tile], features, rtol=1e-4, atol=1e-2)
 
 
-def test_measures_keep_the_background(tiny_weights: BackboneWeights) -> None:
+def test_losses_are_measured_on_the_fixed_background(tiny_weights: BackboneWeights) -> None:
     """Losses before and after are measured on the background of the settings, whatever the steps used."""
     values: dict[str, Any] = {"background": (0.3, 0.2, 0.1), "warm_start": False}
     drawn, fixed = (
@@ -136,7 +136,7 @@ def test_measures_keep_the_background(tiny_weights: BackboneWeights) -> None:
 
 
 @pytest.mark.parametrize("kind", ["random", "palette"])
-def test_runs_repeat_and_resume_to_the_bit(tiny_weights: BackboneWeights, tmp_path: Path, kind: str) -> None:
+def test_repeated_and_resumed_runs_are_bit_identical(tiny_weights: BackboneWeights, tmp_path: Path, kind: str) -> None:
     whole, again, resumed, other = (
         make(tiny_weights, ball(), training_background=kind, seed=seed) for seed in (3, 3, 3, 4)
     )
@@ -157,7 +157,7 @@ def test_runs_repeat_and_resume_to_the_bit(tiny_weights: BackboneWeights, tmp_pa
     assert losses[0] == losses[1]
 
 
-def test_a_covered_scene_is_stylized_as_if_nothing_could_be_drawn(tiny_weights: BackboneWeights) -> None:
+def test_covered_scene_ignores_the_training_background(tiny_weights: BackboneWeights) -> None:
     """Results are bit-identical to those with a fixed background."""
     plain = make(tiny_weights, wall(), training_background="background")
     automatic = make(tiny_weights, wall())
@@ -169,14 +169,14 @@ def test_a_covered_scene_is_stylized_as_if_nothing_could_be_drawn(tiny_weights: 
     assert "training_background" not in told[0]
 
 
-def test_the_paper_is_the_papers_for_scans_too(tiny_weights: BackboneWeights) -> None:
+def test_paper_preset_uses_a_fixed_background_for_scans(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("paper", steps_coarse=1, steps_sos=1)
     stylizer = Stylizer.planned(ball(), cameras(2), style(), settings, weights=tiny_weights)
     assert (stylizer.job.plan.training_background, stylizer.job.plan.warm_start) == ("background", False)
     assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.job.plan.seen])
 
 
-def test_losses_with_different_colors_behind_do_not_end_a_run_early(
+def test_changing_backgrounds_do_not_stop_a_run_early(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A target is compared with the loss on the fixed background, once per round."""

@@ -32,7 +32,7 @@ def colors_of(sh_dc: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
-def test_weighted_mean_and_covariance_become_the_styles(scale: float) -> None:
+def test_weighted_mean_and_covariance_match_the_style(scale: float) -> None:
     generator = torch.Generator().manual_seed(0)
     # A style of low contrast in the middle of the range, so that no color is clamped.
     style = 0.45 + 0.1 * picture(40, 50, seed=3).float()
@@ -46,7 +46,7 @@ def test_weighted_mean_and_covariance_become_the_styles(scale: float) -> None:
 
 
 @pytest.mark.parametrize("start", [with_moments, warm_start])
-def test_colors_that_match_already_stay(start: Start) -> None:
+def test_matching_colors_are_unchanged(start: Start) -> None:
     style = picture(30, 30, seed=2).float()
     sh_dc = (style.reshape(-1, 3) - 0.5) / SH_C0
     found = start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style))
@@ -56,7 +56,7 @@ def test_colors_that_match_already_stay(start: Start) -> None:
         torch.testing.assert_close(colors_of(found), colors_of(sh_dc), rtol=0, atol=0.06)
 
 
-def test_a_dark_scene_gets_both_colors_of_a_bright_style() -> None:
+def test_dark_scene_gets_both_colors_of_a_bright_style() -> None:
     """Matching only mean and covariance gives the brighter color to most Gaussians that should get the darker one."""
     style = torch.full((30, 30, 3), 0.9)
     style[:10] = torch.tensor([0.1, 0.2, 0.6])
@@ -69,7 +69,7 @@ def test_a_dark_scene_gets_both_colors_of_a_bright_style() -> None:
     assert float(white.double().mean()) == pytest.approx(2 / 3, abs=0.02)
 
 
-def test_pictures_of_a_style_count_by_their_weights() -> None:
+def test_style_images_count_by_their_weights() -> None:
     """Colors are as frequent as in the mixture, whatever the sizes of the images."""
     pictures = [torch.full((8, 8, 3), 0.2), torch.full((300, 400, 3), 0.8)]
     mixture = Style.weighted(pictures, [3.0, 1.0])
