@@ -105,7 +105,7 @@ def render(
     out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
 
 
-@with_options(ViewOptions, only=("near", "drop_invalid", "spz_axes"))
+@with_options(ViewOptions, only=("near", "drop_invalid", "spz_axes", "render_mode", "eps2d"))
 def convert(
     scene: SceneArgument,
     out: Annotated[Path, typer.Argument(metavar="OUT", help=f"Scene to write: {RESULT_SUFFIXES}.", show_default=False)],

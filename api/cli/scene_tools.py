@@ -15,6 +15,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.sog import META_NAME
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
@@ -26,14 +27,16 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.quality.compression import CompressionLoss, measure_compression
 from sgsst_core.quality.findings import Finding, findings_of
+from sgsst_core.quality.render_mode import render_mode_findings
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.refining import refine, refined
-from worker.capture import choose_axes, read_capture
+from worker.capture import about_rendering, choose_axes, read_capture
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
 from worker.request import (
     SceneRequest,
@@ -118,7 +121,8 @@ def look_for_extremes(source: SceneRequest, style: Path | None) -> list[Finding]
     about = [
         Finding("views", f"{line.item}: {line.decision}", count, count, "", line.reason) for line in capture.decisions
     ]
-    return [*about, *findings_of(file, capture.cameras, image, near=source.near)]
+    modes = render_mode_findings(file, capture.cameras, near=source.near)
+    return [*about, *modes, *findings_of(file, capture.cameras, image, near=source.near)]
 
 
 # --- render --------------------------------------------------------------------------------------------------------
@@ -203,13 +207,15 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
         source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
     axes, decisions = choose_axes(source)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
-    scene = file.scene
+    file = file.rendered(source.render_mode, source.eps2d)
+    scene, decisions = file.scene, [*decisions, *about_rendering(file)]
     cameras: list[Camera] = []
     if source.cameras or source.orbit:
         capture = read_capture(source, scene).checked(scene, source.near)
         cameras, decisions = capture.cameras, [*decisions, *capture.decisions]
     out.parent.mkdir(parents=True, exist_ok=True)
     size = _write_as(out, scene)
+    decisions += _about_lost_mode(out, scene)
     loss = replace(measure_compression(out, scene, cameras, near=source.near), size=size) if compare else None
     return Converted(len(scene), file.notes, tuple(decisions), loss)
 
@@ -222,6 +228,15 @@ def _check_target(out: Path, compare: bool) -> None:
             raise OutputError(f"{out}: USD can only be written, so it cannot be compared. Omit --compare.")
     elif out.name != META_NAME:
         result_format(out)
+
+
+def _about_lost_mode(out: Path, scene: Scene) -> list[Decision]:
+    """Return the line about a render mode that the format of a written file cannot state."""
+    found = CLASSIC if out.suffix.lower() in USD_SUFFIXES else read_scene_header(out).tag.rendering
+    if found == scene.rendering:
+        return []
+    reason = f"its format cannot state {scene.rendering.text}"
+    return [Decision("rendering", f"warning: {out.name} will be drawn {found.text}", reason)]
 
 
 def _write_as(out: Path, scene: Scene) -> int:

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.loss.difference import psnr
-from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.quality.scene_difference import scene_psnr
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import scene_colors
 
 #: Number of compared views, and their longer side in pixels.
 _VIEWS, _SIDE = 3, 256
@@ -29,6 +27,7 @@ class CompressionLoss:
         views: Names of the compared views.
         psnr: PSNR in dB of these views against those of the original scene, with colors clamped to 0 to 1; None if all
             are identical.
+        lost_mode: How the file is read if it cannot state the scene's render mode; empty if it can.
     """
 
     name: str
@@ -36,16 +35,19 @@ class CompressionLoss:
     size: int
     views: list[str]
     psnr: float | None
+    lost_mode: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the values for the JSON report."""
         psnr = None if self.psnr is None else round(self.psnr, 2)
-        return {"name": self.name, "format": self.format, "bytes": self.size, "views": self.views, "psnr_db": psnr}
+        values = {"name": self.name, "format": self.format, "bytes": self.size, "views": self.views, "psnr_db": psnr}
+        return {**values, "lost_mode": self.lost_mode} if self.lost_mode else values
 
     def text(self, original: str) -> str:
         """Return a description of the result in one line, given that of the original file."""
         psnr = "renders identical to" if self.psnr is None else f"{self.psnr:.1f} dB PSNR against"
-        return f"{self.format}, {self.size / 1e6:.1f} MB, {psnr} {original}"
+        lost = f"; {self.lost_mode}" if self.lost_mode else ""
+        return f"{self.format}, {self.size / 1e6:.1f} MB, {psnr} {original}{lost}"
 
 
 def measure_compression(
@@ -69,15 +71,8 @@ def measure_compression(
         SceneError: If the file cannot be read.
     """
     back = read_scene(path)
-    pairs = [make_rasterizer("cpu", each, background=background, near=near) for each in (scene, back.scene)]
     chosen = [resized(camera, min(_SIDE, max(camera.width, camera.height))) for camera in spread(cameras, _VIEWS)]
-    squares = values = 0.0
-    for camera in chosen:
-        first, second = (
-            rasterizer.render(scene_colors(each, camera), camera).clamp(0, 1)
-            for rasterizer, each in zip(pairs, (scene, back.scene), strict=True)
-        )
-        squares += float((first.double() - second.double()).square().sum())
-        values += first.numel()
-    loss = psnr(squares / values) if squares else None
-    return CompressionLoss(path.name, back.format, path.stat().st_size, [camera.name for camera in chosen], loss)
+    loss = scene_psnr(scene, back.scene, chosen, background=background, near=near)
+    names, read_as = [camera.name for camera in chosen], back.scene.rendering
+    lost = "" if read_as == scene.rendering else f"read as {read_as.text}, since it cannot state {scene.rendering.text}"
+    return CompressionLoss(path.name, back.format, path.stat().st_size, names, loss, lost)

@@ -30,6 +30,7 @@ from sgsst_core.features.network_weights import BackboneWeights, cache_folder
 from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import TENSORS
+from sgsst_core.scene.rendering import Rendering
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -913,6 +914,27 @@ def test_convert_writes_an_unpacked_sog(files: Files, capsys: pytest.CaptureFixt
         assert {name: found.read(name) for name in found.namelist()} == {
             path.name: path.read_bytes() for path in meta.parent.iterdir()
         }
+
+
+@pytest.mark.parametrize(("name", "lost"), [("a.sog", False), ("a.glb", False), ("a.ply", False), ("a.spz", True)])
+def test_convert_reports_a_lost_render_mode(
+    files: Files, capsys: pytest.CaptureFixture[str], name: str, lost: bool
+) -> None:
+    written = files.out.with_name(name)
+    arguments = ["convert", str(files.ply), str(written), "--render-mode", "antialiased", "--eps2d", "0.1"]
+    assert main([*arguments, "--compare", "--cameras", str(files.cameras)]) == 0
+    said = capsys.readouterr().out
+    assert ("its format cannot state antialiased, eps2d 0.1" in said) == lost
+    assert ("since it cannot state antialiased, eps2d 0.1" in said) == lost
+    assert read_scene(written).scene.rendering == Rendering("antialiased", 0.3 if lost else 0.1)
+
+
+def test_check_reports_what_the_render_mode_changes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["check", str(files.ply), "--cameras", str(files.cameras)]
+    assert main([*arguments, "--render-mode", "antialiased", "--eps2d", "0.2"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "dB PSNR" in said
+    assert main([*arguments, "--eps2d", "0"]) == 2
 
 
 def test_convert_writes_usd(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
