@@ -7,8 +7,8 @@ pydantic cannot express are added by `Annotated[..., Option(...)]`.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Annotated, Any, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -62,6 +62,7 @@ class Option:
         instead: Name of the option that sets this field, which is then not an option itself; empty if it is an option.
         parse: Parser of command-line text, for values that are more than a number or a word.
         syntax: Command-line syntax that `parse` accepts; replaces the final period of the help text.
+        presets: Default for each preset, if it depends on the preset.
     """
 
     unit: str = ""
@@ -72,10 +73,11 @@ class Option:
     instead: str = ""
     parse: Callable[[str], object] | None = None
     syntax: str = ""
+    presets: Mapping[str, str] = field(default_factory=dict)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """Add unit and default to JSON schemas, and thereby to the OpenAPI document."""
-        extra = {"x-unit": self.unit, "x-default": self.default}
+        extra = {"x-unit": self.unit, "x-default": self.default, "x-presets": dict(self.presets)}
         return handler(schema) | {name: value for name, value in extra.items() if value}
 
 

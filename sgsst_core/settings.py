@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
@@ -69,20 +69,35 @@ def _some_weight(weights: tuple[float, ...] | None) -> tuple[float, ...] | None:
     return weights
 
 
-class _StrengthWords:
-    """Annotation that accepts a word of `STRENGTHS` in place of a number, also in JSON schemas."""
+class _OrText:
+    """Annotation that accepts text in place of a value, also in JSON schemas.
+
+    Args:
+        parse: Parser of the text; raises a ValueError for invalid text.
+        schema: JSON schema of the text.
+    """
+
+    def __init__(self, parse: Callable[[str], object], schema: dict[str, Any]) -> None:
+        self._parse = parse
+        self._schema = {"type": "string", **schema}
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_before_validator_function(self._number, handler(source))
+        return core_schema.no_info_before_validator_function(self._value, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        numbers = handler(schema)
-        kinds = numbers.get("anyOf", [numbers])
-        return {"anyOf": [*kinds, {"type": "string", "enum": list(STRENGTHS)}]}
+        values = handler(schema)
+        kinds = values.pop("anyOf", None) or [{name: values.pop(name) for name in list(values) if name != "default"}]
+        return {**values, "anyOf": [*kinds, self._schema]}
 
-    @staticmethod
-    def _number(value: object) -> object:
-        return STRENGTHS.get(value, value) if isinstance(value, str) else value
+    def _value(self, value: object) -> object:
+        return self._parse(value) if isinstance(value, str) else value
+
+
+#: Color as three fractions. Text is parsed as on the command line.
+Color = Annotated[
+    tuple[Fraction, Fraction, Fraction],
+    _OrText(parse_color, {"description": "black, white, or R,G,B from 0 to 255", "examples": ["40,40,48"]}),
+]
 
 
 class Settings(BaseModel):
@@ -110,7 +125,7 @@ class Settings(BaseModel):
     )
     content_weight: Annotated[
         float,
-        _StrengthWords(),
+        _OrText(lambda text: STRENGTHS.get(text, text), {"enum": list(STRENGTHS)}),
         Option(
             unit="factor or strength",
             metavar="W",
@@ -145,7 +160,7 @@ class Settings(BaseModel):
     )
     max_resolution: Resolution = None
     background: Annotated[
-        tuple[Fraction, Fraction, Fraction],
+        Color,
         Option(
             unit="RGB, 0 to 1",
             metavar="COLOR",
@@ -343,9 +358,14 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
         raise SettingsError(f"Setting {name} = {first['input']!r}: {renamed_hint(name) or first['msg']}.") from error
 
 
+def preset_texts(setting: Declared) -> dict[str, str]:
+    """Return the default of a setting as text for each preset."""
+    return {preset: setting.text(getattr(make_settings(preset), setting.field)) for preset in _PRESETS}
+
+
 def default_text(setting: Declared) -> str:
     """Return the default of a setting as text; if it depends on the preset, list it for each preset."""
-    values = {preset: setting.text(getattr(make_settings(preset), setting.field)) for preset in _PRESETS}
+    values = preset_texts(setting)
     if len(set(values.values())) == 1:
         return values["standard"]
     return f"{BY_PRESET}: " + ", ".join(f"{preset} {value}" for preset, value in values.items())

@@ -29,6 +29,7 @@ from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.options import RunOptions
 from worker.prepare import Job, Warn
+from worker.previews import Previews
 from worker.request import Outputs
 
 #: Default seconds between checkpoints. If a rank is lost, at most this much work is repeated.
@@ -71,7 +72,7 @@ def execute(
     progress: Callable[[Progress], None],
     stop: Callable[[], bool],
     warn: Warn,
-    preview: Callable[[Stylizer], None] | None = None,
+    preview: Previews | None = None,
     saved: Callable[[int], None] = lambda step: None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     run_id: str | None = None,
@@ -86,7 +87,7 @@ def execute(
         progress: Callback for the progress of the steps.
         stop: Callback that returns True to interrupt the job.
         warn: Callback for warnings, such as a checkpoint that cannot be written while the job runs.
-        preview: Callback after every step; see `Previews`. None writes no previews.
+        preview: Writer of previews after every step, and of the thumbnail at the end. None writes neither.
         saved: Callback that receives the step of each checkpoint.
         checkpoint_seconds: Seconds between checkpoints. A job that ends early writes one more at its end.
         run_id: Identifier of this run, stored in checkpoints. None generates one.
@@ -115,7 +116,10 @@ def execute(
         if checkpoint.error is not None:
             raise checkpoint.error
         return Result(stopped, stylizer.step, stylizer.job.total_steps, {}, {})
-    return _finish(job, stopped, measure)
+    result = _finish(job, stopped, measure)
+    if first and preview:
+        preview.finish(stylizer)
+    return result
 
 
 def _make_room(outputs: Outputs) -> None:

@@ -20,13 +20,14 @@ from sgsst_core.scene.rendering import MAX_EPS2D, RenderMode
 from sgsst_core.settings import (
     BY_PRESET,
     EVERYTHING,
-    Fraction,
+    Color,
     Near,
     PresetName,
     Resolution,
     Settings,
     default_text,
     make_settings,
+    preset_texts,
 )
 
 Backbone = Literal["auto", "vgg19", "vgg16"]
@@ -85,7 +86,8 @@ def _settings_to_choose() -> dict[str, Any]:
         info, shown = setting.info, name in _SHOWN
         constraints = [item for item in info.metadata if not isinstance(item, Option)]
         kind = info.annotation if shown else info.annotation | None  # type: ignore[operator]
-        option = setting.option if shown else replace(setting.option, default=text, name="")
+        presets = preset_texts(setting) if text.startswith(BY_PRESET) else {}
+        option = setting.option if shown else replace(setting.option, default=text, name="", presets=presets)
         told = Field(info.default if shown else None, description=info.description)
         fields[name] = (Annotated[kind, *constraints, option], told)
     return fields
@@ -104,7 +106,7 @@ class StylizeOptions(_Chosen):
     """Options of `sgsst stylize` and of a job of the service. Omitted options take their values from the preset."""
 
     style_background: Annotated[
-        tuple[Fraction, Fraction, Fraction],
+        Color,
         Option(unit="RGB, 0 to 1", metavar="COLOR", default="white", parse=parse_color, syntax=COLOR_SYNTAX),
     ] = Field((1.0, 1.0, 1.0), description="Color behind transparent parts of style images.")
     backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 if it is installed, else VGG16.")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from sgsst_core.files.images import save_jpg
 from sgsst_core.scene.camera import resized
@@ -17,6 +18,10 @@ from sgsst_core.stylizing.stylizer import Stylizer
 _SHARE = 0.05
 #: Maximum length of a preview's longer side in pixels.
 _SIDE = 960
+#: Maximum length of the thumbnail's longer side in pixels.
+_THUMBNAIL_SIDE = 480
+#: Name of the thumbnail. Clients show the last preview by name.
+_THUMBNAIL = "thumbnail.jpg"
 
 
 class Previews:
@@ -54,17 +59,35 @@ class Previews:
             self._written(path)
         self._last = time.monotonic()
 
+    def finish(self, stylizer: Stylizer) -> None:
+        """Write the thumbnail of a finished job: a view whose left half is unstylized. It replaces the previews."""
+        try:
+            before = _rendered(stylizer, stylizer.job.views.scene.sh_dc.to(stylizer.sh_dc.device), _THUMBNAIL_SIDE)
+            after = _rendered(stylizer, stylizer.shown(), _THUMBNAIL_SIDE)
+            middle = before.shape[1] // 2
+            path = self._path(_THUMBNAIL)
+            save_jpg(path, torch.cat([before[:, :middle], after[:, middle:]], dim=1))
+        except Exception as error:
+            self._warn(f"The thumbnail could not be rendered: {error}")
+        else:
+            self._written(path)
+
     def _write(self, stylizer: Stylizer) -> Path:
-        views = stylizer.job.views
-        index = stylizer.job.evaluation_views[0]
-        camera = views.cameras[index]
-        if camera.side > _SIDE:
-            camera = resized(camera, _SIDE)
-        path = self._folder / f"step_{stylizer.step:07d}.jpg"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path = self._path(f"step_{stylizer.step:07d}.jpg")
         colors = stylizer.shown() if stylizer.step else transferred_colors(stylizer.job).to(stylizer.sh_dc.device)
-        with torch.no_grad():
-            # Only this rank renders here, so the distributed renderer cannot be used.
-            image = views.rasterizer.render(views.colors(index, colors), camera)
-        save_jpg(path, image)
+        save_jpg(path, _rendered(stylizer, colors, _SIDE))
         return path
+
+    def _path(self, name: str) -> Path:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        return self._folder / name
+
+
+def _rendered(stylizer: Stylizer, colors: Tensor, side: int) -> Tensor:
+    """Render the first evaluation view with colors [n, 3] at a limited size, on this rank alone."""
+    views, index = stylizer.job.views, stylizer.job.evaluation_views[0]
+    camera = views.cameras[index]
+    if camera.side > side:
+        camera = resized(camera, side)
+    with torch.no_grad():
+        return views.rasterizer.render(views.colors(index, colors), camera)

@@ -21,7 +21,7 @@ from fastapi import FastAPI, Request, Response
 from api.http.sending import names_etag
 from service.errors import NotFoundError
 from service.store.states import ACTIONS, TITLES, UNFINISHED
-from sgsst_core.files.formats import FORMATS
+from sgsst_core.files.formats import FORMATS, RESULT_FORMATS
 
 FOLDER = Path(__file__).parents[1] / "static"
 #: Placeholder in pages for the URL prefix of the files.
@@ -102,7 +102,15 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
 def _filled_modules() -> dict[str, tuple[bytes, object]]:
     """Return the placeholder and its JSON value for each module that shows a table of the server."""
     formats = [
-        {"suffix": each.suffix, "title": each.title, "shown": each.shown, "magic": list(each.magic)} for each in FORMATS
+        {
+            "name": each.name,
+            "suffix": each.suffix,
+            "title": each.title,
+            "shown": each.shown,
+            "magic": list(each.magic),
+            "result": each in RESULT_FORMATS,
+        }
+        for each in FORMATS
     ]
     actions = [{"name": name, "title": name.capitalize(), "statuses": statuses} for name, statuses in ACTIONS.items()]
     states = {"titles": TITLES, "unfinished": UNFINISHED, "actions": actions}

@@ -22,6 +22,7 @@ export class CompareView {
       if (jobs.some((job) => job.status !== "succeeded")) throw new Error(words.compare.notThere);
       this.stage = new ResultStage(jobs, { signal: this.leaving.signal });
       const names = labels(jobs);
+      this.stage.stage.title = names.join(" ");
       put(this.element, h("header.head", h("h1", words.compare.heading(names[0], names[1])), h("div.row", jobs.map((job, i) => h("a.button.quiet", { href: `#/jobs/${job.id}` }, names[i])))), this.stage.element);
     } catch (error) {
       if (this.leaving.signal.aborted) return;

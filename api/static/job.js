@@ -3,15 +3,18 @@
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { LossChart } from "./chart.js";
 import { announce, h, icon, put } from "./dom.js";
-import { labels, nameOf, stylesOf } from "./names.js";
+import { labels, nameOf } from "./names.js";
 import { decisions } from "./plan.js";
 import { ResultStage } from "./result_stage.js";
+import { resultFormats } from "./scene_formats.js";
 import { actionsOf, titles, UNFINISHED } from "./statuses.js";
 import { size, time, words } from "./words.js";
 
 const say = words.job;
 /** Milliseconds after which a lost stream is reopened by the page. */
 const AGAIN = 3000;
+/** Milliseconds between requests for changes that were made elsewhere, such as in another tab. */
+const ELSEWHERE = 5000;
 
 /** @param {string} status */
 export const badge = (status) => h(`span.badge.${status}`, titles[status] ?? status);
@@ -40,11 +43,13 @@ export class JobView {
     this.picture = h("figure.preview");
     this.show = h("div.show", this.picture);
     this.plan = h("section.card", { hidden: true });
+    this.download = h("section.card", { hidden: true });
     this.files = h("section.card");
+    this.deletion = h("p.deletion");
     this.facts = h("section.card");
     this.curve = h("section.card", h("h2", say.loss), this.chart.element);
     this.body = h("div.job", h("header.head", h("div", h("div.row", this.heading, this.renaming, this.badge), this.meta), this.actions),
-      this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.curve, this.plan, this.files, this.facts)));
+      this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.download, this.curve, this.plan, this.files, this.facts, this.deletion)));
     this.element = h("div", h("p.quiet.pending", words.page.loading));
     this.begin();
   }
@@ -59,7 +64,32 @@ export class JobView {
     }
     put(this.element, this.body);
     await Promise.all([this.loadHistory(), this.loadFiles()]);
-    if (!this.leaving.signal.aborted && UNFINISHED.has(this.job.status)) this.watch();
+    if (this.leaving.signal.aborted) return;
+    if (UNFINISHED.has(this.job.status)) this.watch();
+    const timer = setInterval(() => document.hidden || this.lookElsewhere(), ELSEWHERE);
+    this.leaving.signal.addEventListener("abort", () => clearInterval(timer));
+    document.addEventListener("visibilitychange", () => document.hidden || this.lookElsewhere(), { signal: this.leaving.signal });
+  }
+
+  /** Show what has changed without an event: a new name, a retry, or the deletion of the job. */
+  async lookElsewhere() {
+    const { name, status } = this.job;
+    try {
+      const job = await get(`/v1/jobs/${this.id}`, this.leaving.signal);
+      if (job.name === name && job.status === status) return;
+      this.job = job;
+      this.update();
+      if (UNFINISHED.has(job.status) && !UNFINISHED.has(status)) this.watch();
+    } catch (error) {
+      if (error instanceof Problem && error.status === 404 && !this.leaving.signal.aborted) this.showDeleted();
+    }
+  }
+
+  showDeleted() {
+    this.leaving.abort();
+    document.title = words.page.title(say.deleted);
+    announce(say.deleted);
+    put(this.element, h("div.empty", h("h1", say.deleted), h("a.button.quiet", { href: "#/jobs" }, words.page.jobs)));
   }
 
   async refresh() {
@@ -144,6 +174,7 @@ export class JobView {
     const { job } = this;
     this.title = nameOf(job);
     document.title = words.page.title(this.title);
+    if (this.result) this.result.stage.title = this.title;
     this.heading.textContent = this.title;
     put(this.badge, badge(job.status));
     const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
@@ -208,8 +239,8 @@ export class JobView {
     if (this.shownFor === job.status) return;
     this.shownFor = job.status;
     put(this.actions,
-      actionsOf(job.status).map(({ name, title }) => button(title, () => ask("POST", `/v1/jobs/${this.id}/${name}`), UNFINISHED.has(job.status) ? "quiet" : "primary")),
-      UNFINISHED.has(job.status) ? null : deleteButton(say.remove, async () => {
+      actionsOf(job.status).map(({ name, title }) => button(title, () => ask("POST", `/v1/jobs/${this.id}/${name}`), UNFINISHED.has(job.status) ? "quiet" : "primary")));
+    put(this.deletion, UNFINISHED.has(job.status) ? null : deleteButton(say.remove, async () => {
         await ask("DELETE", `/v1/jobs/${this.id}`);
         location.hash = "#/jobs";
       }, (error) => this.tellError(error)));
@@ -257,7 +288,25 @@ export class JobView {
     else if (!this.preview && !this.result) put(this.picture, h("p.quiet", UNFINISHED.has(this.job.status) ? say.noPreview : ""));
     this.showFiles(found.filter(({ name }) => !name.startsWith("previews/")), names);
     if (names.has("plan.json") && this.plan.hidden) await this.loadPlan();
-    if (this.job.status === "succeeded" && names.has("stylized.ply") && !this.result) this.showResult(names);
+    const result = found.find(({ name }) => name === "stylized.ply");
+    if (this.job.status !== "succeeded" || !result || this.result) return;
+    this.offerDownload(result.size);
+    this.showResult(names);
+  }
+
+  /** @param {number} bytes size of the PLY */
+  offerDownload(bytes) {
+    const link = h("a.button.primary", { download: "" }, icon("down"), h("span", say.download)), note = h("p.help");
+    const chooser = h("select", { "aria-label": say.format, onchange: () => choose() },
+      resultFormats.map(({ name, title }, i) => h("option", { value: name }, i ? title : `${title} · ${size(bytes)}`)));
+    const choose = () => {
+      const path = artifactPath(this.id, "stylized.ply"), first = chooser.value === resultFormats[0].name;
+      link.href = first ? path : `${path}?format=${encodeURIComponent(chooser.value)}`;
+      note.textContent = first ? "" : say.converting;
+    };
+    choose();
+    this.download.hidden = false;
+    put(this.download, h("h2", say.result), h("div.row.download", link, chooser), note);
   }
 
   async loadPlan() {
@@ -289,16 +338,21 @@ export class JobView {
   /** @param {Set<string>} names names of artifacts */
   showResult(names) {
     this.result = new ResultStage([this.job], { signal: this.leaving.signal });
+    this.result.stage.title = this.title;
     const stage = h("div", this.result.element), sheet = h("figure.sheet", { hidden: true });
     /** @type {[string, HTMLElement][]} */
     const tabs = [[say.threeD, stage]];
-    if (names.has("before_after.jpg")) tabs.push([say.sheet, sheet]);
+    if (names.has("before_after.jpg")) {
+      if (this.result.stage.viewer) tabs.push([say.sheet, sheet]);
+      else tabs.unshift([say.sheet, sheet]);
+    }
     const open = (/** @type {number} */ at) => {
       tabs.forEach(([, body], i) => (body.hidden = i !== at));
       if (tabs[at][1] === sheet && !sheet.firstChild) put(sheet, h("a", { href: artifactPath(this.id, "before_after.jpg"), target: "_blank", rel: "noopener" }, h("img", { src: artifactPath(this.id, "before_after.jpg"), alt: say.sheetOf(this.title) })));
     };
     const picker = h("fieldset.segments", h("legend.away", say.view3d), tabs.map(([name], i) => h("label", h("input", { type: "radio", name: `tab${this.id}`, checked: !i, onchange: () => open(i) }), h("span", name))));
     put(this.show, h("div.row.tabs", picker, this.compareLink()), tabs.map(([, body]) => body));
+    open(0);
   }
 
   /** Create a link to compare this job with other finished runs of the same scene. */
@@ -335,7 +389,8 @@ export function deleteButton(name, act, failed, label) {
   const first = h("button.quiet.danger", { type: "button", onclick: () => ask_(), "aria-label": label ?? name }, label ? icon("bin") : name);
   const ask_ = () => {
     const yes = h("button.danger", { type: "button", onclick: () => act().catch(failed) }, say.remove);
-    put(holder, h("span", say.removeSure), yes, h("button.quiet", { type: "button", onclick: () => (put(holder, first), first.focus()) }, say.keep));
+    holder.classList.add("asking");
+    put(holder, h("span", say.removeSure), yes, h("button.quiet", { type: "button", onclick: () => (holder.classList.remove("asking"), put(holder, first), first.focus()) }, say.keep));
     yes.focus();
   };
   put(holder, first);

@@ -10,7 +10,7 @@ import { percent, time, words } from "./words.js";
 
 const say = words.jobs;
 /** Milliseconds between polls while a job runs, and otherwise. */
-const OFTEN = 3000, SELDOM = 20000;
+const OFTEN = 3000, SELDOM = 5000;
 const PAGE = 60;
 
 export class JobsView {

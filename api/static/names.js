@@ -7,15 +7,15 @@ import { time, words } from "./words.js";
 const stem = (name) => name.replace(/\.[^.]*$/, "");
 
 /**
- * Return the name that the service gives to a job without one.
+ * Return the name that the service gives to a job without one; without styles, that of the scene.
  *
  * @param {string | undefined} scene name of the scene's file
  * @param {string[]} styles names of the style images
  */
 export function defaultName(scene, styles) {
-  if (!scene || !styles.length) return "";
-  const suffix = sceneSuffix(scene);
-  return `${suffix ? scene.slice(0, -suffix.length) : stem(scene)} · ${styles.map(stem).join(" + ")}`;
+  if (!scene) return "";
+  const suffix = sceneSuffix(scene), plain = suffix ? scene.slice(0, -suffix.length) : stem(scene);
+  return styles.length ? `${plain} · ${styles.map(stem).join(" + ")}` : plain;
 }
 
 /** @param {any} job @returns {string} names of the job's style images */

@@ -4,8 +4,17 @@ import { h, newId } from "./dom.js";
 import { words } from "./words.js";
 
 /**
- * @typedef {{name: string, title: string, help: string, element: HTMLElement, value: () => any, set: (value: any) => void, suggest: (text: string) => void, wrong: (text: string) => void}} Control
- *   `value` is undefined if the preset decides
+ * @typedef {object} Control
+ * @property {string} name
+ * @property {string} title
+ * @property {string} help
+ * @property {HTMLElement} element
+ * @property {() => any} value undefined if the preset decides
+ * @property {(value: any) => void} set
+ * @property {(text: string) => void} suggest show a default while there is no value
+ * @property {(preset: string) => void} follow show the default of a preset
+ * @property {() => string} problem why the value cannot be sent; "" if it can
+ * @property {(text: string) => void} wrong
  */
 
 /** @param {any} schema @returns {any[]} alternatives of a type, without null */
@@ -16,8 +25,14 @@ const choices = (schema) => (schema.const !== undefined ? [schema.const] : (sche
 const isNumber = (schema) => schema.type === "number" || schema.type === "integer";
 /** @param {string} name */
 export const titleOf = (name) => {
-  const text = name.replaceAll("_", " ").replace(/\bsos\b/, "SOS").replace(/\bsh\b/, "SH");
+  const text = words.options.titles[name] ?? name.replaceAll("_", " ");
   return text[0].toUpperCase() + text.slice(1);
+};
+
+/** Options by group; those of no other group are for experts. @type {{essentials: string[], look: string[]}} */
+export const GROUPS = {
+  essentials: ["content_weight", "resolution", "views", "max_seconds"],
+  look: ["style_scale", "style_rotation", "preserve_colors", "background", "style_background", "refine", "sh_attenuation", "unseen"],
 };
 
 /**
@@ -27,17 +42,60 @@ export const titleOf = (name) => {
  * @returns {Control}
  */
 export function optionControl(name, schema, { title = titleOf(name), hint = true } = {}) {
-  const id = newId(), kinds = variants(schema), fallback = String(schema["x-default"] ?? schema.default ?? "");
-  const [input, read] = inputFor(kinds, fallback, id);
+  const id = newId(), kinds = variants(schema), shown = words.options.defaults[name];
+  const fallback = shown ?? String(schema["x-default"] ?? schema.default ?? "");
+  const [input, read, suggest] = inputFor(kinds, id);
+  suggest(fallback);
   const error = h("p.wrong", { id: `${id}e`, hidden: true });
-  const unit = kinds.some(isNumber) && schema["x-unit"] ? h("span.unit", schema["x-unit"]) : null;
-  const help = hint && schema.description ? h("p.help", { id: `${id}h` }, schema.description) : null;
+  const unit = words.options.units[name] ?? (kinds.some(isNumber) ? schema["x-unit"] : ""), told = words.options.help[name] ?? schema.description;
+  const help = hint && told ? h("p.help", { id: `${id}h` }, told) : null;
   input.id = id;
   input.setAttribute("aria-describedby", [help && `${id}h`, `${id}e`].filter(Boolean).join(" "));
-  const element = h("div.option", { "data-name": name }, h("label", { htmlFor: id }, title), h("div.value", input, unit), help, error);
+  const element = h("div.option", { "data-name": name }, h("label", { htmlFor: id }, title), h("div.value", input, unit ? h("span.unit", unit) : null), help, error);
   const wrong = (/** @type {string} */ text) => showWrong(input, error, text);
   input.addEventListener("input", () => wrong(""));
-  return { name, title, help: schema.description ?? "", element, value: () => read(input.value), set: (value) => void (input.value = value === undefined || value === null ? "" : String(value)), suggest: (text) => (input.placeholder = text), wrong };
+  return {
+    name, title, help: `${told ?? ""} ${schema.description ?? ""}`, element, wrong, suggest,
+    value: () => read(input.value),
+    set: (value) => void (input.value = value === undefined || value === null ? "" : String(value)),
+    follow: (preset) => suggest(schema["x-presets"]?.[preset] ?? fallback),
+    problem: () => (input.validity?.badInput ? words.refusals.notNumber : problemOf(kinds, read(input.value))),
+  };
+}
+
+/**
+ * Return why a value does not fit its type, in words for users; "" if it does. The service checks the rest.
+ *
+ * @param {any[]} kinds
+ * @param {any} value
+ * @returns {string}
+ */
+export function problemOf(kinds, value) {
+  if (value === undefined || typeof value === "boolean") return "";
+  const array = kinds.find((kind) => kind.type === "array"), numeric = kinds.find(isNumber);
+  if (Array.isArray(value)) return array?.items ? value.map((each) => problemOf([array.items], each)).find(Boolean) ?? "" : "";
+  const listed = kinds.flatMap(choices), free = kinds.some((kind) => kind.type === "string" && !choices(kind).length);
+  if (typeof value === "string") return free || listed.includes(value) ? "" : listed.length ? words.refusals.notListed(listed, !!numeric) : words.refusals.notNumber;
+  if (!numeric) return "";
+  if (!Number.isFinite(value)) return words.refusals.notNumber;
+  if (numeric.type === "integer" && !Number.isInteger(value)) return words.refusals.notWhole;
+  const { minimum, maximum, exclusiveMinimum, exclusiveMaximum } = numeric;
+  if (minimum !== undefined && value < minimum) return words.refusals.atLeast(minimum);
+  if (maximum !== undefined && value > maximum) return words.refusals.atMost(maximum);
+  if (exclusiveMinimum !== undefined && value <= exclusiveMinimum) return words.refusals.above(exclusiveMinimum);
+  if (exclusiveMaximum !== undefined && value >= exclusiveMaximum) return words.refusals.below(exclusiveMaximum);
+  return "";
+}
+
+/** Return a message of the service's schema in words for users. @param {string} message */
+export function plainly(message) {
+  const bound = /^Input should be (greater|less) than( or equal to)? ([-+.\deE]+)$/.exec(message);
+  if (bound) {
+    const way = /** @type {const} */ ({ greater: ["above", "atLeast"], less: ["below", "atMost"] })[/** @type {"greater" | "less"} */ (bound[1])][bound[2] ? 1 : 0];
+    return words.refusals[way](Number(bound[3]));
+  }
+  if (/^Input should be a (valid|finite) (number|integer)/.test(message)) return words.refusals.notNumber;
+  return message.replace(/^Value error, /, "");
 }
 
 /**
@@ -54,32 +112,36 @@ export function showWrong(input, error, text) {
 
 /**
  * @param {any[]} kinds
- * @param {string} fallback
  * @param {string} id
- * @returns {[any, (text: string) => any]}
+ * @returns {[any, (text: string) => any, (fallback: string) => void]} input, parser of its text, and how it shows a default
  */
-function inputFor(kinds, fallback, id) {
+function inputFor(kinds, id) {
   const words_ = kinds.flatMap(choices);
+  const chosen = (/** @type {[string, string][]} */ options, /** @type {(text: string) => any} */ read) => {
+    const first = h("option", { value: "" });
+    const suggest = (/** @type {string} */ fallback) => (first.textContent = fallback ? words.submit.byDefault(fallback) : "–");
+    return /** @type {[any, (text: string) => any, (fallback: string) => void]} */ ([h("select", first, options.map(([value, text]) => h("option", { value }, text))), read, suggest]);
+  };
   if (kinds.every((kind) => kind.type === "boolean")) {
-    return [select([["true", words.submit.on], ["false", words.submit.off]], fallback), (text) => (text ? text === "true" : undefined)];
+    return chosen([["true", words.submit.on], ["false", words.submit.off]], (text) => (text ? text === "true" : undefined));
   }
-  if (kinds.every((kind) => choices(kind).length)) return [select(words_.map((value) => [value, value]), fallback), (text) => text || undefined];
+  if (kinds.every((kind) => choices(kind).length)) return chosen(words_.map((value) => [value, value]), (text) => text || undefined);
+  const input = h("input", { type: "text", autocomplete: "off" }), suggest = (/** @type {string} */ fallback) => void (input.placeholder = fallback);
   if (kinds.length === 1 && isNumber(kinds[0])) {
     const [kind] = kinds;
-    const input = h("input", { type: "number", step: kind.type === "integer" ? 1 : "any", placeholder: fallback, inputMode: kind.type === "integer" ? "numeric" : "decimal", autocomplete: "off" });
+    Object.assign(input, { type: "number", step: kind.type === "integer" ? 1 : "any", inputMode: kind.type === "integer" ? "numeric" : "decimal" });
     if (kind.minimum !== undefined) input.min = kind.minimum;
     if (kind.maximum !== undefined) input.max = kind.maximum;
-    return [input, (text) => (text === "" ? undefined : Number(text))];
+    return [input, (text) => (text === "" ? undefined : Number(text)), suggest];
   }
-  if (kinds.some((kind) => kind.type === "array")) {
-    return [h("input", { type: "text", placeholder: fallback, autocomplete: "off" }), (text) => (text.trim() ? text.split(/[\s,;]+/).filter(Boolean).map((part) => (part === "" || isNaN(Number(part)) ? part : Number(part))) : undefined)];
+  if (kinds.some((kind) => kind.type === "array") && !kinds.some((kind) => kind.type === "string")) {
+    return [input, (text) => (text.trim() ? text.split(/[\s,;]+/).filter(Boolean).map((part) => (isNaN(Number(part)) ? part : Number(part))) : undefined), suggest];
   }
-  const input = h("input", { type: "text", placeholder: fallback, autocomplete: "off" });
-  if (!words_.length) return [input, (text) => text || undefined];
+  if (!words_.length) return [input, (text) => text.trim() || undefined, suggest];
   input.setAttribute("list", `${id}l`);
   const holder = h("div.listed", input, h("datalist", { id: `${id}l` }, words_.map((value) => h("option", { value }))));
   Object.defineProperties(holder, { value: { get: () => input.value, set: (text) => (input.value = text) } });
-  return [aliased(holder, input), (text) => (text.trim() === "" ? undefined : isNaN(Number(text)) ? text.trim() : Number(text))];
+  return [aliased(holder, input), (text) => (text.trim() === "" ? undefined : isNaN(Number(text)) ? text.trim() : Number(text)), suggest];
 }
 
 /**
@@ -94,12 +156,4 @@ function aliased(holder, input) {
   holder.toggleAttribute = (/** @type {string} */ name, /** @type {boolean} */ on) => input.toggleAttribute(name, on);
   holder.focus = () => input.focus();
   return holder;
-}
-
-/**
- * @param {[string, string][]} options
- * @param {string} fallback
- */
-function select(options, fallback) {
-  return h("select", h("option", { value: "" }, fallback.includes(" ") || !fallback ? fallback || "–" : words.submit.byDefault(fallback)), options.map(([value, text]) => h("option", { value }, text)));
 }

@@ -6,7 +6,7 @@ import { announce, h, icon, put } from "./dom.js";
 import { JobView } from "./job.js";
 import { JobsView } from "./jobs.js";
 import { SignInView } from "./signin.js";
-import { SubmitView } from "./submit.js";
+import { forgetDraft, SubmitView } from "./submit.js";
 import { words } from "./words.js";
 
 /** @typedef {{title: string, element: HTMLElement, end: () => void}} View */
@@ -55,13 +55,15 @@ function enter() {
 async function signOut() {
   await ask("DELETE", "/v1/session").catch(() => {});
   announce(words.signIn.out);
-  begin();
+  signIn(words.signIn.out);
+  forgetDraft(); // the next person at this computer must not see it
 }
 
-function signIn() {
+/** @param {string} [why] why a key is asked for */
+function signIn(why = out.hidden ? words.signIn.lead : words.signIn.expired) {
   if (view instanceof SignInView) return;
   out.hidden = true;
-  show(new SignInView(begin));
+  show(new SignInView(begin, why));
 }
 
 async function begin() {
@@ -71,7 +73,7 @@ async function begin() {
   else enter();
 }
 
-whenKeyIsNeeded(signIn);
+whenKeyIsNeeded(() => signIn());
 addEventListener("hashchange", () => {
   if (view instanceof SignInView) return;
   enter();

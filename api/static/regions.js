@@ -1,18 +1,19 @@
 // @ts-check
 /** Regions of a scene, each with its own style or frozen. */
 import { h, icon, newId, put } from "./dom.js";
+import { showWrong } from "./options.js";
 import { words } from "./words.js";
 
 const say = words.submit;
 
 export class RegionList {
   constructor() {
-    /** @type {{element: HTMLElement, value: () => any, setStyles: (names: string[]) => void}[]} */
+    /** @type {{element: HTMLElement, value: () => any, set: (region: any) => void, setStyles: (names: string[]) => void, wrong: (text: string, field?: string) => void}[]} */
     this.rows = [];
     /** @type {string[]} */
     this.styles = [];
     this.list = h("div.regions");
-    this.element = h("div", this.list, h("button.quiet.small", { type: "button", onclick: () => this.add() }, icon("plus"), say.addRegion));
+    this.element = h("div", this.list, h("button.quiet.small", { type: "button", onclick: () => this.add().element.querySelector("input")?.focus() }, icon("plus"), say.addRegion));
   }
 
   add() {
@@ -31,12 +32,51 @@ export class RegionList {
     setStyles(this.styles);
     const value = () => ({ name: name.value.trim(), ...(select.value.trim() ? { select: select.value.trim() } : {}), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(freeze.checked ? { freeze: true } : {}) });
     const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field("Name", name), field("Select", select), field(say.style, style), h("label.check", freeze, h("span", "Freeze")));
-    const row = { element, value, setStyles };
+    const error = h("p.wrong", { id: newId(), hidden: true });
+    const inputs = /** @type {Record<string, any>} */ ({ name, select, style, freeze });
+    for (const input of Object.values(inputs)) input.setAttribute("aria-describedby", error.id);
+    const wrong = (/** @type {string} */ text, field = "select") => {
+      for (const input of Object.values(inputs)) showWrong(input, error, "");
+      if (text) showWrong(inputs[field] ?? select, error, text);
+    };
+    const set = (/** @type {any} */ region) => {
+      [name.value, select.value, style.value] = [region.name, region.select ?? "", region.style ?? ""];
+      freeze.checked = !!region.freeze;
+    };
+    const row = { element, value, set, setStyles, wrong };
     const remove = h("button.tool", { type: "button", "aria-label": say.remove(say.region(this.rows.length + 1)), onclick: () => ((this.rows = this.rows.filter((each) => each !== row)), element.remove()) }, icon("close"));
-    element.append(remove);
+    element.append(error, remove);
+    element.addEventListener("input", () => wrong(""));
     this.rows.push(row);
     this.list.append(element);
-    name.focus();
+    return row;
+  }
+
+  /** Rows that are sent; the others are empty. */
+  get sent() {
+    return this.rows.filter((row) => row.value().name || row.value().select);
+  }
+
+  /** @param {any[]} regions */
+  restore(regions) {
+    for (const region of regions) this.add().set(region);
+  }
+
+  clearWrong() {
+    for (const row of this.rows) row.wrong("");
+  }
+
+  /**
+   * Show a refusal in the region that caused it. Return the region's element, or undefined if none did.
+   *
+   * @param {string} at path of the refused parameter, such as "regions.0.select"
+   * @param {string} message
+   */
+  refuse(at, message) {
+    const [, number, field] = /\bregions\.(\d+)(?:\.(\w+))?/.exec(at) ?? [], named = /\b[Rr]egion '?([A-Za-z][\w-]*)/.exec(message)?.[1];
+    const row = number !== undefined ? this.sent[Number(number)] : this.rows.find((each) => named && each.value().name === named);
+    row?.wrong(message, field);
+    return row?.element;
   }
 
   /** @param {string[]} names names of the style files */
@@ -46,6 +86,6 @@ export class RegionList {
   }
 
   value() {
-    return this.rows.map((row) => row.value()).filter((region) => region.name || region.select);
+    return this.sent.map((row) => row.value());
   }
 }

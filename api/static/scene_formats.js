@@ -3,14 +3,19 @@
 
 /**
  * @typedef {object} SceneFormat
+ * @property {string} name name in requests
  * @property {string} suffix file name suffix, such as ".compressed.ply"
  * @property {string} title
  * @property {boolean} shown whether the viewer reads the format
  * @property {number[]} magic first bytes of a file that the viewer does not read; empty if they vary
+ * @property {boolean} result whether results can be downloaded in this format
  */
 
 /** @type {SceneFormat[]} */
 export const sceneFormats = /** @type {any} */ ("{{scene_formats}}");
+
+/** Formats of results, PLY first. */
+export const resultFormats = sceneFormats.filter(({ result }) => result);
 
 /** Titles of all formats: "PLY, compressed PLY, SPZ or .splat". */
 export const titles = sceneFormats.map(({ title }) => title).join(", ").replace(/, ([^,]*)$/, " or $1");

@@ -6,18 +6,45 @@ import { sceneSuffix } from "./scene_formats.js";
 import { size, words } from "./words.js";
 
 const say = words.submit;
+/** Number of files that a slot lists. */
+const SHOWN = 12;
+
+/**
+ * Add files to others; a file replaces one of the same name.
+ *
+ * @param {File[]} old
+ * @param {File[]} more
+ */
+export function withoutDoubles(old, more) {
+  const names = new Set(more.map(({ name }) => name));
+  return [...old.filter(({ name }) => !names.has(name)), ...more];
+}
+
+/**
+ * Add camera files to others. A JSON file holds all cameras, so it replaces what was there; the files of a COLMAP model
+ * belong together.
+ *
+ * @param {File[]} old
+ * @param {File[]} more
+ */
+export function oneModel(old, more) {
+  const isJson = (/** @type {File} */ { name }) => /\.json$/i.test(name);
+  return more.some(isJson) ? more : withoutDoubles(old.filter((file) => !isJson(file)), more);
+}
 
 export class Slot {
   /**
    * @param {string} name
    * @param {string} hint
-   * @param {{accept?: string, multiple?: boolean, pictures?: boolean, changed: () => void}} how
+   * @param {{accept?: string, multiple?: boolean, pictures?: boolean, add?: (old: File[], more: File[]) => File[], changed: () => void}} how
+   *   `add` returns the files after some were chosen
    */
-  constructor(name, hint, { accept = "", multiple = false, pictures = false, changed }) {
+  constructor(name, hint, { accept = "", multiple = false, pictures = false, add = withoutDoubles, changed }) {
     this.hint = hint;
     this.multiple = multiple;
     this.pictures = pictures;
     this.changed = changed;
+    this.combined = add;
     /** @type {File[]} */
     this.files = [];
     /** @type {string[]} */
@@ -35,8 +62,7 @@ export class Slot {
   /** @param {File[]} files */
   add(files) {
     if (!files.length) return;
-    const known = new Set(this.files.map((file) => file.name + file.size));
-    this.files = this.multiple ? [...this.files, ...files.filter((file) => !known.has(file.name + file.size))] : [files[0]];
+    this.files = this.multiple ? this.combined(this.files, files) : [files[0]];
     this.input.value = "";
     this.show();
     this.changed();
@@ -58,8 +84,16 @@ export class Slot {
     this.element.classList.toggle("filled", files.length > 0);
     this.action.textContent = files.length && !this.multiple ? say.change : say.choose;
     const total = files.reduce((sum, file) => sum + file.size, 0);
-    this.say(!files.length ? this.hint : files.length === 1 ? `${files[0].name} · ${size(total)}` : `${say.nFiles(files.length)} · ${size(total)}`);
-    put(this.thumbs, files.slice(0, 12).map((file) => this.thumb(file)));
+    this.say(!files.length ? this.hint : files.length === 1 ? size(total) : `${say.nFiles(files.length)} · ${size(total)}`);
+    put(this.thumbs, files.slice(0, SHOWN).map((file) => this.thumb(file)), files.length > SHOWN ? h("span.quiet", say.moreFiles(files.length - SHOWN)) : null,
+      files.length > 1 ? h("button.quiet.small", { type: "button", onclick: () => this.clear() }, say.removeAll) : null);
+  }
+
+  clear() {
+    this.files = [];
+    this.show();
+    this.changed();
+    this.input.focus();
   }
 
   /** @param {File} file */
@@ -86,7 +120,7 @@ export class Slot {
   }
 }
 
-const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp)$/i, CAMERAS = /\.(json|bin|txt)$/i;
+const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp|heic|heif)$/i, CAMERAS = /\.(json|bin|txt)$/i;
 
 /**
  * Sort dropped files into slots. Up to four images are styles; more are photos.
@@ -96,10 +130,11 @@ const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp)$/i, CAMERAS = /\.(json|bin|txt)$/i
  */
 export function sorted(files) {
   const pictures = files.filter((file) => PICTURE.test(file.name)), many = pictures.length > 4;
+  const [scene, ...others] = files.filter((file) => sceneSuffix(file.name));
   return {
-    scene: files.filter((file) => sceneSuffix(file.name)), cameras: files.filter((file) => CAMERAS.test(file.name)),
+    scene: scene ? [scene] : [], cameras: files.filter((file) => CAMERAS.test(file.name)),
     style: many ? [] : pictures, photos: many ? pictures : [],
-    unknown: files.filter(({ name }) => !PICTURE.test(name) && !CAMERAS.test(name) && !sceneSuffix(name)),
+    unknown: [...others, ...files.filter(({ name }) => !PICTURE.test(name) && !CAMERAS.test(name) && !sceneSuffix(name))],
   };
 }
 

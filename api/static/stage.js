@@ -2,6 +2,7 @@
 /** 3D view with its controls: wipe, cameras, screenshots and messages. */
 import { announce, h, icon, newId, put } from "./dom.js";
 import { cameraLines, frameSize, upOf } from "./cameras.js";
+import { fileName } from "./names.js";
 import { Controls } from "./viewer/controls.js";
 import { Viewer } from "./viewer/viewer.js";
 import { words } from "./words.js";
@@ -24,6 +25,8 @@ export class Stage {
     this.tools = h("div.tools", { role: "toolbar", "aria-label": say.name });
     this.frame = h("div.frame", this.canvas, this.leftName, this.rightName, this.divider, this.overlay, this.note, this.bar);
     this.element = h("section.stage", { "aria-label": say.name }, this.frame, this.tools);
+    /** Start of the names of saved images. */
+    this.title = "";
     /** @type {JobCamera[]} */
     this.cameras = [];
     this.stood = -1;
@@ -31,11 +34,13 @@ export class Stage {
     this.names = null;
     /** @type {Viewer | null} */
     this.viewer = null;
-    this.showFrames = false;
+    this.hasFrames = false;
+    this.framesShown = true;
     this.up = [0, -1, 0];
     try {
       this.viewer = new Viewer(this.canvas, () => this.told());
     } catch (error) {
+      this.element.classList.add("flat");
       this.message(error instanceof Error ? error.message : String(error));
       return;
     }
@@ -53,6 +58,7 @@ export class Stage {
     this.wipe = h("div.wipe", { hidden: true }, h("label", { htmlFor: wipeId }, say.wipe), this.slider, button("swap", say.toggle, () => this.toggle()));
     const group = newId(), mode = (/** @type {string} */ name, /** @type {boolean} */ orbit) =>
       h("label", h("input", { type: "radio", name: group, checked: orbit, onchange: () => this.controls && (this.controls.orbit = orbit) }), h("span", name));
+    this.framesButton = h("button.tool", { type: "button", hidden: true, "aria-pressed": "true", title: say.frames, "aria-label": say.frames, onclick: () => this.toggleFrames() }, icon("cameras"));
     this.chooser = h("select", { "aria-label": say.camera, onchange: () => this.stand(Number(this.chooser.value)) });
     this.cameraTools = h("div.cameras", { hidden: true },
       button("left", say.previous, () => this.stand(this.stood - 1)), this.chooser, button("right", say.next, () => this.stand(this.stood + 1)));
@@ -60,7 +66,7 @@ export class Stage {
       h("dl", say.help.map(([keys, what]) => h("div", h("dt", keys), h("dd", what)))));
     help.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && (help.open = false));
     put(this.tools, this.wipe, this.cameraTools, h("fieldset.segments", h("legend.away", say.movement), mode(say.orbit, true), mode(say.fly, false)),
-      h("div.buttons", button("home", say.home, () => this.home()), button("picture", say.screenshot, () => this.save()), button("full", say.full, () => this.full()), help));
+      h("div.buttons", this.framesButton, button("home", say.home, () => this.home()), button("picture", say.screenshot, () => this.save()), button("full", say.full, () => this.full()), help));
   }
 
   /** Update the stage after a change in the viewer. */
@@ -128,8 +134,9 @@ export class Stage {
    */
   setCameras(cameras, { frames = false, stand = false } = {}) {
     this.cameras = cameras;
-    this.showFrames = frames;
+    this.hasFrames = frames;
     if (!this.viewer) return;
+    this.framesButton.hidden = !frames || !cameras.length;
     if (cameras.length > 1) this.up = upOf(cameras);
     this.cameraTools.hidden = !cameras.length;
     put(this.chooser, h("option", { value: "-1" }, say.free), cameras.map((camera, i) => h("option", { value: String(i) }, say.cameraOf(i + 1, cameras.length, camera.name.slice(-40)))));
@@ -138,11 +145,17 @@ export class Stage {
     this.drawFrames();
   }
 
+  toggleFrames() {
+    this.framesShown = !this.framesShown;
+    this.framesButton.setAttribute("aria-pressed", String(this.framesShown));
+    this.drawFrames();
+  }
+
   drawFrames() {
     const { viewer } = this;
     if (!viewer) return;
     const middle = viewer.sides?.left.scene.middle ?? null, length = frameSize(this.cameras, middle);
-    const shown = this.showFrames ? this.cameras.filter((_, i) => i !== this.stood) : [];
+    const shown = this.hasFrames && this.framesShown ? this.cameras.filter((_, i) => i !== this.stood) : [];
     viewer.lines = cameraLines(shown, length);
     viewer.draw();
   }
@@ -182,7 +195,9 @@ export class Stage {
   async save() {
     if (!this.viewer) return;
     const url = URL.createObjectURL(await this.viewer.picturePng());
-    h("a", { href: url, download: "view.png" }).click();
+    const camera = this.cameras[this.stood]?.name.replace(/^.*\/|\.[^.]*$/g, "");
+    const name = [this.title, camera || say.view].map(fileName).filter(Boolean).join("-");
+    h("a", { href: url, download: `${name}.png` }).click();
     setTimeout(() => URL.revokeObjectURL(url), 10000);
   }
 

@@ -4,11 +4,11 @@ import { ask, eventsOf, get, Problem, randomKey } from "./api.js";
 import { readCameras, ringCameras } from "./cameras.js";
 import { announce, h, icon, newId, put } from "./dom.js";
 import { defaultName } from "./names.js";
-import { optionControl } from "./options.js";
+import { GROUPS, optionControl, plainly } from "./options.js";
 import { costCard } from "./plan.js";
 import { RegionList } from "./regions.js";
 import { accepted } from "./scene_formats.js";
-import { droppedFiles, Slot, sorted } from "./slots.js";
+import { droppedFiles, oneModel, Slot, sorted } from "./slots.js";
 import { Stage } from "./stage.js";
 import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
 import { percent, words } from "./words.js";
@@ -16,10 +16,25 @@ import { percent, words } from "./words.js";
 /** @typedef {import("./options.js").Control} Control */
 
 const say = words.submit;
-/** Options that are always visible, and those with an input elsewhere on the page. */
-const MAIN = ["resolution", "views", "content_weight", "max_seconds"], PLACED = new Set(["name", "preset", "orbit", "up", "elevation", "radius", "style_weights", "regions", ...MAIN]);
+const ORBIT = ["orbit", "up", "elevation", "radius"];
+/** Options with an input outside of the folds. */
+const PLACED = new Set(["name", "preset", "style_weights", "regions", ...ORBIT, ...GROUPS.essentials]);
 const DRAFT = "sgsst.draft";
 const UPS = /** @type {Record<string, number[]>} */ ({ x: [1, 0, 0], "-x": [-1, 0, 0], y: [0, 1, 0], "-y": [0, -1, 0], z: [0, 0, 1], "-z": [0, 0, -1] });
+
+/**
+ * Files, weights of the styles and regions of the form while another view is shown. The other inputs are in the
+ * session's storage, which cannot hold files.
+ *
+ * @type {{files: Record<string, File[]>, weights: string[], regions: any[]} | null}
+ */
+let kept = null;
+
+/** Forget everything that was entered into the form. */
+export function forgetDraft() {
+  kept = null;
+  sessionStorage.removeItem(DRAFT);
+}
 
 /** View of a new job. When it ends, its uploads stop: other views have no place to show them. */
 export class SubmitView {
@@ -29,7 +44,7 @@ export class SubmitView {
     this.slots = {
       scene: new Slot(say.scene, say.sceneHint, { accept: accepted, ...changed(() => this.sceneChanged()) }),
       style: new Slot(say.style, say.styleHint, { accept: "image/*", multiple: true, pictures: true, ...changed(() => this.styleChanged()) }),
-      cameras: new Slot(say.cameras, say.camerasHint, { accept: ".json,.bin,.txt", multiple: true, ...changed(() => this.camerasChanged()) }),
+      cameras: new Slot(say.cameras, say.camerasHint, { accept: ".json,.bin,.txt", multiple: true, add: oneModel, ...changed(() => this.camerasChanged()) }),
       photos: new Slot(say.photos, say.photosHint, { accept: "image/*", multiple: true, ...changed(() => this.refresh()) }),
     };
     this.stage = new Stage();
@@ -42,9 +57,20 @@ export class SubmitView {
     /** @type {any[]} */
     this.weights = [];
     this.regions = new RegionList();
+    this.created = false;
     this.build();
+    this.restoreFiles();
     this.loadOptions();
     this.listenToDrops();
+  }
+
+  restoreFiles() {
+    if (!kept) return;
+    this.weights = kept.weights.map((value) => ({ value }));
+    for (const [role, slot] of Object.entries(this.slots)) slot.add(kept.files[role]);
+    this.regions.restore(kept.regions);
+    this.regionFold.open = kept.regions.length > 0;
+    kept = null;
   }
 
   build() {
@@ -57,11 +83,13 @@ export class SubmitView {
     this.fromFiles = this.choice("views", say.fromFiles, true);
     this.viewsBody = h("div.views-body");
     this.found = h("p.quiet");
-    this.shares = h("div.options", { hidden: true });
-    this.all = h("div.options");
+    this.shares = h("div.options.shares", { hidden: true });
+    this.lookOptions = h("div.options");
+    this.expertOptions = h("div.options");
     this.search = h("input", { type: "search", "aria-label": say.find, placeholder: say.find, oninput: () => this.filter() });
     this.none = h("p.quiet", { hidden: true }, say.noOptions);
-    this.more = h("details.fold", h("summary", say.more), this.search, this.none, this.all);
+    this.lookFold = h("details.fold.group", h("summary", say.lookOptions), this.lookOptions);
+    this.expertFold = h("details.fold.group", h("summary", say.expertOptions), h("p.help", say.expertHint), this.expertOptions);
     this.regionFold = h("details.fold", h("summary", say.regions), h("p.help", say.regionsHint), this.regions.element);
     this.problem = h("p.wrong.block", { hidden: true, role: "alert" });
     this.costButton = h("button.quiet", { type: "button", onclick: () => this.act(true) }, say.cost);
@@ -69,11 +97,13 @@ export class SubmitView {
     this.progress = h("div.sending", { hidden: true });
     this.result = h("div.result", { "aria-live": "polite" });
     this.notice = h("div.notice", { hidden: true });
+    this.unused = h("p.wrong.block", { hidden: true, role: "alert" });
     this.form = h("form.panel", { noValidate: true, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.act(false)) },
       h("header", h("h1", say.heading), h("p.lead", say.lead)), this.notice, this.name.element,
-      h("section", h("h2", say.files), this.slots.scene.element, this.slots.style.element, this.shares),
+      h("section", h("h2", say.files), this.unused, this.slots.scene.element, this.slots.style.element, this.shares),
       h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.viewsBody, this.found),
-      h("section", h("h2", say.look), this.presets, this.main, this.regionFold, this.more),
+      h("section", h("h2", say.essentials), this.presets, this.main),
+      h("section", h("h2", say.more), this.search, this.none, h("div", this.lookFold, this.regionFold, this.expertFold)),
       h("div.actions", this.problem, this.progress, h("div.row", this.costButton, this.startButton)), this.result);
     this.element = h("div.split", h("div.pinned", this.stage.element), this.form);
     this.showViews();
@@ -122,9 +152,10 @@ export class SubmitView {
     }
     this.makePresets(schema.preset);
     const elements = (/** @type {string[]} */ names) => names.map((name) => this.controls.get(name)?.element).filter(Boolean);
-    put(this.main, ...elements(MAIN));
-    put(this.ring, ...elements(["orbit", "up", "elevation", "radius"]));
-    put(this.all, ...elements([...this.controls.keys()].filter((name) => !PLACED.has(name))));
+    put(this.main, ...elements(GROUPS.essentials));
+    put(this.ring, ...elements(ORBIT));
+    put(this.lookOptions, ...elements(GROUPS.look));
+    put(this.expertOptions, ...elements([...this.controls.keys()].filter((name) => !PLACED.has(name) && !GROUPS.look.includes(name))));
     this.ring.addEventListener("input", () => this.camerasChanged());
     this.restoreDraft();
     this.form.addEventListener("input", () => this.saveDraft());
@@ -133,21 +164,31 @@ export class SubmitView {
   /** @param {any} schema */
   makePresets(schema) {
     const name = newId();
-    this.preset = schema.default;
+    this.choosePreset(schema.default);
     put(this.presets, h("legend", "Preset"), schema.enum.map((/** @type {string} */ value) => h("label",
-      h("input", { type: "radio", name, value, checked: value === schema.default, onchange: () => (this.preset = value) }),
+      h("input", { type: "radio", name, value, checked: value === schema.default, onchange: () => this.choosePreset(value) }),
       h("span", h("strong", value), h("small", say.presets[value] ?? "")))));
+  }
+
+  /** @param {string} preset */
+  choosePreset(preset) {
+    this.preset = preset;
+    for (const control of this.controls.values()) control.follow(preset);
   }
 
   filter() {
     const wanted = this.search.value.trim().toLowerCase();
     let shown = 0;
-    for (const { name, help, element } of this.controls.values()) {
+    for (const { name, title, help, element } of this.controls.values()) {
       if (PLACED.has(name)) continue;
-      element.hidden = !!wanted && !`${name.replaceAll("_", " ")} ${name} ${help}`.toLowerCase().includes(wanted);
+      element.hidden = !!wanted && !`${title} ${name.replaceAll("_", " ")} ${name} ${help}`.toLowerCase().includes(wanted);
       shown += element.hidden ? 0 : 1;
     }
     this.none.hidden = shown > 0;
+    for (const fold of [this.lookFold, this.expertFold]) {
+      if (wanted) fold.open = true;
+      fold.hidden = ![...fold.querySelectorAll(".option")].some((/** @type {any} */ element) => !element.hidden);
+    }
   }
 
   saveDraft() {
@@ -171,7 +212,7 @@ export class SubmitView {
     const preset = [...this.presets.querySelectorAll("input")].find((/** @type {any} */ input) => input.value === draft.preset);
     if (preset) {
       /** @type {any} */ (preset).checked = true;
-      this.preset = draft.preset;
+      this.choosePreset(draft.preset);
     }
     if (draft.orbiting && this.around) this.around.input.checked = true;
     this.showViews();
@@ -203,6 +244,13 @@ export class SubmitView {
       this.showViews();
     }
     for (const role of /** @type {const} */ (["cameras", "photos", "style", "scene"])) this.slots[role].add(found[role]);
+    this.tellUnused(found.unknown.map(({ name }) => name));
+  }
+
+  /** @param {string[]} names names of dropped files that no input takes */
+  tellUnused(names) {
+    /** @type {any} */ (this.unused).hidden = !names.length;
+    /** @type {any} */ (this.unused).textContent = names.length ? say.unused(names) : "";
   }
 
   async sceneChanged() {
@@ -225,7 +273,7 @@ export class SubmitView {
     this.stage.show({ scene, colors: "own" });
     try {
       const header = await scene.headerRead;
-      this.slots.scene.say(`${file.name} · ${words.scene.header(header)}`);
+      this.slots.scene.say(words.scene.header(header));
       await scene.ready;
       this.camerasChanged();
     } catch (error) {
@@ -280,13 +328,16 @@ export class SubmitView {
   /** Discard the displayed plan, which was made for other files or parameters. */
   refresh() {
     if (this.result && !this.busy) put(this.result);
-    this.name.suggest(defaultName(this.slots.scene.files[0]?.name, this.slots.style.files.map(({ name }) => name)));
+    const scene = this.slots.scene.files[0]?.name;
+    this.name.suggest(defaultName(scene, this.slots.style.files.map(({ name }) => name)));
+    this.stage.title = this.name.value() ?? defaultName(scene, []);
     this.clearWrong();
   }
 
   clearWrong() {
     for (const slot of Object.values(this.slots)) slot.wrong("");
     for (const control of this.controls.values()) control.wrong("");
+    this.regions.clearWrong();
     if (this.problem) this.problem.hidden = true;
   }
 
@@ -294,7 +345,7 @@ export class SubmitView {
     /** @type {Record<string, any>} */
     const values = {};
     for (const [name, control] of this.controls) {
-      if (!this.orbiting && ["orbit", "up", "elevation", "radius"].includes(name)) continue;
+      if (!this.orbiting && ORBIT.includes(name)) continue;
       const value = control.value();
       if (value !== undefined) values[name] = value;
     }
@@ -318,12 +369,32 @@ export class SubmitView {
     return wrong.length > 0;
   }
 
+  /** Mark inputs whose text is not what they ask for. Return whether there are any. */
+  invalid() {
+    const used = [...this.controls.values()].filter(({ name }) => this.orbiting || !ORBIT.includes(name));
+    const wrong = used.filter((control) => control.problem());
+    for (const control of [...wrong].reverse()) this.tell(control, control.problem());
+    const weight = this.weights.find((input) => !(Number(input.value) > 0) || !Number.isFinite(Number(input.value)));
+    if (!weight) return wrong.length > 0;
+    this.slots.style.wrong(words.refusals.weight(weight.getAttribute("aria-label")));
+    weight.focus();
+    return true;
+  }
+
+  /** Stop sending and planning; the form stays as it is. */
+  stop() {
+    this.stopped = true;
+    this.stopping?.abort();
+    for (const upload of this.sending ?? []) upload.stop();
+  }
+
   /** @param {boolean} dry whether to plan only */
   async act(dry) {
     if (this.busy) return;
     this.clearWrong();
-    if (this.missing()) return;
+    if (this.missing() || this.invalid()) return;
     this.setBusy(true, dry);
+    this.stopping = new AbortController();
     this.planningText = "";
     try {
       const body = await this.send();
@@ -332,6 +403,7 @@ export class SubmitView {
     } catch (error) {
       if (!this.leaving.signal.aborted && !this.stopped) this.refuse(error);
     } finally {
+      this.stopping = undefined;
       this.setBusy(false, dry);
     }
   }
@@ -372,12 +444,15 @@ export class SubmitView {
       this.sendingBar = h("progress", { max: 1, value: 0, "aria-label": words.uploads.title });
       this.sendingText = h("span");
       this.pauseButton = h("button.quiet.small", { type: "button", onclick: () => this.pause() }, words.uploads.pause);
-      put(this.progress, h("div.row", h("strong", words.uploads.title), this.sendingText, this.pauseButton), this.sendingBar);
+      this.stopButton = h("button.quiet.small", { type: "button", onclick: () => this.stop() }, say.stop);
+      this.sendingTitle = h("strong", words.uploads.title);
+      put(this.progress, h("div.row", this.sendingTitle, this.sendingText, this.pauseButton, this.stopButton), this.sendingBar);
     }
     const now = uploads.find((upload) => upload.state !== "done") ?? uploads[0], through = uploads.length === files.length && uploads.every((upload) => upload.state === "done");
     this.sendingBar.value = sent / Math.max(total, 1);
     this.sendingText.textContent = through ? this.planningText ?? "" : now ? `${now.file.name}: ${uploadText(now)}` : "";
-    this.pauseButton.hidden = through;
+    this.pauseButton.hidden = this.sendingTitle.hidden = through;
+    this.stopButton.hidden = false;
     this.pauseButton.textContent = now?.state === "paused" ? words.uploads.resume : words.uploads.pause;
   }
 
@@ -392,7 +467,7 @@ export class SubmitView {
   /** @param {any} body */
   async plan(body) {
     this.tellPlanning(say.planning);
-    const answer = await ask("POST", "/v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: this.leaving.signal });
+    const answer = await ask("POST", "/v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: AbortSignal.any([this.leaving.signal, /** @type {AbortController} */ (this.stopping).signal]) });
     if (!answer.headers.get("content-type")?.includes("event-stream")) return void put(this.result, costCard(await answer.json()));
     for await (const { event, data } of eventsOf(answer)) {
       if (event === "planning") this.tellPlanning(say.planned(data.step, data.total), data.fraction);
@@ -416,10 +491,13 @@ export class SubmitView {
   /** @param {any} body */
   async create(body) {
     this.tellPlanning(say.starting);
+    this.stopButton.hidden = true; // the service may already have accepted the job
     const key = (this.key ??= [randomKey(), JSON.stringify(body)]);
     if (key[1] !== JSON.stringify(body)) this.key = [randomKey(), JSON.stringify(body)];
     const job = await (await ask("POST", "/v1/jobs", { json: body, headers: { "Idempotency-Key": (this.key ?? key)[0] } })).json();
-    sessionStorage.removeItem(DRAFT);
+    if (this.leaving.signal.aborted) return announce(say.created(job.name));
+    this.created = true;
+    forgetDraft();
     location.hash = `#/jobs/${job.id}`;
   }
 
@@ -428,8 +506,11 @@ export class SubmitView {
     const text = error instanceof Error ? error.message : String(error);
     if (error instanceof Problem) {
       if (error.code === "unknown-upload") this.uploads.clear();
+      const [first] = error.errors, told = first ? plainly(first.message) : text;
+      const region = this.regions.refuse(first?.at ?? "", told);
+      if (region) return this.reveal(region, told);
       const at = this.placeOf(error);
-      if (at) return this.tell(at, text);
+      if (at) return this.tell(at, told);
     }
     this.problem.hidden = false;
     this.problem.textContent = text;
@@ -449,15 +530,29 @@ export class SubmitView {
    */
   tell(place, text) {
     place.wrong(text);
-    const fold = place.element.closest("details");
-    if (fold) fold.open = true;
     place.element.hidden = false;
-    const input = place.element.querySelector("input, select");
+    this.reveal(place.element, text);
+  }
+
+  /**
+   * Scroll to an element with a refusal, and focus its wrong input.
+   *
+   * @param {HTMLElement} element
+   * @param {string} text
+   */
+  reveal(element, text) {
+    const fold = element.closest("details");
+    if (fold) fold.hidden = !(fold.open = true);
+    const input = element.querySelector("[aria-invalid=true]") ?? element.querySelector("input, select");
     if (input instanceof HTMLElement) input.focus();
     announce(text);
   }
 
   end() {
+    if (!this.created) {
+      const files = Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, slot.files]));
+      kept = { files, weights: this.weights.map((input) => input.value), regions: this.regions.value() };
+    }
     this.leaving.abort();
     for (const upload of this.uploads.values()) upload.stop();
     for (const slot of Object.values(this.slots)) slot.end();

@@ -60,7 +60,7 @@ class Outbox:
         }
         previews = self._out / "previews"
         if previews.is_dir():
-            files |= {f"previews/{path.name}": path for path in previews.glob("step_*.jpg")}
+            files |= {f"previews/{path.name}": path for path in previews.glob("[!.]*.jpg")}
         return files
 
     def results(self) -> dict[str, Path]:

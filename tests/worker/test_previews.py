@@ -38,3 +38,27 @@ def test_first_preview_shows_warm_start_colors(tiny_weights: BackboneWeights, tm
     found, expected = (np.asarray(Image.open(path)) for path in (written[0][1], tmp_path / "wanted.jpg"))
     np.testing.assert_array_equal(found, expected)
     assert found.std() > 1
+
+
+def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
+    tiny_weights: BackboneWeights, tmp_path: Path
+) -> None:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
+    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    stylizer = Stylizer.planned(wall(), cameras(), style, settings, weights=tiny_weights)
+    run(stylizer)
+    missing: list[str] = []
+    written: list[Path] = []
+    Previews(tmp_path, 3600, written.append, missing.append).finish(stylizer)
+    assert not missing
+    assert written == [tmp_path / "thumbnail.jpg"]
+    assert written[0].name > "step_9999999.jpg", "clients show the last preview by name"
+
+    views, index = stylizer.job.views, stylizer.job.evaluation_views[0]
+    found = np.asarray(Image.open(written[0]), dtype=np.float64)
+    middle = found.shape[1] // 2
+    for part, colors in ((np.s_[:, :middle], views.scene.sh_dc), (np.s_[:, middle:], stylizer.shown())):
+        with torch.no_grad():
+            image = views.rasterizer.render(views.colors(index, colors), views.cameras[index])
+        wanted = (image.clamp(0, 1) * 255).numpy()[part]
+        assert np.abs(found[part] - wanted).mean() < 5  # JPEG

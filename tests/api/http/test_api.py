@@ -626,6 +626,17 @@ def _answers(url: str) -> bool:
         return False
 
 
+@pytest.mark.parametrize("name", ["background", "style_background"])
+def test_colors_are_names_numbers_or_fractions(client: httpx.Client, files: dict[str, bytes], name: str) -> None:
+    def sent(color: object) -> httpx.Response:
+        return client.post("/v1/jobs", files=form(files), data={"parameters": json.dumps({name: color})})
+
+    for color, fractions in (("white", [1, 1, 1]), ("0,51,255", [0, 0.2, 1]), ([0, 0.2, 1], [0, 0.2, 1])):
+        assert sent(color).json()["parameters"][name] == fractions
+    for color in ("pink", "0,0,256", "nan,0,0", [0, 51, 255]):
+        assert name in refused(sent(color), 422, "invalid-request")["detail"]
+
+
 def test_job_is_named_by_its_files_and_renamed(client: httpx.Client, files: dict[str, bytes]) -> None:
     named = form(files, scene=("plush.compressed.ply", files["scene"]), style=("starry_night.jpg", files["style"]))
     job = client.post("/v1/jobs", files=named).json()

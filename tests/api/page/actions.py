@@ -46,11 +46,16 @@ def choose(watched: Watched, files: dict[str, Path]) -> None:
         watched.page.get_by_label(role.capitalize(), exact=True).set_input_files(path)
 
 
+def expand(watched: Watched) -> None:
+    """Expand all groups of options."""
+    watched.page.locator("details.group").evaluate_all("(folds) => folds.forEach((fold) => { fold.open = true; })")
+
+
 def set_options(watched: Watched, **values: Any) -> None:
-    """Expand the section of options, and fill in the given ones."""
+    """Expand the groups of options, and fill in the given ones."""
     page = watched.page
     page.locator(".presets input").first.wait_for()
-    page.locator("details.fold", has_text="All options").evaluate("(fold) => { fold.open = true; }")
+    expand(watched)
     for name, value in values.items():
         control = page.locator(f"[data-name={name}]").locator("input, select").first
         if control.evaluate("(element) => element.tagName") == "SELECT":

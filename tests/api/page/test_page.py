@@ -18,7 +18,7 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.camera import resized
-from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, drop, set_options, submit
+from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, drop, expand, set_options, submit
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import ball, wall, write_files
@@ -183,7 +183,7 @@ def test_refusals_stand_beside_their_field(visit: Visit, files: dict[str, Path],
     set_options(watched, resolution=-5)
     page.get_by_role("button", name="Estimate time").click()
     field = page.locator("[data-name=resolution]")
-    field.get_by_text("greater than or equal to 1").wait_for()
+    field.get_by_text("Must be at least 1.").wait_for()
     assert field.locator("input").get_attribute("aria-invalid") == "true"
     watched.check(REFUSED)
 
@@ -323,7 +323,7 @@ def test_accessible_and_never_too_wide(
         page.locator("h1").wait_for()
         if name == "new":
             page.locator("[data-name=resolution]").wait_for()
-            page.locator("details.fold", has_text="All options").evaluate("(fold) => { fold.open = true; }")
+            expand(watched)
         if name == "jobs":
             page.locator(".tile").first.wait_for()
         if name == "job":
@@ -358,6 +358,7 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
         for watched, key in zip((ann, ben), keys, strict=True):
             page = watched.page
             page.goto(f"{service.url}/#/jobs")
+            page.get_by_text("requires an API key").wait_for()
             page.get_by_label("API key").fill("sgsst_wrong")
             page.get_by_role("button", name="Sign in").click()
             page.get_by_text("key isn't valid").wait_for()
@@ -372,7 +373,18 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
         ann.page.goto(f"{service.url}/#/jobs/{job_id}")
         ann.page.locator(".badge", has_text="Done").wait_for()
         ann.settled()
+        ann.page.get_by_role("link", name="New").click()
+        choose(ann, {"scene": files["scene"]})
+        ann.context.clear_cookies()  # as if the session had expired
+        ann.page.get_by_role("link", name="Jobs").click()
+        ann.page.get_by_text("session has expired").wait_for()
+        ann.page.get_by_label("API key").fill(keys[0])
+        ann.page.get_by_role("button", name="Sign in").click()
+        ann.page.locator(".tile", has_text="of ann").wait_for()
+        ann.page.get_by_role("link", name="New").click()
+        ann.page.get_by_role("button", name="Remove scene.ply").wait_for()
         ann.page.get_by_role("button", name="Sign out").click()
+        ann.page.get_by_text("You signed out.").wait_for()
         ann.page.get_by_label("API key").wait_for()
         ann.page.reload()
         ann.page.get_by_label("API key").wait_for()

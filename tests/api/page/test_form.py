@@ -1,0 +1,227 @@
+"""Tests of the form for a new job: its layout, files, inputs and refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from PIL import Image
+
+from tests.api.page.actions import LONG, REFUSED, Visit, choose, drop, expand, set_options
+from tests.api.page.browser import FLAGS, Watched, chromium
+from tests.api.service import Service, wait_for
+
+pytestmark = pytest.mark.slow
+
+#: Script that returns the texts of elements of the form that extend beyond it, or that are cut off by the window.
+_CUT_OFF = """() => {
+  const form = document.querySelector("form.panel").getBoundingClientRect();
+  const shown = [...document.querySelectorAll("form.panel *")].filter((each) => each.getClientRects().length);
+  const wide = shown.filter((each) => !each.closest(".away, svg, .segments input, .presets input, .pick input"));
+  return wide.filter((each) => each.getBoundingClientRect().right > Math.min(form.right, innerWidth) + 1)
+    .filter((each) => !each.matches("input[type=file], input[type=radio]")).map((each) => each.outerHTML.slice(0, 200));
+}"""
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (1100, 800), (390, 844)])
+def test_form_fits_with_two_paintings_and_during_an_upload(
+    visit: Visit, files: dict[str, Path], tmp_path: Path, width: int, height: int
+) -> None:
+    paintings = []
+    for name in ("a_painting_with_a_name_that_is_longer_than_any_column_of_the_form", "another_painting_of_that_kind"):
+        paintings.append(tmp_path / f"{name}.png")
+        Image.new("RGB", (640, 360), (20, 30, 90)).save(paintings[-1])
+    watched = visit(width=width, height=height)
+    page = watched.page
+    choose(watched, {"scene": files["scene"], "cameras": files["cameras"]})
+    page.get_by_label("Style", exact=True).set_input_files(paintings)
+    page.get_by_label(paintings[0].name, exact=True).wait_for()
+    page.locator("[data-name=resolution]").wait_for()
+    assert page.evaluate(_CUT_OFF) == []
+    held: list[Any] = []
+    page.route(
+        "**/v1/uploads/*", lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_()
+    )
+    page.get_by_role("button", name="Start").click()
+    wait_for(lambda: page.evaluate("1") and held, "a part to be sent")
+    page.get_by_role("button", name="Pause").wait_for()
+    assert page.evaluate(_CUT_OFF) == []
+    page.get_by_role("button", name="Stop").click()
+    page.get_by_role("button", name="Pause").wait_for(state="hidden")
+    page.unroute_all(behavior="ignoreErrors")
+    watched.check("net::ERR")
+
+
+def test_files_are_removed_and_replaced(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    page.get_by_text("3 cameras shown in the scene").wait_for()
+    page.get_by_role("button", name="Remove cameras.json").click()
+    page.get_by_role("button", name="Remove cameras.json").wait_for(state="detached")
+    choose(watched, {"cameras": files["cameras"]})
+    (tmp_path / "other").mkdir()
+    fewer = tmp_path / "other" / "cameras.json"
+    fewer.write_text(json.dumps(json.loads(files["cameras"].read_text())[:2]))
+    choose(watched, {"cameras": fewer})
+    page.get_by_text("2 cameras shown in the scene").wait_for()
+    assert page.get_by_role("button", name="Remove cameras.json").count() == 1
+    photos = []
+    for name in ("view_0.png", "view_1.png"):
+        photos.append(tmp_path / name)
+        Image.new("RGB", (96, 72)).save(photos[-1])
+    page.get_by_label("Photos", exact=True).set_input_files(photos)
+    page.get_by_role("button", name="Remove view_0.png").click()
+    page.get_by_label("Photos", exact=True).set_input_files(photos)
+    page.locator(".slot", has_text="Photos").get_by_role("button", name="Remove all").click()
+    page.get_by_role("button", name="Remove view_1.png").wait_for(state="detached")
+    watched.check()
+
+
+def test_what_was_entered_survives_other_views(visit: Visit, files: dict[str, Path]) -> None:
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    set_options(watched, steps_sos=17, name="kept")
+    page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
+    page.get_by_role("button", name="Add a region").click()
+    page.get_by_role("group", name="Region 1").get_by_label("Name").fill("left")
+    page.get_by_role("link", name="Jobs").click()
+    page.get_by_role("link", name="New").click()
+    for path in files.values():
+        page.get_by_role("button", name=f"Remove {path.name}").wait_for()
+    page.get_by_text("616 Gaussians").wait_for()
+    wait_for(lambda: page.locator("[data-name=steps_sos] input").input_value() == "17", "the options")
+    assert page.locator("[data-name=name] input").input_value() == "kept"
+    assert page.get_by_role("group", name="Region 1").get_by_label("Name").input_value() == "left"
+    watched.check()
+
+
+def test_dropped_files_that_are_not_used_are_named(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
+    notes = tmp_path / "notes.docx"
+    notes.write_bytes(b"text")
+    watched = visit()
+    drop(watched, files | {"notes": notes})
+    watched.page.get_by_role("alert").get_by_text("Not used: notes.docx").wait_for()
+    watched.page.get_by_role("button", name="Remove scene.ply").wait_for()
+    drop(watched, {"cameras": files["cameras"]})
+    watched.page.get_by_text("Not used").wait_for(state="hidden")
+    watched.check()
+
+
+def test_invalid_numbers_stop_the_start(visit: Visit, files: dict[str, Path]) -> None:
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    sent: list[str] = []
+    page.on("request", lambda request: sent.append(request.url) if "/v1/" in request.url else None)
+    wrong = {
+        "resolution": ("99999", "Must be at most 16,384."),
+        "max_seconds": ("1e400", "Must be a number."),
+        "content_weight": ("1e400", "Must be a number."),
+        "views": ("2.5", "Must be a whole number."),
+        "refine": ("0", "Must be at least 1."),
+        "target_loss": ("1", "Must be less than 1."),
+    }
+    page.locator(".presets input").first.wait_for()
+    expand(watched)
+    for name, (text, _) in wrong.items():
+        page.locator(f"[data-name={name}] input").press_sequentially(text)
+    page.get_by_role("button", name="Start").click()
+    for name, (_, message) in wrong.items():
+        page.locator(f"[data-name={name}]").get_by_text(message).wait_for()
+    assert sent == []
+    watched.check()
+
+
+def test_refusals_of_the_service_stand_at_their_place(visit: Visit, files: dict[str, Path]) -> None:
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    set_options(watched, background="pink")
+    page.get_by_role("button", name="Estimate time").click()
+    page.locator("[data-name=background]").get_by_text("'pink' is not a color. Give black, white").wait_for()
+    set_options(watched, background="40,40,48")
+    page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
+    for name, select in (("first", "half-space=1,0,0,0"), ("second", "cube=1")):
+        page.get_by_role("button", name="Add a region").click()
+        region = page.get_by_role("group", name=f"Region {1 if name == 'first' else 2}")
+        region.get_by_label("Name").fill(name)
+        region.get_by_label("Select").fill(select)
+        region.get_by_label("Freeze").check()
+    page.get_by_role("button", name="Estimate time").click()
+    region.locator(".wrong", has_text="not a known selection").wait_for()
+    region.get_by_label("Name").fill("no name")
+    region.get_by_label("Select").fill("half-space=-1,0,0,0")
+    page.get_by_role("button", name="Estimate time").click()
+    region.locator(".wrong:visible").wait_for()
+    assert region.get_by_label("Name").get_attribute("aria-invalid") == "true"
+    watched.check(REFUSED)
+
+
+def test_defaults_are_those_of_the_chosen_preset(visit: Visit) -> None:
+    watched = visit()
+    page = watched.page
+    resolution = page.locator("[data-name=resolution] input")
+    resolution.wait_for()
+    assert resolution.get_attribute("placeholder") == "the cameras' own"
+    page.get_by_label("preview").check(force=True)
+    assert resolution.get_attribute("placeholder") == "640"
+    assert page.locator("[data-name=bounded] option").first.text_content() == "on (default)"
+    page.get_by_label("paper").check(force=True)
+    assert page.locator("[data-name=steps_sos] input").get_attribute("placeholder") == "10000"
+    assert page.locator("[data-name=bounded] option").first.text_content() == "off (default)"
+    watched.check()
+
+
+def test_camera_frames_can_be_hidden(visit: Visit, files: dict[str, Path]) -> None:
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    page.get_by_text("3 cameras shown in the scene").wait_for()
+    with_frames = watched.pixels()
+    page.get_by_role("button", name="Show cameras").click()
+    without = watched.pixels()
+    assert (with_frames != without).any()
+    page.get_by_role("button", name="Show cameras").click()
+    assert (watched.pixels() == with_frames).all()
+    watched.check()
+
+
+def test_start_does_not_take_over_another_view(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """A user who has left the form while its job is created stays where they are."""
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    set_options(watched, **LONG, name="made elsewhere")
+    held: list[Any] = []
+    page.route("**/v1/jobs", lambda route: held.append(route) if route.request.method == "POST" else route.continue_())
+    page.get_by_role("button", name="Start").click()
+    wait_for(lambda: page.evaluate("1") and held, "the job to be sent")
+    page.get_by_role("link", name="Jobs").click()
+    held[0].continue_()
+    tile = page.locator(".tile", has_text="made elsewhere")
+    tile.wait_for()
+    page.locator("#said", has_text="made elsewhere").wait_for(state="attached")
+    assert page.url.endswith("#/jobs")
+    (job,) = (job for job in httpx.get(f"{service.url}/v1/jobs").json()["jobs"] if job["name"] == "made elsewhere")
+    httpx.post(f"{service.url}/v1/jobs/{job['id']}/cancel").raise_for_status()
+    watched.check()
+
+
+def test_form_works_without_webgl(browser: Any, service: Service, files: dict[str, Path]) -> None:
+    """Without WebGL the place of the 3D view is small, and files can be chosen and dropped."""
+    flags = [flag for flag in FLAGS if "swiftshader" not in flag] + ["--disable-3d-apis"]
+    bare = browser.browser_type.launch(executable_path=chromium(), args=flags, chromium_sandbox=False)
+    watched = Watched(bare, service.url, width=1100, height=800)
+    page = watched.page
+    page.goto(service.url)
+    page.get_by_text("needs WebGL 2").wait_for()
+    assert page.locator(".stage").bounding_box()["height"] < 300
+    drop(watched, files)
+    page.get_by_role("button", name="Remove scene.ply").wait_for()
+    watched.check("WebGL")
+    bare.close()

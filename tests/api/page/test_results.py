@@ -1,0 +1,119 @@
+"""Tests of finished jobs on the page: downloads, thumbnails, other tabs, and browsers without WebGL."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from sgsst_core.files.formats import RESULT_FORMATS, read_scene_header
+from tests.api.page.actions import LONG, STEPS, Visit, done, submit
+from tests.api.page.browser import FLAGS, Watched, chromium
+from tests.api.service import Service
+from tests.small_scenes import cameras, wall, write_files
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def finished(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the id of a finished job with default name."""
+    ply, file, style = write_files(tmp_path_factory.mktemp("files"), wall(sh_degree=1), cameras(3, 96, 72))
+    return done(service, submit(service, {"scene": ply, "cameras": file, "style": style}, **STEPS))
+
+
+def test_result_is_downloaded_in_every_format(visit: Visit, finished: str) -> None:
+    watched = visit(f"/#/jobs/{finished}", width=1100, height=800)
+    page = watched.page
+    button = page.get_by_role("link", name="Download", exact=True)
+    button.wait_for()
+    chart = page.get_by_role("img", name="Loss against seconds")
+    chart.wait_for()
+    assert button.bounding_box()["y"] < chart.bounding_box()["y"]
+    formats = page.get_by_label("Format")
+    offered = formats.locator("option").evaluate_all("(options) => options.map((each) => each.value)")
+    assert offered == [each.name for each in RESULT_FORMATS]
+    for each in RESULT_FORMATS[:3]:
+        formats.select_option(each.name)
+        with page.expect_download() as download:
+            button.click()
+        assert download.value.suggested_filename == f"scene_style-stylized{each.suffix}"
+        assert read_scene_header(download.value.path()).format.title == each.title
+    watched.settled()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save image").click()
+    assert download.value.suggested_filename == "scene_style-view_0.png"
+    watched.check()
+
+
+def test_result_comes_before_deletion_on_a_phone(visit: Visit, finished: str) -> None:
+    watched = visit(f"/#/jobs/{finished}", width=390, height=844)
+    page = watched.page
+    page.get_by_role("link", name="Download", exact=True).wait_for()
+    places = [
+        page.get_by_role("region", name="3D view"),
+        page.get_by_role("link", name="Download", exact=True),
+        page.get_by_role("button", name="Delete"),
+    ]
+    tops = [place.bounding_box()["y"] for place in places]
+    assert tops == sorted(tops)
+    watched.check()
+
+
+@pytest.mark.parametrize("width", [1440, 1100, 390])
+def test_tile_shows_the_whole_finished_image(visit: Visit, finished: str, width: int) -> None:
+    watched = visit("/#/jobs", width=width, height=844)
+    page = watched.page
+    tile = page.locator(".tile", has=page.locator(f"a[href='#/jobs/{finished}']"))
+    image = tile.locator("img")
+    image.wait_for()
+    assert image.get_attribute("src").endswith("/thumbnail.jpg")
+    assert image.evaluate("(image) => getComputedStyle(image).objectFit") == "contain"
+    boxes = [tile.locator(part).bounding_box() for part in (".badge", ".sure button")]
+    badge, bin_ = (box["y"] + box["height"] / 2 for box in boxes)
+    assert abs(badge - bin_) < 2, "on one line"
+    assert boxes[1]["x"] + boxes[1]["width"] <= tile.bounding_box()["x"] + tile.bounding_box()["width"]
+    watched.check()
+
+
+def test_another_tab_sees_changes(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = submit(service, files, **LONG)
+    here, there = visit(f"/#/jobs/{job_id}"), visit(f"/#/jobs/{job_id}")
+    here.page.get_by_role("button", name="Cancel").click()
+    for watched in (here, there):
+        watched.page.locator(".badge", has_text="Canceled").wait_for()
+    here.page.get_by_role("button", name="Retry").click()
+    there.page.get_by_role("button", name="Cancel").click()
+    for watched in (here, there):
+        watched.page.locator(".badge", has_text="Canceled").wait_for()
+    here.page.get_by_role("button", name="Rename").click()
+    here.page.get_by_label("New name").fill("renamed here")
+    here.page.keyboard.press("Enter")
+    there.page.get_by_role("heading", name="renamed here").wait_for()
+    listed = visit("/#/jobs")
+    listed.page.locator(".tile", has_text="renamed here").wait_for()
+    here.page.get_by_role("button", name="Delete").click()
+    here.page.get_by_role("button", name="Delete", exact=True).click()
+    there.page.get_by_role("heading", name="This job was deleted.").wait_for()
+    listed.page.locator(".tile", has_text="renamed here").wait_for(state="detached")
+    there.check("status of 404")
+    for watched in (here, listed):
+        watched.check()
+
+
+def test_result_without_webgl_is_the_sheet(browser: Any, service: Service, finished: str) -> None:
+    flags = [flag for flag in FLAGS if "swiftshader" not in flag] + ["--disable-3d-apis"]
+    bare = browser.browser_type.launch(executable_path=chromium(), args=flags, chromium_sandbox=False)
+    watched = Watched(bare, service.url, width=1100, height=800)
+    page = watched.page
+    page.goto(f"{service.url}/#/jobs/{finished}")
+    page.get_by_role("img", name="before and after").wait_for()
+    assert page.get_by_label("Before and after").is_checked()
+    page.get_by_label("3D", exact=True).check(force=True)
+    page.get_by_text("needs WebGL 2").wait_for()
+    assert page.locator(".stage").bounding_box()["height"] < 200
+    assert httpx.get(f"{service.url}/v1/jobs/{finished}").json()["preview"] == "previews/thumbnail.jpg"
+    watched.check("WebGL")
+    bare.close()
