@@ -24,7 +24,7 @@ from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import bought, build_report, plan_json, sent_json
 from sgsst_core.report.page import write_page
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, relative_loss, round_evaluation
 from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.options import RunOptions
@@ -43,7 +43,8 @@ class Result:
     Attributes:
         stopped: Reason why the job ended; see `run`. If it is "interrupted", only a checkpoint was written.
         step, total: Number of completed steps, and number of all steps.
-        before, after: Losses on the evaluation views before and after the job; empty if the job was interrupted.
+        before: Loss of the unstylized scene on the evaluation views; empty if the job was interrupted.
+        after: Loss of the last round of views; empty if the job was interrupted.
         bought: Loss as a function of the time spent; see `report.bought`. None if no step was made on all scales.
         report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
         packed: Measured loss of quality in the compressed file; None if no compressed file was requested.
@@ -62,8 +63,9 @@ class Result:
 
     @property
     def losses(self) -> tuple[float, float]:
-        """Return the mean loss before and after."""
-        return mean_loss(self.before, self.weights), mean_loss(self.after, self.weights)
+        """Return the mean loss before and after, over the same scales."""
+        after = mean_loss(self.after, self.weights)
+        return after / relative_loss(self.before, self.after, self.weights), after
 
 
 def execute(
@@ -176,7 +178,10 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
         outputs.checkpoints.remove()
     measure.at_the_end()
     # The initial loss is evaluated here, because evaluating it before the first step would delay the job.
-    before, after = measure.evaluate(unstylized=True), measure.evaluate()
+    before = measure.evaluate(unstylized=True)
+    # A run that ends before its first step has no round of views.
+    round_length, weights = stylizer.job.round_length, stylizer.job.loss.weights
+    after = round_evaluation(stylizer.history, round_length, weights) if stylizer.history else measure.evaluate()
     error = _write_reports(job, stopped, before, after, packed) if first else None
     found = bought(stylizer, before)
     problem = str(error) if error else None
@@ -189,7 +194,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
         found,
         problem,
         packed,
-        stylizer.job.loss.weights,
+        weights,
     )
 
 

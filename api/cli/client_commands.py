@@ -304,8 +304,9 @@ def _step_text(progress: Any) -> str:
         return str(progress["stage"])
     unit = "view" if progress["stage"] == "planning" else "step"
     text = f"{progress['stage']}: {unit} {progress['step']} of {progress['total']}"
-    if progress.get("loss") is not None:
-        text += f", loss {progress['loss']:.3g}"
+    loss = progress.get("mean_loss") or progress.get("loss")
+    if loss is not None:
+        text += f", loss {loss:.3g}"
     if progress.get("eta_s") is not None:
         text += f", {clock(progress['eta_s'])} left"
     return text

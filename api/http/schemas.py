@@ -74,6 +74,8 @@ class ProgressView(BaseModel):
         eta_s=310.5,
         loss=23729174.8,
         scales=[41029174.8, 19120331.2, 11038018.4],
+        mean_loss=24105220.5,
+        mean_scales=[42105220.5, 19210441.0, 11000000.0],
         seconds=205.1,
         attempt=1,
         updated_at=_NOW,
@@ -93,6 +95,8 @@ class ProgressView(BaseModel):
     scales: list[float | None] | None = Field(
         None, description="Loss of each scale, full size first; null for scales that the step skipped."
     )
+    mean_loss: float | None = Field(None, description="Loss of the last round of views, comparable over time.")
+    mean_scales: list[float | None] | None = Field(None, description="The same for each scale.")
     seconds: float | None = Field(description="Seconds of all steps so far.")
     attempt: int
     updated_at: Time
@@ -109,6 +113,8 @@ class ProgressPoint(BaseModel):
         seconds=205.1,
         loss=23729174.8,
         scales=[41029174.8, 19120331.2, 11038018.4],
+        mean_loss=24105220.5,
+        mean_scales=[42105220.5, 19210441.0, 11000000.0],
         updated_at=_NOW,
     )
 
@@ -119,6 +125,8 @@ class ProgressPoint(BaseModel):
     seconds: float = Field(description="Seconds of all steps so far.")
     loss: float
     scales: list[float | None] | None = Field(description="Same as in a job's progress.")
+    mean_loss: float | None = Field(None, description="Same as in a job's progress.")
+    mean_scales: list[float | None] | None = Field(None, description="Same as in a job's progress.")
     updated_at: Time
 
 

@@ -3,7 +3,7 @@
 import { h, put, svg } from "./dom.js";
 import { rough, words } from "./words.js";
 
-/** @typedef {{attempt: number, stage: string, step: number, seconds: number | null, loss: number | null, scales?: number[] | null}} Point */
+/** @typedef {{attempt: number, stage: string, step: number, seconds: number | null, loss: number | null, scales?: number[] | null, mean_loss?: number | null, mean_scales?: number[] | null}} Point */
 
 const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 12, BOTTOM = 34;
 
@@ -63,11 +63,12 @@ export class LossChart {
     const of = (/** @type {string} */ stage) => all.filter((point) => point.stage === stage), sos = of("sos");
     const line = (/** @type {Point[]} */ points, /** @type {(p: Point) => number | null | undefined} */ value) =>
       /** @type {[number, number][]} */ (points.filter((p) => (value(p) ?? 0) > 0).map((p) => [p.seconds, value(p)]));
-    const scales = Math.max(0, ...sos.map((point) => point.scales?.length ?? 0));
+    const scales = Math.max(0, ...sos.map((point) => point.scales?.length ?? 0)), mean = (/** @type {Point} */ p) => p.mean_loss ?? p.loss;
     return [
-      { name: words.chart.coarse, kind: "coarse", line: line(of("coarse"), (p) => p.loss) },
-      ...(scales > 1 ? Array.from({ length: scales }, (_, n) => ({ name: words.chart.scale(n), kind: `scale scale${n % 5}`, line: line(sos, (p) => p.scales?.[n]) })) : []),
-      { name: words.chart.all, kind: "all", line: line(sos, (p) => p.loss) },
+      { name: words.chart.single, kind: "single", line: line(sos, (p) => p.loss) },
+      { name: words.chart.coarse, kind: "coarse", line: line(of("coarse"), mean) },
+      ...(scales > 1 ? Array.from({ length: scales }, (_, n) => ({ name: words.chart.scale(n), kind: `scale scale${n % 5}`, line: line(sos, (p) => (p.mean_scales ?? p.scales)?.[n]) })) : []),
+      { name: words.chart.all, kind: "all", line: line(sos, mean) },
     ].filter((each) => each.line.length);
   }
 

@@ -152,7 +152,7 @@ export const words = {
     sheetOf: (/** @type {string} */ name) => `Views of ${name} before and after`, failed: "The job failed", again: "Stylize this scene again", preparing: "Preparing…",
   },
   chart: {
-    seconds: "seconds", loss: "loss", all: "all scales", coarse: "coarse", scale: (/** @type {number} */ n) => (n ? `1/${2 ** n}` : "full size"),
+    seconds: "seconds", loss: "loss", all: "mean of all views", single: "single views", coarse: "coarse", scale: (/** @type {number} */ n) => (n ? `1/${2 ** n}` : "full size"),
     told: (/** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ s) => `Loss against seconds: from ${three.format(from)} to ${three.format(to)} in ${seconds(s)}`,
   },
   jobs: {

@@ -188,6 +188,8 @@ def report_progress(now: Progress) -> None:
             "seconds": now.seconds,
             "seconds_left": now.seconds_left,
             "scales": list(now.scales) or None,
+            "mean_loss": now.mean_loss,
+            "mean_scales": list(now.mean_scales) or None,
         }
     )
 

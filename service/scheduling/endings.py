@@ -23,6 +23,8 @@ class Message(TypedDict, total=False):
     seconds: float
     seconds_left: float | None
     scales: list[float | None] | None
+    mean_loss: float | None
+    mean_scales: list[float | None] | None
     path: str
     gpus: list[str]
     file: dict[str, Any]

@@ -70,6 +70,8 @@ def progress_record(message: Message, attempt: int) -> dict[str, Any]:
         "eta_s": message.get("seconds_left"),
         "loss": message.get("loss"),
         "scales": message.get("scales"),
+        "mean_loss": message.get("mean_loss"),
+        "mean_scales": message.get("mean_scales"),
         "seconds": message.get("seconds"),
         "attempt": attempt,
     }

@@ -35,6 +35,7 @@ class Point:
         loss: Loss of the step.
         scales: Loss per scale, full size first; None for scales that the step left out.
         updated_at: Time of the report in seconds since 1970.
+        mean_loss, mean_scales: Loss of the last round of views, and per scale; None in points of earlier versions.
     """
 
     attempt: int
@@ -45,6 +46,8 @@ class Point:
     loss: float
     scales: list[float | None] | None
     updated_at: float
+    mean_loss: float | None = None
+    mean_scales: list[float | None] | None = None
 
 
 _POINTS = Base.metadata.tables[ProgressPointRow.__tablename__]
@@ -75,6 +78,7 @@ def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
     elif step <= last.step or seconds < GROWTH * last.seconds:
         return
     values = {name: progress[name] for name in ("total", "stage", "loss", "updated_at")}
+    values |= {name: progress.get(name) for name in ("mean_loss", "mean_scales")}
     values |= {"job_id": job_id, "attempt": attempt, "step": step, "seconds": seconds, "scales": progress.get("scales")}
     session.execute(upsert(session)(_POINTS).values(values).on_conflict_do_nothing())
 

@@ -139,7 +139,11 @@ class EventRow(Base):
 
 
 class ProgressPointRow(Base):
-    """Point of a job's loss history; `scales` has the loss of each scale, None for scales that the step left out."""
+    """Point of a job's loss history.
+
+    `scales` has the loss of each scale, None for scales that the step left out; `mean_loss` and `mean_scales` are those
+    of the last round of views.
+    """
 
     __tablename__ = "progress_points"
 
@@ -152,6 +156,8 @@ class ProgressPointRow(Base):
     loss: Mapped[float] = mapped_column(Float)
     scales: Mapped[list[Any] | None]
     updated_at: Mapped[float] = mapped_column(Float)
+    mean_loss: Mapped[float | None] = mapped_column(Float)
+    mean_scales: Mapped[list[Any] | None]
 
 
 class ArtifactRow(Base):

@@ -694,7 +694,7 @@ class CostModel:
         if plan.measured:
             once = _RENDER * self.views.rasterized() + self.views.later(coarse=False) + work.evaluation(rate)
             unvisited = max(1 - settings.steps_sos * settings.views_per_step / count, 0.0)
-            price = 2 * once + unvisited * expected.first_visit
+            price = once + unvisited * expected.first_visit
             # `target_loss` is relative to the initial loss on these views. Their number must not depend on timings, or
             # timings would determine the step at which the job ends.
             if not settings.target_loss:
@@ -850,7 +850,7 @@ class _PeakMemory:
         return image + matching + colors + reference_activations(self.plan, self.activations, budget)
 
     def _visited(self, steps: int) -> float:
-        """Return the fraction of views visited by this many steps and by the loss before and after."""
+        """Return the fraction of views visited by this many steps and by the initial loss."""
         evaluated = self.loss_views if self.plan.measured else 0
         return min((steps * self.settings.views_per_step + evaluated) / len(self.plan.covered), 1.0)
 

@@ -97,7 +97,7 @@ def _about_measuring(plan: Plan, expected: Prediction, settings: Settings) -> De
     """Return the line about measurements outside the steps and their cost."""
     steps = expected.job - expected.measuring
     cost = f"about {expected.measuring:.2g} s in addition to {steps:.3g} s of steps"
-    losses = f"the loss before and after on {_count(plan.loss_views, 'view')}"
+    losses = f"the initial loss on {_count(plan.loss_views, 'view')}"
     if not settings.measure:
         return Decision("measuring", f"{losses} only", f"requested; {cost}")
     level = LEVELS[plan.measuring]

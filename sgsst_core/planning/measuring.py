@@ -18,7 +18,7 @@ from sgsst_core.planning.plan import Prediction
 LEAST_ALLOWED = 30.0
 #: Planned measurements may use this fraction of the time allowed, because predictions are accurate to about a fifth.
 _PLANNED = 0.8
-#: Candidate numbers of views for the loss before and after; the largest that half of the time allowed covers is used.
+#: Candidate numbers of views for the initial loss; the largest that half of the time allowed covers is used.
 #: At least one view is always evaluated, because a job that cannot report what it has achieved is of little use.
 LOSS_VIEWS = (4, 2, 1)
 #: Novel views rendered per view of a `Level`: one for the Gram distance, the others for the pairs in which it is
@@ -92,7 +92,7 @@ def allowed_seconds(fraction: float, steps: float) -> float:
 def novel_view_seconds(fraction: float, expected: Prediction) -> float:
     """Return the time in seconds that novel views may take.
 
-    This is the time allowed minus the time for the loss before and after; 0 if `fraction` is 0.
+    This is the time allowed minus the time for the initial loss; 0 if `fraction` is 0.
     """
     if not fraction:
         return 0.0

@@ -30,7 +30,7 @@ class Prediction:
         first_visit_coarse: Additional time in seconds of a view's first visit in phase 1.
         style: Time in seconds for the style's statistics in the first step, assuming a style as large as a view.
         evaluation: Time in seconds for the loss on the evaluation views once they have been visited.
-        losses: Time in seconds for the loss before and after, including first visits of views that no step has visited.
+        losses: Time in seconds for the initial loss, including first visits of views that no step has visited.
         measuring: Time in seconds for all measurements outside the steps.
         job: Time in seconds for all steps, with first visits, style and measurements.
         ending: Seconds from the last step to the last file, except for measurements.

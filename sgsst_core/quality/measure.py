@@ -80,7 +80,7 @@ class Measurements:
         return step > 0 and step in self.moments
 
     def seconds_left(self, step: int) -> float:
-        """Predict the seconds of all measurements from a step on, including the loss before and after the job."""
+        """Predict the seconds of all measurements from a step on, including the initial loss."""
         expected, measured = self._stylizer.job.plan.prediction, self._stylizer.measured
         done = {entry["step"] for entry in measured}
         left = sum((moment >= step or not measured) and moment not in done for moment in self.moments)

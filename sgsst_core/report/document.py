@@ -19,7 +19,7 @@ from sgsst_core.planning.measuring import allowed_seconds
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
 from sgsst_core.report.machine import machine, peak_memory, program_version
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, relative_loss
 from sgsst_core.stylizing.loop import Stopped
 from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -66,7 +66,7 @@ def build_report(
         sources: Origin of the job's inputs.
         stopped: Reason why the job stopped, as returned by `loop.run`.
         before: Loss of the unstylized scene on the stylizer's `evaluation_views`.
-        after: Loss of the stylized scene on the same views.
+        after: Loss of the last round of views (`round_evaluation`).
         findings: Findings about scene, views and style.
     """
     return {
@@ -105,8 +105,10 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
             "views": [stylizer.job.views.cameras[index].name for index in stylizer.job.evaluation_views],
             "before": _evaluation_json(before, weights),
             "after": _evaluation_json(after, weights),
-            "relative": mean_loss(after, weights) / mean_loss(before, weights),
-            "relative_by_scale": {str(scale): after[scale].total / before[scale].total for scale in before},
+            "relative": relative_loss(before, after, weights),
+            "relative_by_scale": {
+                str(scale): after[scale].total / before[scale].total for scale in before if scale in after
+            },
         },
         "bought": bought(stylizer, before),
         "measuring": _measuring_json(stylizer),

@@ -98,8 +98,15 @@ def history_of(report: dict[str, Any]) -> History:
         mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
         memory=column([record.get("memory_bytes") for record in records]),
         device_memory=column([record.get("device_memory_bytes") for record in records]),
-        round_length=max(1, report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"])),
+        round_length=round_length(report),
     )
+
+
+def round_length(report: dict[str, Any]) -> int:
+    """Return the number of steps in which every view is visited once."""
+    views: int = report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"])
+    views_per_step: int = report["settings"].get("views_per_step", 1)
+    return max(1, math.ceil(views / views_per_step))
 
 
 def column(values: Sequence[float | None]) -> Floats:
@@ -189,10 +196,13 @@ def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
 
 
 def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
-    """Return the geometric mean of the `window` values around each index, or of fewer values near the ends."""
+    """Return the geometric mean of the last `window` values at each index, or of all values so far if there are fewer.
+
+    The last mean is that of the last window, as in `convergence.smoothed`.
+    """
     logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
     sums = np.concatenate([[0.0], np.cumsum(logs)])
-    positions = np.arange(len(logs))
-    reach = np.minimum(np.minimum(positions, positions[::-1]), window // 2)
-    means: Floats = np.exp((sums[positions + reach + 1] - sums[positions - reach]) / (2 * reach + 1))
+    end = np.arange(1, len(logs) + 1)
+    start = np.maximum(end - window, 0)
+    means: Floats = np.exp((sums[end] - sums[start]) / (end - start))
     return means

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.report.figures import draw_figures
-from sgsst_core.report.history import AGAINST, BINS
+from sgsst_core.report.history import AGAINST, BINS, round_length
 from sgsst_core.report.palette import ON_DARK, PAGE
 from sgsst_core.report.tables import (
     approximation_table,
@@ -90,7 +90,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         on_dark=ON_DARK,
         against=AGAINST,
         bins=BINS,
-        round_length=report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"]),
+        round_length=round_length(report),
         # All text in the figures is constant or escaped by the XML writer, so the SVGs are safe as markup.
         figures=[(figure, {against: Markup(figure.svg[against]) for against in AGAINST}) for figure in figures],
         losses=loss_table(report),

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
+from sgsst_core.loss.convergence import smoothed
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.targets import StyleTargets
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.scene.camera import Camera
+from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.view_targets import ViewTargets
 
 Evaluation = dict[int, LossTerms]
@@ -32,12 +35,46 @@ def evaluate(
 
 
 def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """Return the mean over views, scale by scale."""
+    """Return the mean over views, scale by scale; views without a scale do not count for it."""
     total: Evaluation = {}
+    counts: Counter[int] = Counter()
     for evaluation in evaluations:
+        counts.update(evaluation.keys())
         for scale, part in evaluation.items():
             total[scale] = total.get(scale, LossTerms()) + part
-    return {scale: terms / len(evaluations) for scale, terms in total.items()}
+    return {scale: terms / counts[scale] for scale, terms in total.items()}
+
+
+def round_loss(history: Sequence[StepRecord], round_length: int) -> float:
+    """Return the loss of the last round of views: the geometric mean over the last steps of the current phase.
+
+    Single steps see single views, whose losses differ by factors.
+    """
+    return smoothed([record.loss for record in _last_round(history, round_length)], round_length)
+
+
+def round_evaluation(history: Sequence[StepRecord], round_length: int, weights: ScaleWeights = EVEN) -> Evaluation:
+    """Return the loss of the last round of views by scale and term, scaled so that its mean is `round_loss`."""
+    found = mean_evaluation([record.terms for record in _last_round(history, round_length)])
+    mean = mean_loss(found, weights)
+    factor = round_loss(history, round_length) / mean if mean > 0 else 1.0
+    return {
+        scale: LossTerms(**{name: value * factor for name, value in terms.items()}) for scale, terms in found.items()
+    }
+
+
+def _last_round(history: Sequence[StepRecord], round_length: int) -> list[StepRecord]:
+    last = history[-round_length:]
+    return [record for record in last if record.stage == last[-1].stage]
+
+
+def relative_loss(before: Evaluation, after: Evaluation, weights: ScaleWeights = EVEN) -> float:
+    """Return the loss after a job relative to that before it, over the scales that were computed."""
+    return mean_loss(after, weights) / mean_loss(_shared(before, after), weights)
+
+
+def _shared(before: Evaluation, after: Evaluation) -> Evaluation:
+    return {scale: before[scale] for scale in after if scale in before} or before
 
 
 def mean_loss(evaluation: Evaluation, weights: ScaleWeights = EVEN) -> float:

@@ -13,7 +13,7 @@ from typing import Literal, Protocol
 
 from sgsst_core.loss.convergence import has_converged, has_reached
 from sgsst_core.planning.plan import Prediction
-from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
 
@@ -32,6 +32,8 @@ class Progress:
         seconds: Time in seconds of all steps so far.
         seconds_left: Remaining seconds of the job, including measurements and output.
         scales: Loss of the step by scale, full size first; None for skipped scales.
+        mean_loss: Loss of the last round of views.
+        mean_scales: Loss of the last round of views by scale, as in `scales`.
     """
 
     stage: str
@@ -41,6 +43,8 @@ class Progress:
     seconds: float
     seconds_left: float
     scales: tuple[float | None, ...] = ()
+    mean_loss: float | None = None
+    mean_scales: tuple[float | None, ...] = ()
 
 
 class Measuring(Protocol):
@@ -217,9 +221,25 @@ def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Pr
     stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
     if expected:
         left += expected.ending
-    terms = record.terms
-    scales = tuple(terms[scale].total if scale in terms else None for scale in range(max(terms, default=-1) + 1))
-    return Progress(stage, record.step, stylizer.job.total_steps, record.loss, stylizer.seconds, left, scales)
+    round_mean = round_evaluation(stylizer.history, stylizer.job.round_length, stylizer.job.loss.weights)
+    return Progress(
+        stage,
+        record.step,
+        stylizer.job.total_steps,
+        record.loss,
+        stylizer.seconds,
+        left,
+        _by_scale(record.terms),
+        round_loss(stylizer.history, stylizer.job.round_length),
+        _by_scale(round_mean),
+    )
+
+
+def _by_scale(evaluation: Evaluation) -> tuple[float | None, ...]:
+    """Return the loss by scale, full size first; None for skipped scales."""
+    return tuple(
+        evaluation[scale].total if scale in evaluation else None for scale in range(max(evaluation, default=-1) + 1)
+    )
 
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:

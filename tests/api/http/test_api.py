@@ -633,8 +633,8 @@ def test_colors_are_names_numbers_or_fractions(client: httpx.Client, files: dict
 
     for color, fractions in (("white", [1, 1, 1]), ("0,51,255", [0, 0.2, 1]), ([0, 0.2, 1], [0, 0.2, 1])):
         assert sent(color).json()["parameters"][name] == fractions
-    for color in ("pink", "0,0,256", "nan,0,0", [0, 51, 255]):
-        assert name in refused(sent(color), 422, "invalid-request")["detail"]
+    for wrong in ("pink", "0,0,256", "nan,0,0", [0, 51, 255]):
+        assert name in refused(sent(wrong), 422, "invalid-request")["detail"]
 
 
 def test_job_is_named_by_its_files_and_renamed(client: httpx.Client, files: dict[str, bytes]) -> None:

@@ -384,7 +384,7 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
         ann.page.get_by_role("link", name="New").click()
         ann.page.get_by_role("button", name="Remove scene.ply").wait_for()
         ann.page.get_by_role("button", name="Sign out").click()
-        ann.page.get_by_text("You signed out.").wait_for()
+        ann.page.locator("main").get_by_text("You signed out.").wait_for()
         ann.page.get_by_label("API key").wait_for()
         ann.page.reload()
         ann.page.get_by_label("API key").wait_for()

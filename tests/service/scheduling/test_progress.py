@@ -32,7 +32,7 @@ def records(channel: io.StringIO) -> list[dict[str, Any]]:
 def test_planning_counts_views_as_steps(channel: io.StringIO) -> None:
     report_planning(PlanningProgress(0, 8))
     report_planning(PlanningProgress(2, 8, 31.5))
-    nothing = {"loss": None, "scales": None, "seconds": None, "attempt": 2}
+    nothing = dict.fromkeys(("loss", "scales", "mean_loss", "mean_scales", "seconds")) | {"attempt": 2}
     assert records(channel) == [
         {"stage": "planning", "step": 0, "total": 8, "fraction": 0.0, "eta_s": None, **nothing},
         {"stage": "planning", "step": 2, "total": 8, "fraction": 0.25, "eta_s": 31.5, **nothing},

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.report.document import REPORT_VERSION, Sources, bought, build_report
+from sgsst_core.report.history import history_of, running_mean
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -142,6 +144,28 @@ def test_report_has_the_losses_of_the_steps(
     assert report["loss"]["relative"] == pytest.approx(mean_loss(after) / mean_loss(before))
     assert report["loss"]["relative"] < 1
     assert report["loss"]["views"] == ["view_0", "view_1", "view_0", "view_1"]
+
+
+def test_loss_after_is_the_mean_of_the_last_round_everywhere(
+    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources
+) -> None:
+    """The headline, the text, the end of the chart and the progress state one number."""
+    stylizer, before, _ = finished
+    length = stylizer.job.round_length
+    after = round_evaluation(stylizer.history, length)
+    report = build_report(stylizer, sources, "finished", before, after)
+    last = [record.loss for record in stylizer.history[-length:]]
+    wanted = math.prod(last) ** (1 / length)
+    assert mean_loss(after) == pytest.approx(wanted) == pytest.approx(round_loss(stylizer.history, length))
+    history = history_of(report)
+    assert history.round_length == length
+    relative = wanted / mean_loss(before)
+    assert report["loss"]["relative"] == pytest.approx(relative)
+    assert report["bought"]["relative"] == pytest.approx(relative)
+    assert running_mean(history.relative[0], length)[-1] == pytest.approx(relative)
+    coarse = [StepRecord(1, "coarse", 0, 0.1, 4.0, {1: LossTerms(gram=4.0)}, {}, 0)]
+    steps = [StepRecord(n, "sos", 0, 0.1, loss, {0: LossTerms(gram=loss)}, {}, 0) for n, loss in ((2, 1.0), (3, 4.0))]
+    assert round_loss(coarse + steps, 5) == pytest.approx(2), "of the current phase only"
 
 
 def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:

@@ -3,15 +3,19 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
+from sgsst_core.loss.convergence import smoothed
 from sgsst_core.report.history import BINS, running_mean, thinned
 
 
-def test_running_mean_is_geometric_and_centered() -> None:
+def test_running_mean_is_geometric_and_over_the_last_window() -> None:
     values = [1.0, 10.0, 100.0, 1000.0, 10.0]
-    np.testing.assert_allclose(running_mean(values, 3), [1, 10, 100, 100, 10])
+    np.testing.assert_allclose(running_mean(values, 3), [1, 10**0.5, 10, 100, 100])
     np.testing.assert_allclose(running_mean(values, 1), values)
-    np.testing.assert_allclose(running_mean(values, 99), [1, 10, math.prod(values) ** 0.2, 100, 10])
+    np.testing.assert_allclose(running_mean(values, 99), [math.prod(values[:n]) ** (1 / n) for n in range(1, 6)])
+    for window in (1, 3, 99):
+        assert running_mean(values, window)[-1] == pytest.approx(smoothed(values, window))
     assert np.isfinite(running_mean([0.0, 1.0], 1)).all()
     assert len(running_mean([], 3)) == 0
 
