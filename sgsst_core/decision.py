@@ -1,8 +1,12 @@
-"""One line of a plan."""
+"""Lines of a plan."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+#: Subject of the decision about views that see nothing.
+VIEWS = "views"
 
 
 @dataclass(frozen=True)
@@ -24,3 +28,16 @@ class Decision:
     seconds: float | None = None
     bytes: int | None = None
     error: str = "none"
+
+
+#: Beginning of decisions that need the user's attention.
+_WARNING = "warning: "
+
+
+def warnings_of(decisions: Sequence[Decision]) -> list[str]:
+    """Return decisions that need the user's attention as sentences: warnings, and views that are skipped."""
+    return [
+        f"{each.item}: {each.decision.removeprefix(_WARNING)}: {each.reason}"
+        for each in decisions
+        if each.decision.startswith(_WARNING) or each.item == VIEWS
+    ]

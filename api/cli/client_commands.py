@@ -337,7 +337,9 @@ def _job_text(job: Job) -> str:
 
 def _plan_text(plan: Any) -> str:
     lines = [f"{plan['gaussians']:,} Gaussians, {plan['views']} views, {plan['pixels']:,} pixels"]
+    lines += [f"warning: {text}" for text in plan["warnings"]]
     lines += [f"{item['item']}: {item['decision']}: {item['reason']}" for item in plan["plan"]["decisions"]]
-    if plan["estimated_seconds"]:
-        lines.append(f"predicted: {clock(plan['estimated_seconds'])} for all steps")
+    if plan["total_seconds"]:
+        whole, steps = clock(plan["total_seconds"]), clock(plan["estimated_seconds"])
+        lines.append(f"predicted: {whole} for the whole job, {steps} of them for its steps")
     return "\n".join(lines)

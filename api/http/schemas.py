@@ -326,6 +326,8 @@ class PlanView(BaseModel):
         photos=0,
         workers=1,
         estimated_seconds=12.4,
+        total_seconds=21.9,
+        warnings=["region left: ignored, because it has no Gaussians: half-space=1,0,0,9"],
         memory_bytes=946495488,
         device_memory_bytes=None,
         plan={
@@ -352,6 +354,14 @@ class PlanView(BaseModel):
     photos: int
     workers: int | None = Field(description="Requested workers; null if the service decides when the job starts.")
     estimated_seconds: float | None = Field(description="Estimated seconds of all steps; null if unknown.")
+    total_seconds: float | None = Field(
+        None,
+        description="Estimated seconds of the whole job after it leaves the queue: start, reading, planning, steps, "
+        "measurements and files; null if unknown. A job that stops early takes less.",
+    )
+    warnings: list[str] = Field(
+        default_factory=list, description="Decisions that need attention, such as views that see nothing."
+    )
     memory_bytes: int | None = Field(description="Estimated peak memory; null if unknown.")
     device_memory_bytes: int | None = Field(
         None, description="Estimated peak memory of the GPU; null if no GPU is used."

@@ -80,8 +80,8 @@ export function problemOf(kinds, value) {
   if (!Number.isFinite(value)) return words.refusals.notNumber;
   if (numeric.type === "integer" && !Number.isInteger(value)) return words.refusals.notWhole;
   const { minimum, maximum, exclusiveMinimum, exclusiveMaximum } = numeric;
-  if (minimum !== undefined && value < minimum) return words.refusals.atLeast(minimum);
-  if (maximum !== undefined && value > maximum) return words.refusals.atMost(maximum);
+  if (minimum !== undefined && value < minimum) return words.refusals.noLess(minimum);
+  if (maximum !== undefined && value > maximum) return words.refusals.noMore(maximum);
   if (exclusiveMinimum !== undefined && value <= exclusiveMinimum) return words.refusals.above(exclusiveMinimum);
   if (exclusiveMaximum !== undefined && value >= exclusiveMaximum) return words.refusals.below(exclusiveMaximum);
   return "";
@@ -91,7 +91,7 @@ export function problemOf(kinds, value) {
 export function plainly(message) {
   const bound = /^Input should be (greater|less) than( or equal to)? ([-+.\deE]+)$/.exec(message);
   if (bound) {
-    const way = /** @type {const} */ ({ greater: ["above", "atLeast"], less: ["below", "atMost"] })[/** @type {"greater" | "less"} */ (bound[1])][bound[2] ? 1 : 0];
+    const way = /** @type {const} */ ({ greater: ["above", "noLess"], less: ["below", "noMore"] })[/** @type {"greater" | "less"} */ (bound[1])][bound[2] ? 1 : 0];
     return words.refusals[way](Number(bound[3]));
   }
   if (/^Input should be a (valid|finite) (number|integer)/.test(message)) return words.refusals.notNumber;

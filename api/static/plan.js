@@ -9,8 +9,9 @@ const say = words.plan;
 export function costCard(view) {
   const figure = (/** @type {string} */ name, /** @type {string} */ value, note = "") => h("div", h("dt", name), h("dd", value, note && h("small", note)));
   return h("section.card.cost", { "aria-label": say.title }, h("h2", say.title),
+    view.warnings.length ? h("ul.warnings", { role: "alert" }, view.warnings.map((/** @type {string} */ text) => h("li", text))) : null,
     h("dl.figures",
-      figure(say.seconds, view.estimated_seconds === null ? say.unknown : seconds(view.estimated_seconds)),
+      figure(say.seconds, view.total_seconds === null ? say.unknown : seconds(view.total_seconds), view.total_seconds === null ? "" : say.wholeJob),
       figure(say.memory, view.memory_bytes === null ? say.unknown : size(view.memory_bytes)),
       view.device_memory_bytes ? figure(say.gpuMemory, size(view.device_memory_bytes)) : null,
       figure(say.workers, view.workers === null ? say.byService : String(view.workers)),

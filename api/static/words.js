@@ -101,7 +101,7 @@ export const words = {
   },
   refusals: {
     notNumber: "Must be a number.", notWhole: "Must be a whole number.",
-    atLeast: (/** @type {number} */ n) => `Must be at least ${count(n)}.`, atMost: (/** @type {number} */ n) => `Must be at most ${count(n)}.`,
+    noLess: (/** @type {number} */ n) => `Must be at least ${count(n)}.`, noMore: (/** @type {number} */ n) => `Must be at most ${count(n)}.`,
     above: (/** @type {number} */ n) => `Must be more than ${count(n)}.`, below: (/** @type {number} */ n) => `Must be less than ${count(n)}.`,
     notListed: (/** @type {string[]} */ names, /** @type {boolean} */ numeric) => `Must be ${[...names, ...(numeric ? ["a number"] : [])].join(", ").replace(/, ([^,]*)$/, " or $1")}.`,
     weight: (/** @type {string} */ name) => `The blend of ${name} must be more than 0.`,
@@ -136,7 +136,7 @@ export const words = {
     pause: "Pause", resume: "Resume", title: "Uploading", progress: (/** @type {string} */ name) => `Uploading ${name}`,
   },
   plan: {
-    title: "Estimate", decided: "How it will run", seconds: "Estimated time of the steps", memory: "Memory", gpuMemory: "GPU memory", workers: "Workers", gaussians: "Gaussians", views: "Views",
+    title: "Estimate", decided: "How it will run", seconds: "Estimated time", wholeJob: "for the whole job, once it starts", memory: "Memory", gpuMemory: "GPU memory", workers: "Workers", gaussians: "Gaussians", views: "Views",
     unknown: "unknown", byService: "automatic", dropped: (/** @type {number} */ n) => `${count(n)} left out`, pixels: (/** @type {number} */ n) => `${hundredths.format(n / 1e6)} megapixels`,
     item: "What", decision: "Decision", reason: "Why", none: "Nothing was left out.",
   },

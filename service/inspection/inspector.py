@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 #: Task of the inspecting process: validate a job's inputs, or plan the job as well.
 Work = Literal["validate", "plan"]
 #: Version of the validation; raising it invalidates stored findings.
-_VERSION = "4"
+_VERSION = "5"
 #: Maximum number of requests that wait for the inspecting process; further ones are rejected with `BusyError`.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import math
 import os
 import resource
 import select
@@ -39,6 +40,7 @@ from service.parameters import JobParameters
 from service.request import scene_request, stylize_request
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders
+from sgsst_core.decision import warnings_of
 from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.cache_folder import cache_folder
@@ -48,6 +50,7 @@ from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.loss.scale_weights import check_scales
 from sgsst_core.paintings import STARRY_NIGHT
+from sgsst_core.planning.plan import Prediction
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import PlanningProgress, ShowPlanning
 from sgsst_core.quality.compression import measure_compression
@@ -64,6 +67,8 @@ from worker.inputs import check_something_in_view, load_styles, read_regions
 from worker.processes import die_with_parent
 from worker.request import check_choice, check_steps
 
+#: Time at which all modules were imported.
+_ready_at = time.time()
 #: Maximum size of a response in bytes.
 MAX_ANSWER = 64 << 20
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
@@ -164,6 +169,7 @@ def _refinement_note(settings: Settings) -> str:
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """Return the findings of `validate` and the plan of `sgsst plan`; `show` receives the progress."""
+    started = time.perf_counter()
     findings, inputs = _read_inputs(staged, parameters, limits)
     request = stylize_request(staged, parameters)
     weights = load_network_weights(request.backbone)
@@ -182,8 +188,15 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
         regions=regions and regions.refined(refinement),
         refinement=refinement,
     )
-    seconds = memory = on_device = None
+    seconds = total = memory = on_device = None
     if job_plan.prediction:
+        # The job starts a process with the same modules as this one, then reads and plans as was done here.
+        total = (
+            _seconds_to_start()
+            + time.perf_counter()
+            - started
+            + _seconds_from_first_step(job_plan.prediction, settings)
+        )
         memory, on_device = job_plan.prediction.peak_bytes, job_plan.prediction.device_bytes
         coarse = job_plan.prediction.seconds_coarse or job_plan.prediction.seconds
         seconds = job_plan.prediction.seconds * request.settings.steps_sos + coarse * job_plan.steps_coarse
@@ -191,9 +204,24 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
         **findings,
         "plan": plan_json(job_plan),
         "estimated_seconds": seconds,
+        "total_seconds": total,
+        "warnings": warnings_of(job_plan.decisions),
         "memory_bytes": memory,
         "device_memory_bytes": on_device,
     }
+
+
+def _seconds_from_first_step(expected: Prediction, settings: Settings) -> float:
+    """Return the predicted seconds of steps, measurements and outputs."""
+    steps = expected.job - expected.measuring
+    return min(steps, settings.max_seconds or math.inf) + expected.measuring + expected.ending
+
+
+@functools.cache
+def _seconds_to_start() -> float:
+    """Return the seconds from the start of this process to its first request, nearly all of them for imports."""
+    created: float = psutil.Process().create_time()
+    return _ready_at - created
 
 
 def compress(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]:
@@ -467,6 +495,7 @@ def _is_response(answer: Any) -> bool:
 
 def main() -> None:
     """Process requests until stdin is closed."""
+    _seconds_to_start()  # cached before any fork
     torch.set_num_threads(1)  # a child forked from a process with threads could wait for them forever
     die_with_parent()
     for line in sys.stdin.buffer:

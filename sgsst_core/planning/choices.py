@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.budget import memory_for
-from sgsst_core.decision import Decision
+from sgsst_core.decision import VIEWS, Decision
 from sgsst_core.loss.convergence import LEAST_FALL, window_length
 from sgsst_core.loss.nearest import MOST_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
@@ -108,7 +108,7 @@ def about_views(probe: Probe) -> list[Decision]:
     """Return the line about views that show nothing."""
     total = len(probe.sizes)
     blind = total - len(probe.survey.covered)
-    return [Decision("views", f"{blind} of {total} are skipped", "they see no Gaussian")] if blind else []
+    return [Decision(VIEWS, f"{blind} of {total} are skipped", "they see no Gaussian")] if blind else []
 
 
 def position_weights(survey: Survey, settings: Settings) -> tuple[bool, list[Decision]]:

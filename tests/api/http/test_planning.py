@@ -65,6 +65,29 @@ def test_events_report_views_and_same_plan(service: Service, files: dict[str, by
         assert client.get("/v1/jobs").json()["jobs"] == []
 
 
+def test_estimate_covers_the_whole_job(service: Service, files: dict[str, bytes]) -> None:
+    with service.client() as client:
+        plan = client.post("/v1/jobs", **request(files)).json()
+        assert plan["warnings"] == []
+        expected = plan["plan"]["prediction"]
+        assert plan["total_seconds"] > expected["job"] + expected["ending"] > plan["estimated_seconds"] > 0
+        steps = expected["job"] - expected["measuring"]
+        limited = client.post("/v1/jobs", **request(files, max_seconds=steps / 1000)).json()
+        assert limited["total_seconds"] > limited["plan"]["prediction"]["ending"]
+
+
+def test_views_and_regions_without_gaussians_are_warned_about(service: Service, files: dict[str, bytes]) -> None:
+    aside = json.loads(files["cameras"])
+    aside[0]["position"] = [0, 0, 99]
+    regions = [{"name": "empty", "select": "half-space=0,0,-1,-99"}, {"name": "all", "select": "half-space=0,0,1,-99"}]
+    with service.client() as client:
+        sent = request({**files, "cameras": json.dumps(aside).encode()}, regions=regions)
+        first, second = client.post("/v1/jobs", **sent).json()["warnings"]
+        assert first == "views: 1 of 3 are skipped: they see no Gaussian"
+        assert "empty" in second
+        assert "ignored, because it has no Gaussians" in second
+
+
 def test_unusable_files_are_rejected_before_first_event(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         headers = {"Accept": "text/event-stream"}
@@ -112,6 +135,7 @@ def test_plan_lists_camera_and_photo_decisions(service: Service, files: dict[str
         lines = [f"{line['item']}: {line['decision']}" for line in answer.json()["plan"]["decisions"]]
         assert "lenses: the photos are undistorted" in lines
         assert "photos: warning: 1 of 3 views are left out" in lines
+        assert any(text.startswith("photos: 1 of 3 views are left out: ") for text in answer.json()["warnings"])
         assert answer.json()["views"] == 2
 
 
