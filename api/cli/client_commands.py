@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -16,11 +17,12 @@ from rich.progress import BarColumn, TextColumn
 from rich.table import Table
 
 from api.cli.arguments import JobInputs, JsonOption
-from api.cli.console import FAILURE, error_console, out_console
+from api.cli.console import INTERRUPTED, JOB_FAILED, error_console, out_console
 from api.cli.options import with_arguments, with_options
 from api.cli.progress_bars import transfer_bar
 from api.client.inputs import different_names
 from service.parameters import JobParameters
+from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import (
     EXTRA_FORMATS,
     RESULT_SUFFIXES,
@@ -123,13 +125,13 @@ def status(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None,
 
 
 def watch(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Show the progress of a job until it ends; exit with 1 if it does not succeed."""
+    """Show the progress of a job until it ends; exit with 5 if it does not succeed."""
     with _client(url, key) as client:
         ended = _follow(client, job, as_json)
     if not as_json:
         out_console.print(_job_text(ended))
     if ended.status != "succeeded":
-        raise typer.Exit(FAILURE)
+        raise typer.Exit(JOB_FAILED)
 
 
 def download(
@@ -142,25 +144,50 @@ def download(
         ExtraName | None,
         typer.Option("--format", help="Compressed format of stylized.ply. [default: from the ending of --out]"),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace existing files, which may belong to another job.")
+    ] = False,
     as_json: JsonOption = False,
     url: UrlOption = None,
     key: KeyOption = None,
 ) -> None:
     """Download a job's result or other files; an interrupted download resumes."""
     with _client(url, key) as client:
-        names = [entry["name"] for entry in client.artifacts(job)] if name == "all" else [name]
+        digests = {entry["name"]: entry["sha256"] for entry in client.artifacts(job)}
+        names = list(digests) if name == "all" else [name]
         written = []
         for each in names:
             target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
             target.parent.mkdir(parents=True, exist_ok=True)
+            chosen = (format or _format_of(target)) if each == "stylized.ply" else None
+            if format and out is None and each == "stylized.ply":
+                target = Path(result_name(each, by_name(format)))
+            stored = result_name(each, by_name(chosen)) if chosen else each
+            if not (overwrite or (name == "all" and out is None)):  # that folder is named after the job
+                _check_target(target, digests.get(stored))
             with transfer_bar(error_console, each) as progress:
-                chosen = (format or _format_of(target)) if each == "stylized.ply" else None
-                if format and out is None and each == "stylized.ply":
-                    target = Path(result_name(each, by_name(format)))
                 written.append(str(client.download(job, target, each, progress, chosen)))
             if not as_json:
                 _print_compression_loss(client, job, chosen)
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
+
+
+def _check_target(target: Path, sha256: str | None) -> None:
+    """Raise an OutputError if a file exists whose content is not that of the artifact to download.
+
+    Args:
+        sha256: SHA-256 of the artifact; None if it does not exist yet.
+    """
+    if not target.exists() or (target.is_file() and sha256 == _sha256(target)):
+        return
+    raise OutputError(
+        f"{target}: exists, and is not this job's file. Write to another file with --out, or pass --overwrite."
+    )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def cancel(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
@@ -194,11 +221,16 @@ def jobs(
     if as_json:
         out_console.print(json.dumps([job.data for job in page]))
         return
-    table = Table("id", "name", "status", "progress", "created")
+    console = Console(highlight=False, markup=False)
+    widths = {"id": 35, "name": 0, "status": 13, "created": 11}
+    widths["name"] = max(console.width - sum(widths.values()) - 2 * (len(widths) - 1), len("name"))
+    table = Table(box=None, pad_edge=False)
+    for heading, width in widths.items():
+        table.add_column(heading, no_wrap=True, width=width)
     for job in page:
         created = datetime.fromisoformat(job.data["created_at"]).astimezone()
-        table.add_row(job.id, job.data["name"], job.status, _progress_text(job), f"{created:%Y-%m-%d %H:%M}")
-    Console(width=None if out_console.is_terminal else 140, highlight=False, markup=False).print(table)
+        table.add_row(job.id, job.data["name"], _short_status(job), f"{created:%m-%d %H:%M}")
+    console.print(table)
 
 
 COMMANDS = (submit, status, watch, download, cancel, retry, delete, jobs)
@@ -251,6 +283,17 @@ def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
 
 
 def _follow(client: Client, job_id: str, as_json: bool) -> Job:
+    """Show events until the job has ended; Ctrl-C ends the command, not the job."""
+    try:
+        return _show_events(client, job_id, as_json)
+    except KeyboardInterrupt:
+        error_console.print(
+            f"The job continues on the service.\nProgress: sgsst watch {job_id}    Cancel: sgsst cancel {job_id}"
+        )
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def _show_events(client: Client, job_id: str, as_json: bool) -> Job:
     """Show events until the job has ended: as a live bar on a terminal, as lines elsewhere, or as JSON lines."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
     live = error_console.is_terminal and not as_json
@@ -274,7 +317,7 @@ def _follow(client: Client, job_id: str, as_json: bool) -> Job:
 def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
     if job.status != "succeeded":
         error_console.print(_job_text(job))
-        raise typer.Exit(FAILURE)
+        raise typer.Exit(JOB_FAILED)
     with transfer_bar(error_console, out.name) as progress:
         client.download(job.id, out, progress=progress, format=_format_of(out))
     if not as_json:
@@ -320,6 +363,15 @@ def _progress_text(job: Job) -> str:
     if job.status == "queued" and job.data.get("queue_position"):
         return f"position {job.data['queue_position']} in the queue"
     return _step_text(job.progress) if job.progress and not job.finished else ""
+
+
+def _short_status(job: Job) -> str:
+    """Return the status of a job with its position in the queue or its progress, in at most 13 characters."""
+    if job.status == "queued" and job.data.get("queue_position"):
+        return f"queued, #{job.data['queue_position']}"
+    if job.progress and not job.finished and job.progress["total"]:
+        return f"{job.status} {job.progress['fraction']:.0%}"
+    return job.status
 
 
 def _job_text(job: Job) -> str:

@@ -7,8 +7,13 @@ from contextlib import contextmanager
 
 from rich.console import Console
 
-#: Exit codes for an unusable input or option, and for any other failure.
+#: Exit codes: an unusable input or option, and any other failure.
 BAD_INPUT, FAILURE = 2, 1
+#: Exit codes of client commands: no such job or file, a job whose status does not allow the request, and a job that
+#: did not succeed.
+NOT_FOUND, CONFLICT, JOB_FAILED = 3, 4, 5
+#: Exit code after Ctrl-C, as in shells.
+INTERRUPTED = 130
 
 out_console = Console(highlight=False, markup=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import typer
 
 from api.cli import client_commands, operator_commands
 from api.cli.bench_commands import bench_app
-from api.cli.console import BAD_INPUT, FAILURE, error_console, out_console
+from api.cli.console import BAD_INPUT, CONFLICT, FAILURE, INTERRUPTED, NOT_FOUND, error_console, out_console
 from api.cli.doctor_command import doctor
 from api.cli.extras import missing_extra
 from api.cli.scene_commands import check, convert, plan, render
@@ -20,10 +21,13 @@ from api.cli.weights_commands import weights_app
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError
 from sgsst_core.options import renamed_hint
 
+#: Base of errors in the arguments, which typer does not export.
+_UsageError: Any = typer.BadParameter.__base__
+
 app = typer.Typer(
     help="Style transfer for 3D Gaussian Splatting scenes (SGSST).",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -60,21 +64,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         _check_names(arguments)
-        app(args=arguments, prog_name="sgsst", obj=arguments)
+        code = app(args=arguments, prog_name="sgsst", obj=arguments, standalone_mode=False)
+        return code if isinstance(code, int) else 0
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except _UsageError as error:
+        if "--json" in arguments:
+            _print_json("usage", error.format_message())
+        else:
+            error.show()
+        return BAD_INPUT
     except SgsstError as error:
-        error_console.print(f"error: {error}")
-        return BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE
+        if "--json" in arguments:
+            _print_json(error.code, str(error), getattr(error, "problem", None))
+        else:
+            error_console.print(f"error: {error}")
+        return _exit_code(error)
     except ModuleNotFoundError as error:
         problem = missing_extra(error)
         if problem is None:
             raise
         error_console.print(f"error: {problem}")
         return BAD_INPUT
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         error_console.print("Aborted.")
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:  # for example `sgsst weights list | head`
         return FAILURE
     except (MemoryError, RuntimeError) as error:
@@ -82,7 +96,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         error_console.print("error: out of memory. Use a smaller --resolution, fewer --views or a --memory-limit.")
         return FAILURE
-    return 0
+
+
+def _exit_code(error: SgsstError) -> int:
+    """Return the exit code for an expected error; `status` is that of a service's response."""
+    codes = {404: NOT_FOUND, 409: CONFLICT}
+    return codes.get(getattr(error, "status", 0), BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE)
+
+
+def _print_json(code: str, detail: str, problem: Mapping[str, object] | None = None) -> None:
+    """Print an error as a line of JSON on stderr, with the fields of a problem document."""
+    print(json.dumps({"code": code, "detail": detail, **(problem or {})}), file=sys.stderr)
 
 
 def _check_names(arguments: Sequence[str]) -> None:

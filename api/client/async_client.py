@@ -135,6 +135,7 @@ class AsyncClient:
             path = f"/v1/jobs/{job_id}/events"
             try:
                 async with aconnect_sse(self._transport.http, "GET", path, headers=headers, timeout=timeout) as source:
+                    self._transport.reached = True
                     if source.response.status_code != httpx.codes.OK:  # 204: no events will follow
                         await source.response.aread()
                         checked(source.response)
@@ -147,7 +148,7 @@ class AsyncClient:
             except httpx.TransportError as error:
                 # stamina cannot do this: each event resets the count of failures
                 failures += 1
-                if failures >= TRIES:
+                if failures >= TRIES or self._transport.gives_up(error):
                     raise unreachable(self.url, error) from None
                 await anyio.sleep(FIRST_WAIT * 2.0 ** (failures - 1))
                 continue

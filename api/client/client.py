@@ -8,6 +8,7 @@ with Client("http://127.0.0.1:8000") as client:
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
 from contextlib import ExitStack
@@ -50,7 +51,9 @@ def _iterating(
             while (item := client._run(following)) is not _END:
                 yield item
         finally:
-            client._run(items.aclose)
+            # An interrupt can leave the iteration running; it is canceled with the portal.
+            with contextlib.suppress(RuntimeError):
+                client._run(items.aclose)
 
     return cast("Callable[Concatenate[Client, P], Iterator[T]]", iterating)
 

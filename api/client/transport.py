@@ -18,6 +18,9 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
 TRIES = 6
 
+#: Methods of requests that change nothing.
+_READS = ("GET", "HEAD")
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -32,6 +35,7 @@ class Transport:
     Attributes:
         http: HTTP client for requests without retries.
         url: Address of the service.
+        reached: Whether the service has responded. If it has, a refused connection may mean that it restarts.
     """
 
     def __init__(self, url: str | None, key: str | None) -> None:
@@ -42,6 +46,7 @@ class Transport:
             timeout=httpx.Timeout(30.0, read=900.0, write=120.0),
         )
         self.url = str(self.http.base_url)
+        self.reached = False
         self._retrying = stamina.AsyncRetryingCaller(
             attempts=TRIES,
             timeout=None,
@@ -49,7 +54,7 @@ class Transport:
             wait_max=2.0 ** (TRIES - 2),
             wait_jitter=0.0,
             wait_exp_base=2,
-        ).on(is_temporary)
+        )
 
     async def call(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send a request, and return its complete response.
@@ -60,9 +65,11 @@ class Transport:
         """
 
         async def once() -> httpx.Response:
-            return checked(await self.http.request(method, path, **options))
+            response = await self.http.request(method, path, **options)
+            self.reached = True
+            return checked(response)
 
-        return await self._retry(once)
+        return await self._retry(once, reading=method in _READS)
 
     async def listen(
         self, method: str, path: str, take: Callable[[ServerSentEvent], None], **options: Any
@@ -78,6 +85,7 @@ class Transport:
 
         async def once() -> httpx.Response | None:
             async with aconnect_sse(self.http, method, path, **options) as source:
+                self.reached = True
                 if not source.response.headers.get("content-type", "").startswith("text/event-stream"):
                     await source.response.aread()
                     return checked(source.response)
@@ -97,6 +105,7 @@ class Transport:
         async def once() -> None:
             headers = await in_thread(download.headers)
             async with self.http.stream("GET", download.path, headers=headers) as response:
+                self.reached = True
                 # Status 416 means that all bytes were received before.
                 if response.is_error and response.status_code != httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
                     await response.aread()
@@ -107,11 +116,18 @@ class Transport:
                         download.report()
             await in_thread(download.finish)
 
-        await self._retry(once)
+        await self._retry(once, reading=True)
 
-    async def _retry(self, once: Callable[[], Awaitable[T]]) -> T:
+    def gives_up(self, error: Exception) -> bool:
+        """Return whether an error of a read says that there is no service, rather than that it restarts."""
+        return isinstance(error, httpx.ConnectError) and not self.reached
+
+    async def _retry(self, once: Callable[[], Awaitable[T]], *, reading: bool = False) -> T:
+        def may_pass(error: Exception) -> bool:
+            return is_temporary(error) and not (reading and self.gives_up(error))
+
         try:
-            return await self._retrying(once)
+            return await self._retrying(may_pass, once)
         except httpx.TransportError as error:
             raise unreachable(self.url, error) from None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import logging
 from http import HTTPStatus
@@ -14,8 +15,10 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
 from service.errors import ServiceError
+from service.parameters import JobParameters
 from sgsst_core.errors import InvalidInputError
 from sgsst_core.options import renamed_hint
+from worker.region_requests import RegionOptions
 
 MEDIA_TYPE = "application/problem+json"
 #: Names of statuses that HTTPStatus lacks; 460 is defined by the tus protocol.
@@ -125,12 +128,20 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     errors = [
         {
             "at": (at := ".".join(str(part) for part in entry["loc"])[:_SHOWN]),
-            "message": renamed_hint(at) or entry["msg"],
+            "message": renamed_hint(at) or (_unknown(at) if entry["type"] == "extra_forbidden" else entry["msg"]),
         }
         for entry in error.errors()[:20]
     ]
     first = errors[0] if errors else {"at": "", "message": "invalid"}
     return problem(422, "invalid-request", f"{first['at']}: {first['message']}", errors=errors)
+
+
+def _unknown(at: str) -> str:
+    """Return the message for an unknown parameter, with the most similar known one."""
+    name = at.rpartition(".")[2]
+    known = {*JobParameters.model_fields, *RegionOptions.model_fields}
+    similar = difflib.get_close_matches(name, known, 1)
+    return "is not a parameter." + (f" Did you mean {similar[0]!r}?" if similar else "")
 
 
 async def _http_error(request: Request, error: Exception) -> JSONResponse:

@@ -1,0 +1,192 @@
+"""Tests of the client commands against a real service: messages, exit codes, and files."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from api.cli.main import main
+from service.files.artifacts import Artifacts
+from service.settings import ServiceSettings
+from service.store import open_store
+from tests.api.service import ROOT, Service
+from tests.small_scenes import wall, write_files
+
+MISSING = "job_1a1fe701a104f943e9d4d8cce5b818c"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Return the arguments of `submit` for a small scene."""
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    return [str(ply), "--style", str(style), "--cameras", str(cameras)]
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """Yield an API process without a dispatcher: its jobs stay in the queue."""
+    with Service(tmp_path_factory.mktemp("commands") / "data", alone=True) as running:
+        yield running
+
+
+@pytest.fixture(autouse=True)
+def url(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SGSST_URL", service.url)
+
+
+def submit(files: list[str], capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    """Submit a job, and return its id."""
+    assert main(["submit", *files, *options]) == 0
+    return capsys.readouterr().out.strip()
+
+
+def finish(service: Service, job_id: str, content: bytes, folder: Path) -> None:
+    """Finish a queued job in place of a dispatcher, with this content as its result."""
+    settings = ServiceSettings(data=service.data)
+    store = open_store(settings)
+    path = folder / "result.ply"
+    path.write_bytes(content)
+    try:
+        while (lease := store.leases.take("test")) is not None:
+            result = Artifacts(settings.artifacts_url).put(lease.job_id, lease.epoch, "stylized.ply", path)
+            store.leases.start(lease)
+            store.leases.succeed(lease, [result], {"steps": 1, "loss_before": 2.0, "loss_after": 1.0})
+            if lease.job_id == job_id:
+                return
+    finally:
+        store.close()
+
+
+def test_exit_codes_and_errors_as_json(files: list[str], capsys: pytest.CaptureFixture[str], service: Service) -> None:
+    job_id = submit(files, capsys)
+    for command, code, kind in (
+        (["status", MISSING], 3, "not-found"),
+        (["retry", job_id], 4, "conflict"),
+        (["status"], 2, "usage"),
+        (["jobs", "--limt", "3"], 2, "usage"),
+        (["submit", files[0], "--style", "missing.png", "--orbit", "3"], 2, ""),
+        (["submit", *files, "--parameters", '{"resolutoin": 3}'], 2, "invalid-request"),
+    ):
+        assert main([*command, "--json"]) == code, command
+        out, error = capsys.readouterr()
+        assert out == ""
+        found = json.loads(error)
+        assert found["code"].startswith(kind)
+        assert found["detail"]
+    assert "Did you mean 'resolution'?" in found["detail"]
+    assert main(["cancel", job_id]) == 0
+    capsys.readouterr()
+    assert main(["watch", job_id]) == 5, "the job did not succeed"
+    capsys.readouterr()
+    assert main(["status", MISSING]) == 3
+    assert capsys.readouterr().err == f"error: There is no job {MISSING}.\n"
+
+
+def test_service_that_is_not_there_is_reported_at_once(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reads are not retried, so nothing is waited for; the port of a closed socket refuses connections."""
+    waits: list[float] = []
+    monkeypatch.setattr("api.cli.client_commands._print_retry", lambda details: waits.append(details.wait_for))
+    for command in (["status", MISSING], ["jobs"], ["watch", MISSING], ["download", MISSING]):
+        assert main([*command, "--url", "http://127.0.0.1:9"]) == 1
+        assert "cannot be reached" in capsys.readouterr().err
+    assert waits == []
+
+
+def test_interrupted_watch_says_that_the_job_continues(
+    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+) -> None:
+    job_id = submit(files, capsys)
+    commands = (["watch", job_id], ["submit", *files, "--out", str(tmp_path / "out.ply")])
+    for command in commands:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "api.cli", *command],
+            cwd=ROOT,
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stderr is not None
+        shown = ""
+        while "queued" not in shown:
+            line = process.stderr.readline()
+            assert line, shown
+            shown += line
+        process.send_signal(signal.SIGINT)
+        rest = process.communicate(timeout=60)[1]
+        assert process.returncode == 130, shown + rest
+        assert "The job continues on the service." in rest
+        assert "Cancel: sgsst cancel job_" in rest
+    assert httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["status"] == "queued"
+
+
+def test_download_replaces_no_file_of_another_job(
+    files: list[str],
+    capsys: pytest.CaptureFixture[str],
+    service: Service,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ids = []
+    for content in (b"first", b"second"):
+        ids.append(submit(files, capsys))
+        finish(service, ids[-1], content, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    result = tmp_path / "stylized.ply"
+    assert main(["download", ids[0]]) == 0
+    assert main(["download", ids[0]]) == 0, "the same file again"
+    capsys.readouterr()
+    assert main(["download", ids[1]]) == 2
+    assert "exists, and is not this job's file" in capsys.readouterr().err
+    assert result.read_bytes() == b"first"
+    assert main(["download", ids[1], "--out", "other.ply"]) == 0
+    assert main(["download", ids[1], "--overwrite"]) == 0
+    assert result.read_bytes() == (tmp_path / "other.ply").read_bytes() == b"second"
+    assert main(["download", ids[0], "all"]) == main(["download", ids[0], "all"]) == 0
+
+
+def test_list_of_jobs_fits_80_columns(
+    files: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    job_id = submit(files, capsys, "--name", "a name that is longer than its column, " * 3)
+    assert main(["jobs", "--limit", "3"]) == 0
+    heading, *rows = capsys.readouterr().out.splitlines()
+    assert all(len(line) <= 80 for line in (heading, *rows))
+    assert rows[0].startswith(job_id)
+    assert "queued, #" in rows[0]
+    assert len(rows) <= 3
+
+
+def test_short_help_and_completion(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ([], ["submit"], ["keys"], ["keys", "create"]):
+        assert main([*command, "-h"]) == main([*command, "--help"]) == 0
+    assert "--install-completion" in (capsys.readouterr().out)
+    complete = {"_SGSST_COMPLETE": "complete_bash", "COMP_WORDS": "sgsst downl", "COMP_CWORD": "1"}
+    environment = os.environ | complete | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", "import sys; from api.cli.main import main; sys.exit(main())"]
+    found = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert found.stdout.split() == ["download"], found.stderr
+
+
+def test_service_that_restarts_is_waited_for(files: list[str], tmp_path: Path) -> None:
+    """A refused connection ends a command only if the service has not responded before."""
+    from api.client import Client
+
+    service = Service(tmp_path / "data", alone=True)
+    with service, Client(service.url) as client:
+        assert list(client.jobs()) == []
+        service.stop()
+        restarted = Service(tmp_path / "data", alone=True, SGSST_PORT=service.environment["SGSST_PORT"])
+        restarted.start()
+        assert list(client.jobs()) == []
+        restarted.stop()
