@@ -5,7 +5,9 @@ Examples of bodies are defined with their models (`api.http.schemas`, `api.http.
 
 from __future__ import annotations
 
+import copy
 import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -105,18 +107,19 @@ def problems(*errors: type[ServiceError] | ServiceError, key: bool = True) -> Re
         answer = from_service(example)
         body = json.loads(bytes(answer.body))
         response = responses.setdefault(example.status, _no_problem_yet(example.status, body["title"]))
-        content = response["content"][MEDIA_TYPE]
-        content["schema"]["allOf"][1]["properties"]["code"]["enum"].append(example.code)
-        content["examples"][example.code] = {"value": body}
+        response["content"][MEDIA_TYPE]["examples"][example.code] = {"value": body}
         names = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
         response.setdefault("headers", {}).update(headers(*names))
     return responses
 
 
 def _no_problem_yet(status: int, title: str) -> dict[str, Any]:
-    known = {"properties": {"status": {"const": status}, "code": {"enum": []}}}
-    schema = {"allOf": [{"$ref": "#/components/schemas/Problem"}, known]}
+    schema = {"$ref": f"#/components/schemas/{_problem_name(status)}"}  # see `complete`
     return {"description": f"{title}: see `code`.", "content": {MEDIA_TYPE: {"schema": schema, "examples": {}}}}
+
+
+def _problem_name(status: int) -> str:
+    return f"Problem{status}"
 
 
 def invalid(at: str, message: str) -> ServiceError:
@@ -133,6 +136,8 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
     """Complete FastAPI's OpenAPI document in place.
 
     FastAPI omits models that no route takes as an argument, drops nulls from examples, and has its own error schemas.
+    Generators of clients support neither schemas that narrow another one nor constants in headers, and use the first
+    media type of a response.
     """
     schemas = document["components"]["schemas"]
     for model in models:
@@ -145,12 +150,36 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
                 # The header is required. It has a default only because tus requires status 412, not 422, without it.
                 if parameter["name"] == "Tus-Resumable":
                     parameter["required"] = True
+                    version = parameter["schema"].pop("const")
                     parameter["schema"].pop("default", None)
+                    parameter["schema"]["pattern"] = f"^{re.escape(version)}$"
             answers = operation["responses"]
             if "application/json" in answers.get("422", {}).get("content", {}):
                 del answers["422"]  # FastAPI's own error schema, on operations whose parameters cannot be invalid
             for answer in answers.values():
+                if "application/json" in answer.get("content", {}):
+                    answer["content"] = {"application/json": None, **answer["content"]}
                 if method == "head":
                     answer.pop("content", None)
+    _add_problem_schemas(document)
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
+
+
+def _add_problem_schemas(document: dict[str, Any]) -> None:
+    """Add a schema for the problems of each status, with all codes that any operation documents for it."""
+    schemas = document["components"]["schemas"]
+    examples: dict[int, dict[str, Any]] = {}
+    for path in document["paths"].values():
+        for operation in path.values():
+            for status, answer in operation["responses"].items():
+                problem = answer.get("content", {}).get(MEDIA_TYPE)
+                if problem:
+                    found = {code: example["value"] for code, example in problem["examples"].items()}
+                    examples.setdefault(int(status), {}).update(found)
+    for status, by_code in sorted(examples.items()):
+        properties = copy.deepcopy(schemas["Problem"]["properties"])
+        properties["status"] |= {"const": status}
+        properties["code"] |= {"enum": sorted(by_code)}
+        title = {"title": _problem_name(status), "examples": [next(iter(by_code.values()))]}
+        schemas[_problem_name(status)] = {**schemas["Problem"], "properties": properties, **title}
