@@ -49,7 +49,7 @@ class JobBar:
     def show(self, progress: StepProgress) -> None:
         """Show a step."""
         stage = _STAGES[progress.stage]
-        loss, left = f"loss {progress.loss:.3g}", f"{clock(progress.seconds_left)} left"
+        loss, left = f"loss {progress.mean_loss or progress.loss:.3g}", f"{clock(progress.seconds_left)} left"
         self._show(stage, progress.step, progress.total, f"{loss} {left}")
         self._print_now_and_then(f"{stage}: step {progress.step} of {progress.total}", loss, left)
 
