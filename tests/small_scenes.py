@@ -13,7 +13,7 @@ from torch import Tensor
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 
 WIDTH, HEIGHT = 64, 48
 
@@ -69,7 +69,7 @@ def blind_camera() -> Camera:
 
 def style() -> Tensor:
     """Return a style image [96, 80, 3] float32."""
-    return picture(96, 80, seed=1, dtype=torch.float32)
+    return synthetic_image(96, 80, seed=1, dtype=torch.float32)
 
 
 def write_files(folder: Path, scene: Scene | None = None, views: list[Camera] | None = None) -> tuple[Path, Path, Path]:

@@ -18,7 +18,7 @@ LARGEST = 500_000
 
 
 def outputs(notebook: Any) -> list[str]:
-    """Return the texts of all outputs, and the types of images; the progress bar and pictures' bytes are left out."""
+    """Return the texts of all outputs, and the types of images; omit the progress bar and the bytes of images."""
     found = []
     for cell in notebook.cells:
         for each in cell.get("outputs", []):

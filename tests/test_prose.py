@@ -89,5 +89,5 @@ def test_docstrings_start_with_a_noun_or_a_verb(package: str) -> None:
         ("Offset of a row.\n\nReturns:\n    That row.\n\nArgs:\n    whatever: Offset.", []),
     ],
 )
-def test_bad_openers_are_found(docstring: str, bad: list[str]) -> None:
+def test_bad_openers_are_detected(docstring: str, bad: list[str]) -> None:
     assert [text for text in prose(docstring) if OPENS_BADLY.match(text)] == bad

@@ -130,7 +130,7 @@ def test_doctor_describes_the_gpu(counts: Counts) -> None:
     assert "bfloat16 convolutions are " in text
 
 
-def test_doctor_says_why_a_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_explains_why_a_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "exists", lambda path: str(path) == "/dev/nvidia0")
     found = doctor._gpu()
     assert found.state == "warning"

@@ -17,7 +17,7 @@ from sgsst_core.scene.rendering import CLASSIC, Rendering
 from tests.ptx.driver import PtxDriver, compiled_kernels
 from tests.ptx.machine import Kernel
 from tests.ptx.memory import FaultError
-from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras
 
 
@@ -28,7 +28,7 @@ def test_images_and_gradients_agree_with_reference(capability: int, rendering: R
     scene, camera = replace(ball(150), rendering=rendering), cameras(1, 45, 37)[0]
     reference = make_rasterizer("reference", scene)
     colors = torch.rand((len(scene), 3), generator=torch.Generator().manual_seed(0))
-    image_gradient = picture(37, 45, dtype=torch.float32) - 0.5
+    image_gradient = synthetic_image(37, 45, dtype=torch.float32) - 0.5
     image, gradient = (
         reference.render(colors.double(), camera),
         reference.color_gradient(image_gradient.double(), camera),
@@ -41,7 +41,7 @@ def test_images_and_gradients_agree_with_reference(capability: int, rendering: R
 
 
 def test_statistics_of_a_large_image_agree_with_float64() -> None:
-    image = 255 * picture(590, 590, dtype=torch.float32)
+    image = 255 * synthetic_image(590, 590, dtype=torch.float32)
     exact = layer_statistics_reference(image)
     with compiled_kernels(80):
         statistics = fused_statistics(image)
@@ -58,7 +58,7 @@ def sparse(shape: tuple[int, ...], strides: tuple[int, ...], dtype: torch.dtype)
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_offsets_beyond_32_bits_are_correct(dtype: torch.dtype) -> None:
-    """The last row begins after 2.5e9 values."""
+    """The last row starts after 2.5e9 values."""
     generator = torch.Generator().manual_seed(0)
     small = (2 + torch.randn((6, 9, 16), generator=generator)).to(dtype)
     features, gradient = (sparse((6, 9, 16), (500_000_000, 16, 1), dtype) for _ in range(2))

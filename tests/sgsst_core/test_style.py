@@ -19,7 +19,7 @@ from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style, image_of, mixed_moments, normalized
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import cameras, wall
 
 
@@ -57,7 +57,7 @@ def test_equal_images_count_as_one_image():
 
 
 def test_single_image_has_its_own_targets(tiny_weights):
-    loss, style = SosLoss(FeatureNetwork(tiny_weights), coarsest=40), picture(90, 70)
+    loss, style = SosLoss(FeatureNetwork(tiny_weights), coarsest=40), synthetic_image(90, 70)
     alone = loss.targets.of_style(Style.of(style), (100, 80))
     weighted = loss.targets.of_style(Style.weighted([style], [0.3]), (100, 80))
     for scale, (target,) in alone.items():
@@ -67,7 +67,7 @@ def test_single_image_has_its_own_targets(tiny_weights):
 
 
 def test_targets_use_each_image_at_its_own_size(tiny_weights):
-    pictures, weights = [picture(300, 90, seed=1), picture(40, 64, seed=2)], [3.0, 1.0]
+    pictures, weights = [synthetic_image(300, 90, seed=1), synthetic_image(40, 64, seed=2)], [3.0, 1.0]
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64), coarsest=40)
     mixed = loss.targets.of_style(Style.weighted(pictures, weights), (64, 80))
     single = [loss.targets.of_style(Style.of(each), (64, 80)) for each in pictures]
@@ -80,7 +80,7 @@ def test_targets_use_each_image_at_its_own_size(tiny_weights):
 
 def test_tiny_image_is_ignored_in_layers_without_cells(tiny_weights):
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64))
-    large, tiny = picture(64, 64), picture(7, 7, seed=2)
+    large, tiny = synthetic_image(64, 64), synthetic_image(7, 7, seed=2)
     mixed = loss.targets.of_style(Style.weighted([large, tiny], [1, 9]), (64, 64))[0][0].layers
     alone = loss.targets.of_style(Style.of(large), (64, 64))[0][0].layers
     assert_same(mixed["relu4_1"], alone["relu4_1"], rtol=0, atol=0)
@@ -90,7 +90,7 @@ def test_tiny_image_is_ignored_in_layers_without_cells(tiny_weights):
 def test_features_are_matched_with_those_of_all_images(tiny_weights):
     network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights, content=False))
     loss = SosLoss(network, style_loss="nnfm", content_weight=0)
-    pictures = [picture(40, 48, seed=1), picture(64, 32, seed=2)]
+    pictures = [synthetic_image(40, 48, seed=1), synthetic_image(64, 32, seed=2)]
     mixed = loss.targets.of_style(Style.weighted(pictures, [1, 5]), (64, 64))[0][0].vectors.units
     single = [loss.targets.of_style(Style.of(each), (64, 64))[0][0].vectors.units for each in pictures]
     assert torch.equal(mixed, torch.cat(single))
@@ -124,7 +124,7 @@ def test_mixture_has_the_color_moments_of_its_images():
     torch.testing.assert_close(covariance, together.T.cov(correction=0))
 
 
-BYTES = (picture(30, 20) * 255).round().to(torch.uint8)
+BYTES = (synthetic_image(30, 20) * 255).round().to(torch.uint8)
 FLOATS = BYTES / 255
 
 

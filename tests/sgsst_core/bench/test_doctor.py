@@ -43,7 +43,7 @@ def test_missing_weights_are_a_problem(
     assert "sgsst weights fetch" in found[0]["text"]
 
 
-def test_folders_that_cannot_be_written_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_unwritable_folders_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
     monkeypatch.setenv("SGSST_CACHE", str(file))
@@ -62,7 +62,7 @@ def test_wrong_images_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.text.startswith("wrong image: 0.00")
 
 
-def test_results_that_depend_on_free_memory_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_that_depend_on_free_memory_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     """The rasterizer adds memory that was not written, times 0."""
     scene, camera = surface_scene(100), views(1, 32, 24)[0]
     freed: list[Tensor] = []
@@ -82,15 +82,15 @@ def test_results_that_depend_on_free_memory_are_found(monkeypatch: pytest.Monkey
     assert step.different_repeats(2) == 0
 
 
-def test_freed_blocks_hold_nan(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_freed_blocks_contain_nan(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Tensor] = []
     full = torch.full
 
-    def kept(*arguments: Any, **options: Any) -> Tensor:
+    def record_block(*arguments: Any, **options: Any) -> Tensor:
         made.append(full(*arguments, **options))
         return made[-1]
 
-    monkeypatch.setattr(torch, "full", kept)
+    monkeypatch.setattr(torch, "full", record_block)
     leave_nan(CPU)
     assert {tensor.nbytes for tensor in made} == {1 << 12, 1 << 16, 1 << 20}
     assert all(bool(tensor.isnan().all()) for tensor in made)
@@ -101,7 +101,7 @@ def test_checks_pass_within_their_bounds(error: float, passed: bool) -> None:
     assert Check("x", error, 1.0).passed is passed
 
 
-def test_an_examination_that_hangs_or_crashes_is_a_finding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_hanging_or_crashed_examination_is_a_finding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     program = tmp_path / "python"
     program.write_text(
         '#!/bin/sh\necho \'{"topic": "a", "state": "works", "text": "b"}\'\necho no driver >&2\nexit 4\n'
@@ -120,7 +120,7 @@ def test_an_examination_that_hangs_or_crashes_is_a_finding(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("states", "code"), [(["works"], 0), (["works", "warning"], 3), (["warning", "problem", "works"], 1)]
 )
-def test_exit_code_is_that_of_the_worst_finding(
+def test_exit_code_follows_from_the_worst_finding(
     states: list[Any], code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(doctor, "examine", lambda: [Finding("topic", state, "text") for state in states])

@@ -52,7 +52,7 @@ def test_view_is_partitioned_only_if_it_does_not_fit():
     assert choose_tile_size(3361, 5187, 64, held=1, working=0.5) == 64
 
 
-def test_tiles_have_no_more_pixels_than_allowed_even_if_more_fit_in_memory():
+def test_tile_size_is_limited_even_if_more_pixels_fit():
     assert choose_tile_size(3361, 5187, 64, held=1e9, working=0.5, largest=3361 * 5187) is None
     for largest in (3361 * 5187 - 1, 10**6, 10**5):
         size = choose_tile_size(3361, 5187, 64, held=1e9, working=0.5, largest=largest)

@@ -23,7 +23,7 @@ CUDNN: Any = torch.backends.cudnn
 SIZE = (50, 37)
 
 
-def picture() -> Tensor:
+def synthetic_image() -> Tensor:
     return torch.rand((*SIZE, 3), generator=torch.Generator().manual_seed(1))
 
 
@@ -33,7 +33,7 @@ def add(layer: str, features: Tensor, gradient: Tensor) -> None:
 
 
 def pixel_gradient(network: FeatureNetwork) -> Tensor:
-    return network.backward(network.forward(picture()), add)
+    return network.backward(network.forward(synthetic_image()), add)
 
 
 class Watched(FeatureNetwork):
@@ -109,7 +109,9 @@ def test_statistics_are_summed_in_full_float32(tiny_weights: BackboneWeights, mo
     monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
     network = FeatureNetwork(tiny_weights, tf32=True)
     seen = []
-    network.backward(network.forward(picture()), lambda *_: seen.append(torch.backends.cuda.matmul.fp32_precision))
+    network.backward(
+        network.forward(synthetic_image()), lambda *_: seen.append(torch.backends.cuda.matmul.fp32_precision)
+    )
     assert set(seen) == {"ieee"}
 
 
@@ -287,7 +289,7 @@ def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, mon
         fuse(network)
         calls.clear()
         monkeypatch.setattr(vgg, "_INDEXED_VALUES", SIZE[0] * SIZE[1] * 16)
-        network.forward(picture())
+        network.forward(synthetic_image())
         first_block = 2
         assert len(calls) == sum(isinstance(step, vgg._Convolution) for step in network._steps) - first_block
 
@@ -310,7 +312,7 @@ def test_gpu_passes_have_the_expected_launches(tiny_weights: BackboneWeights, mo
     network = FeatureNetwork(tiny_weights, tf32=True)
     monkeypatch.setattr(pooling, "_is_compiled_for", lambda values: False)
     pools = sum(isinstance(step, vgg._Pool) for step in network._steps)
-    convolved, image = len(network._steps) - pools, picture()
+    convolved, image = len(network._steps) - pools, synthetic_image()
     with operator_on_cpu(fused):
         fuse(network)
         network.forward(image)  # tries the convolutions at this size

@@ -15,7 +15,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
 from sgsst_core.loss.difference import Difference
 from sgsst_core.timing import Timer
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 
 HAS_GPU = torch.cuda.is_available()
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not HAS_GPU, reason="no GPU that PyTorch can use")]
@@ -29,7 +29,7 @@ def add(layer: str, features: Tensor, gradient: Tensor) -> None:
 def difference(weights: BackboneWeights, dtype: torch.dtype = torch.float32, *, tf32: bool = False) -> Difference:
     """Compare the image gradient with that of a float64 network on the CPU."""
     use_whole_float32()
-    image = picture(*SIZE)
+    image = synthetic_image(*SIZE)
     exact = FeatureNetwork(weights, dtype=torch.float64)
     found = FeatureNetwork(weights, dtype=dtype, device="cuda", tf32=tf32)
     gradients = [network.backward(network.forward(image), add).cpu().double() for network in (found, exact)]
@@ -71,7 +71,7 @@ def test_tf32_is_enabled_only_within_the_block() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_fused_convolutions_have_channels_last(vgg16_weights: BackboneWeights, dtype: torch.dtype) -> None:
     network = FeatureNetwork(vgg16_weights, dtype=dtype, device="cuda")
-    kept = network.forward(picture(*SIZE))
+    kept = network.forward(synthetic_image(*SIZE))
     print({step.layer: step.fused for step in network._steps if isinstance(step, vgg._Convolution)})
     held = [output for output in kept.outputs if output.numel()]
     assert all(output.is_contiguous(memory_format=torch.channels_last) for output in held)

@@ -52,7 +52,7 @@ def deviations_of(scene: Scene) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_filter_is_applied_and_kept(tmp_path: Path, text: bool) -> None:
+def test_filter_is_applied_and_preserved(tmp_path: Path, text: bool) -> None:
     scene = wall(sh_degree=1)
     path, out = with_filter(tmp_path / "scene.ply", scene, deviations_of(scene), text=text), tmp_path / "out.ply"
     file = read_scene(path)
@@ -124,7 +124,7 @@ def test_invalid_filters_are_reported(tmp_path: Path) -> None:
     assert read_scene(path, drop_invalid=True).dropped == 1
 
 
-def test_flat_scene_is_drawn_without_thickness_and_kept(tmp_path: Path) -> None:
+def test_flat_scene_is_rendered_without_thickness_and_preserved(tmp_path: Path) -> None:
     scene, out = wall(sh_degree=1), tmp_path / "out.ply"
     path = without_thickness(tmp_path / "scene.ply", scene)
     file = read_scene(path)

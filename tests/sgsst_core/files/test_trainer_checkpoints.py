@@ -74,7 +74,7 @@ def test_checkpoint_can_be_saved_as_a_scene_file(tmp_path: Path) -> None:
 
 
 def repacked(path: Path, target: Path, compression: int = zipfile.ZIP_STORED, cut: int | None = None) -> Path:
-    """Write the entries of a checkpoint again, compressed or with the tensors' data cut."""
+    """Write the entries of a checkpoint again, compressed or with truncated tensor data."""
     with zipfile.ZipFile(path) as given, zipfile.ZipFile(target, "w", compression) as written:
         for entry in given.infolist():
             data = given.read(entry)

@@ -18,7 +18,7 @@ pxr = pytest.importorskip("pxr", reason="usd-core is not installed")
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("suffix", USD_SUFFIXES)
-def test_written_values_are_those_of_the_scene(tmp_path: Path, suffix: str, degree: int) -> None:
+def test_written_values_match_the_scene(tmp_path: Path, suffix: str, degree: int) -> None:
     """Values are linear, axes have y up, and coefficients follow each other by Gaussian."""
     from pxr import Usd, UsdGeom, UsdVol
 
@@ -51,7 +51,7 @@ def test_written_values_are_those_of_the_scene(tmp_path: Path, suffix: str, degr
     assert bool((np.array(low) < values("positions")).all() and (np.array(high) > values("positions")).all())
 
 
-def test_without_the_extra_the_message_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [*sys.modules]:
         if name.partition(".")[0] == "pxr":
             monkeypatch.delitem(sys.modules, name)
@@ -60,7 +60,7 @@ def test_without_the_extra_the_message_names_it(monkeypatch: pytest.MonkeyPatch)
         check_usd(Path("scene.usdc"))
 
 
-def test_a_missing_folder_leaves_nothing(tmp_path: Path) -> None:
+def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="is not writable"):
         write_usd(tmp_path / "missing" / "scene.usdc", cloud(10))
     assert not [*tmp_path.iterdir()]

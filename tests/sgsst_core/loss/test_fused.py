@@ -15,7 +15,7 @@ from sgsst_core.loss.statistics_terms import (
     style_loss,
 )
 from sgsst_core.loss.targets import LayerTarget
-from tests.sgsst_core.pictures import nearly_one_color, relative_error
+from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error
 
 pytest.importorskip("triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"

@@ -25,7 +25,7 @@ from sgsst_core.timing import Timer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.pretend_cuda.runtime import pretend_cuda
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -47,7 +47,7 @@ def without_triton(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def image(seed: int, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
-    return picture(height, width, seed=seed, dtype=torch.float32).to("cuda")
+    return synthetic_image(height, width, seed=seed, dtype=torch.float32).to("cuda")
 
 
 def make_loss(weights: BackboneWeights, **options: Any) -> SosLoss:
@@ -55,7 +55,7 @@ def make_loss(weights: BackboneWeights, **options: Any) -> SosLoss:
 
 
 def style_of(loss: SosLoss) -> StyleTargets:
-    return loss.targets.of_style(Style.of(picture(40, 50, seed=1, dtype=torch.float32)), (HEIGHT, WIDTH))
+    return loss.targets.of_style(Style.of(synthetic_image(40, 50, seed=1, dtype=torch.float32)), (HEIGHT, WIDTH))
 
 
 def view_of(loss: SosLoss, seed: int, *, weighted: bool = False) -> ViewTarget:
@@ -127,7 +127,7 @@ def test_each_kind_of_evaluation_has_its_own_graph(tiny_weights: BackboneWeights
     loss = make_loss(tiny_weights)
     whole, other = (
         style_of(loss),
-        loss.targets.of_style(Style.of(picture(60, 60, seed=7, dtype=torch.float32)), (HEIGHT, WIDTH)),
+        loss.targets.of_style(Style.of(synthetic_image(60, 60, seed=7, dtype=torch.float32)), (HEIGHT, WIDTH)),
     )
     content = image(8)
     graphs = LossGraphs(loss)

@@ -14,14 +14,14 @@ from sgsst_core.regions.definition import Region, Regions, check_regions
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.style import Style
 from tests.networks import comparing_pixels
-from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 
 SIZE = (112, 150)
 
 
 def coverage_maps(size, count):
     """Return coverage maps of `count` regions, which add up to 1 with the background; the first have hard borders."""
-    raw = torch.stack([picture(*size, seed=10 + number)[:, :, 0] ** 4 for number in range(count + 1)])
+    raw = torch.stack([synthetic_image(*size, seed=10 + number)[:, :, 0] ** 4 for number in range(count + 1)])
     raw[0, :, size[1] // 2 :] = 0
     raw[1, : size[0] // 2] = 0
     return list((raw / raw.sum(dim=0))[:count])
@@ -41,8 +41,14 @@ def evaluate(network, image, content, styles, maps, weights, **options):
 
 @pytest.fixture
 def case():
-    styles = [resize_area(picture(90, 130, seed=s) ** s, style_size((90, 130), SIZE)) for s in (1, 2, 3)]
-    return picture(*SIZE, seed=5), picture(*SIZE, seed=6), styles, coverage_maps(SIZE, 3), [1.0, 0.3, 7.0]
+    styles = [resize_area(synthetic_image(90, 130, seed=s) ** s, style_size((90, 130), SIZE)) for s in (1, 2, 3)]
+    return (
+        synthetic_image(*SIZE, seed=5),
+        synthetic_image(*SIZE, seed=6),
+        styles,
+        coverage_maps(SIZE, 3),
+        [1.0, 0.3, 7.0],
+    )
 
 
 @pytest.mark.parametrize("tile_size", [None, 64])

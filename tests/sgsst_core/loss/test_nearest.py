@@ -28,7 +28,7 @@ from sgsst_core.settings import StyleLossName
 from sgsst_core.style import Style
 from tests.networks import comparing_pixels
 from tests.networks import tiny_weights as make_tiny_weights
-from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 
 EPS = torch.finfo(torch.float64).eps
 MATCHED: tuple[StyleLossName, ...] = ("nnfm", "mixed")
@@ -45,9 +45,14 @@ def setting(height: int, width: int, *, covered: bool = False) -> tuple[Tensor, 
     """Return image, style, content and coverage (None unless `covered`) for a view of this size."""
     coverage = None
     if covered:
-        coverage = (picture(height, width, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+        coverage = (synthetic_image(height, width, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
         coverage[: height // 3] = 0
-    return picture(height, width, seed=1), picture(90, 110, seed=3) ** 2, picture(height, width, seed=2), coverage
+    return (
+        synthetic_image(height, width, seed=1),
+        synthetic_image(90, 110, seed=3) ** 2,
+        synthetic_image(height, width, seed=2),
+        coverage,
+    )
 
 
 def evaluate(loss: SosLoss, case: tuple[Tensor, Tensor, Tensor, Tensor | None]) -> SosResult:
@@ -232,21 +237,21 @@ def test_styles_with_few_vectors_are_matched(
     tiny_weights: BackboneWeights, style_loss: StyleLossName, size: tuple[int, int]
 ) -> None:
     loss = loss_of(tiny_weights, style_loss)
-    vectors = loss.targets.of_style(Style.of(picture(*size, seed=3)), (100, 80))[0][0].vectors
+    vectors = loss.targets.of_style(Style.of(synthetic_image(*size, seed=3)), (100, 80))[0][0].vectors
     assert vectors is not None
     assert len(vectors.units) == size[0] // 4 * (size[1] // 4)
     image, _, content, _ = setting(100, 80)
-    result = evaluate(loss, (image, picture(*size, seed=3), content, None))
+    result = evaluate(loss, (image, synthetic_image(*size, seed=3), content, None))
     assert result.terms[0]["nearest"] > 0
     assert torch.isfinite(gradient_of(result)).all()
 
 
 def test_style_without_vectors_is_refused(tiny_weights: BackboneWeights) -> None:
     with pytest.raises(ImageError, match="The style is used at 200 x 3 pixels, too few to match"):
-        loss_of(tiny_weights, "nnfm").targets.of_style(Style.of(picture(3, 200)), (100, 80))
+        loss_of(tiny_weights, "nnfm").targets.of_style(Style.of(synthetic_image(3, 200)), (100, 80))
     without_full_size = loss_of(tiny_weights, "nnfm", coarsest=40, scales=ScaleWeights((0.0, 1.0)))
     with pytest.raises(ImageError, match="The style is used at 100 x 2 pixels, too few to match"):
-        without_full_size.targets.of_style(Style.of(picture(4, 200)), (100, 80))
+        without_full_size.targets.of_style(Style.of(synthetic_image(4, 200)), (100, 80))
 
 
 def test_large_styles_are_thinned_evenly() -> None:
@@ -266,7 +271,7 @@ def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
     tiny_weights: BackboneWeights, tile_size: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sgsst_core.loss.target_builder.MOST_VECTORS", 200)
-    style = picture(130, 201, seed=3)
+    style = synthetic_image(130, 201, seed=3)
     loss = loss_of(tiny_weights, "nnfm", tile_size=tile_size)
     vectors = loss.targets.of_style(Style.of(style), (130, 201))[0][0].vectors
     assert vectors is not None

@@ -16,7 +16,7 @@ from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import cameras
 
 SIZE, COARSEST = (160, 233), 50
@@ -29,8 +29,8 @@ def evaluate(
     dtype: torch.dtype = torch.float64,
 ) -> tuple[SosResult, list[tuple[int, int]]]:
     """Return the loss of a view at three scales, and the sizes of all images that the network processed."""
-    image, content, painting = (picture(*SIZE, seed=seed).to(dtype) for seed in (1, 2, 3))
-    coverage = (picture(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1).to(dtype)
+    image, content, painting = (synthetic_image(*SIZE, seed=seed).to(dtype) for seed in (1, 2, 3))
+    coverage = (synthetic_image(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1).to(dtype)
     network = FeatureNetwork(weights, dtype=dtype)
     seen, forward = [], network.forward
 
@@ -51,9 +51,9 @@ def evaluate(
 def test_float64_agrees_with_the_definition(
     tiny_weights: BackboneWeights, values: tuple[float, ...], tile_size: int | None
 ) -> None:
-    image, content, painting = (picture(*SIZE, seed=seed) for seed in (1, 2, 3))
+    image, content, painting = (synthetic_image(*SIZE, seed=seed) for seed in (1, 2, 3))
     painting = resize_area(painting, style_size(SIZE, SIZE))
-    coverage = (picture(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+    coverage = (synthetic_image(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
     expected, gradient = sos_reference(
         tiny_weights, image, painting, content, coverage=coverage, coarsest=COARSEST, scales=values
     )

@@ -14,7 +14,7 @@ from sgsst_core.scene import pyramid
 from sgsst_core.scene.pyramid import resize_area, scale_count, style_size
 from sgsst_core.style import Style
 from tests.networks import comparing_pixels
-from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 
 #: Tolerances of gradients: float64 against the reference; float32 tiled against float32 untiled.
 FLOAT64_TOLERANCE = 1e-9
@@ -23,11 +23,11 @@ FLOAT32_TOLERANCE = 1e-5
 
 def setting(size, *, covered=False):
     """Return float64 image, style, content and coverage (None unless `covered`) for a view of this size."""
-    image, content = picture(*size, seed=1), picture(*size, seed=2)
-    style = resize_area(picture(600, 500, seed=3) ** 2, style_size((600, 500), size))
+    image, content = synthetic_image(*size, seed=1), synthetic_image(*size, seed=2)
+    style = resize_area(synthetic_image(600, 500, seed=3) ** 2, style_size((600, 500), size))
     coverage = None
     if covered:
-        coverage = (picture(*size, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+        coverage = (synthetic_image(*size, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
         coverage[: size[0] // 3] = 0
     return image, style, content, coverage
 
@@ -63,7 +63,7 @@ def test_compared_pixels_are_the_first_layer_without_gram_matrix(tiny_weights):
     weights = comparing_pixels(tiny_weights, 3.0)
     network = FeatureNetwork(weights, (PIXELS, "relu1_1"))
     loss = SosLoss(network, content_weight=0)
-    image, style = picture(40, 56, seed=1).float(), picture(40, 56, seed=3).float()
+    image, style = synthetic_image(40, 56, seed=1).float(), synthetic_image(40, 56, seed=3).float()
     only = {
         scale: (StyleTarget({PIXELS: own[0].layers[PIXELS]}),)
         for scale, own in loss.targets.of_style(Style.of(style), (40, 56)).items()
@@ -203,7 +203,7 @@ def test_loss_without_gradient_is_identical(tiny_weights):
 
 @pytest.mark.parametrize("size", [(1, 1), (15, 17), (16, 16), (3, 200)])
 def test_tiny_views_have_finite_gradients(tiny_weights, size):
-    case = (picture(*size, seed=1), picture(40, 30, seed=2), picture(*size, seed=3), None)
+    case = (synthetic_image(*size, seed=1), synthetic_image(40, 30, seed=2), synthetic_image(*size, seed=3), None)
     result = evaluate(FeatureNetwork(tiny_weights), case, None)
     assert torch.isfinite(result.image_gradient).all()
     assert result.image_gradient.abs().max() > 0

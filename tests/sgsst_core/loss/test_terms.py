@@ -10,7 +10,7 @@ from sgsst_core.loss.sos_reference import style_loss_reference
 from sgsst_core.loss.statistics_terms import StyleGradient, TermWeights, style_loss
 from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.loss.terms import TERMS, LossTerms
-from tests.sgsst_core.pictures import nearly_one_color, relative_error
+from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error
 
 
 def make_features(height, width, channels, seed, dtype=torch.float64):

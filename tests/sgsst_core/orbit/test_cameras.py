@@ -83,7 +83,7 @@ def test_frames_have_few_aspect_ratios_that_follow_the_object() -> None:
 
 
 def test_frames_have_a_margin_around_the_object() -> None:
-    """In a render, nothing is cut off, and the object fills most of its box's area."""
+    """In a render, the object is not cropped, and fills most of its box's area."""
     scene = figure()
     rasterizer = make_rasterizer("cpu", scene)
     for view in orbit(scene, 5, elevations=[10.0, 45.0]):

@@ -605,7 +605,7 @@ def test_computed_data_count_as_gpu_memory() -> None:
         assert on_gpu.device_bytes == own + on_cpu.peak_bytes - GIGABYTE - beside
 
 
-def test_the_same_probe_gives_the_same_plan() -> None:
+def test_same_probe_gives_the_same_plan() -> None:
     one, other = (plan_of(probe(uncovered_share=0.2, ranks=3, link=Link(1e9, 1e-4))) for _ in range(2))
     for field in dataclasses.fields(Plan):
         values = [getattr(plan, field.name) for plan in (one, other)]

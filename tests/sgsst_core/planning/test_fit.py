@@ -23,7 +23,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import ball, blind_camera, cameras, wall
 
 NEAR = 0.2
@@ -169,7 +169,7 @@ def test_photos_of_scans_may_have_a_background(shared_data: Path, tmp_path: Path
     rasterizer = make_rasterizer("cpu", scene, near=NEAR)
     for view in views:
         colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, view))
-        behind = picture(view.height, view.width, seed=3, dtype=torch.float32)
+        behind = synthetic_image(view.height, view.width, seed=3, dtype=torch.float32)
         photo = rasterizer.render(colors, view) + (1 - rasterizer.coverage(view))[..., None] * behind
         noise = torch.randn(photo.shape, generator=torch.Generator().manual_seed(4))
         save_png(tmp_path / f"{view.name}.png", 0.8 * photo + 0.04 * noise)
@@ -192,7 +192,7 @@ def reference_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:
 
 
 def test_psnr_ignores_exposure_and_uncovered_pixels() -> None:
-    render, noise = (picture(20, 30, seed=seed, dtype=torch.float32) for seed in (1, 2))
+    render, noise = (synthetic_image(20, 30, seed=seed, dtype=torch.float32) for seed in (1, 2))
     photo, weight = 0.9 * render + 0.1 * noise, noise[..., 0]
     assert fitted_psnr(photo, render, weight) == pytest.approx(reference_psnr(photo, render, weight), abs=1e-6)
     darker = 0.3 * photo * torch.tensor([1.0, 0.8, 0.6]) + 0.1

@@ -103,7 +103,7 @@ def test_budgets_add_up_to_the_memory_limit(device: str, precision: str, weights
     assert activations > HEIGHT * WIDTH * 3000 * (2 if precision == "bfloat16" and measured else 1)
 
 
-def test_gpu_memory_includes_what_rasterizer_and_measurements_take() -> None:
+def test_gpu_memory_includes_rasterizer_and_measurements() -> None:
     def peak(measured: bool = False, **raster: Any) -> int:
         found = probe(device="cuda", rasterizer="triton", raster=RasterCost(0.01, **raster))
         prediction = decide(found, make_settings(steps_sos=4000), measured=measured).prediction

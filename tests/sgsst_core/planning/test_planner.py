@@ -17,7 +17,7 @@ from sgsst_core.settings import EVERYTHING, Item, PresetName, make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.unseen import neighbors_change
-from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, wall
 
 
@@ -34,7 +34,7 @@ def higher_bands_of_zeros(scene: Scene) -> Scene:
 
 def make(scene: Scene, views: list[Camera], weights: BackboneWeights, **values: Any) -> Stylizer:
     settings = make_settings(**{"steps_coarse": 0, "steps_sos": 4, "learning_rate": 0.05, **values})
-    return Stylizer.planned(scene, views, picture(60, 70, seed=9).float(), settings, weights=weights)
+    return Stylizer.planned(scene, views, synthetic_image(60, 70, seed=9).float(), settings, weights=weights)
 
 
 SCENES = {
@@ -165,6 +165,8 @@ def test_unseen_gaussians_keep_their_color_in_paper(tiny_weights: BackboneWeight
     cases: list[tuple[PresetName, bool]] = [("paper", False), ("standard", True)]
     for preset, moved in cases:
         settings = make_settings(preset, steps_coarse=0, steps_sos=2)
-        stylizer = Stylizer.planned(scene, cameras(2), picture(60, 70, seed=9).float(), settings, weights=tiny_weights)
+        stylizer = Stylizer.planned(
+            scene, cameras(2), synthetic_image(60, 70, seed=9).float(), settings, weights=tiny_weights
+        )
         run(stylizer)
         assert bool((stylizer.stylized()[-10:] != scene.sh_dc[-10:]).any()) == moved

@@ -17,7 +17,7 @@ from torch import Tensor
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import cache_folder, load_perceptual
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def box_blurred(image: Tensor, side: int) -> Tensor:
 )
 def test_zero_for_equal_images_and_symmetric(vgg16_weights, network, dtype):
     lpips = Lpips(network, dtype=dtype)
-    first, second = picture(37, 50, seed=1), picture(37, 50, seed=2)
+    first, second = synthetic_image(37, 50, seed=1), synthetic_image(37, 50, seed=2)
     same = lpips.distance(first, first)
     assert same.mean == 0.0
     assert same.map.shape == (37, 50)
@@ -57,7 +57,7 @@ def test_zero_for_equal_images_and_symmetric(vgg16_weights, network, dtype):
 
 @pytest.mark.parametrize("network", ["alex", "vgg16"])
 def test_float32_agrees_with_float64(vgg16_weights, network):
-    first, second = picture(45, 61, seed=3), picture(45, 61, seed=4)
+    first, second = synthetic_image(45, 61, seed=3), synthetic_image(45, 61, seed=4)
     reference = Lpips(network, dtype=torch.float64).distance(first, second)
     result = Lpips(network).distance(first, second)
     assert result.map.dtype == torch.float32
@@ -113,7 +113,7 @@ def test_prefers_a_small_warp_to_a_blur_unlike_squared_error(alex: Lpips):
 
 
 def test_agrees_with_a_direct_formulation_in_numpy(alex: Lpips):
-    first, second = picture(47, 63, seed=5), picture(47, 63, seed=6)
+    first, second = synthetic_image(47, 63, seed=5), synthetic_image(47, 63, seed=6)
     expected_mean, expected_map = lpips_directly(first.numpy(), second.numpy())
     result = alex.distance(first, second)
     assert result.mean == pytest.approx(expected_mean, rel=1e-6)
@@ -178,7 +178,7 @@ def test_constant_images_are_finite(alex: Lpips):
 def test_minimum_image_size_is_enforced(vgg16_weights, network):
     lpips = Lpips(network)
     side = lpips.minimum_side
-    first, second = picture(side, 64, seed=7), picture(side, 64, seed=8)
+    first, second = synthetic_image(side, 64, seed=7), synthetic_image(side, 64, seed=8)
     assert lpips.distance(first, second).mean > 0
     with pytest.raises(ValueError, match=f"64 x {side - 1} pixels: {side} are the least"):
         lpips.distance(first[1:], second[1:])

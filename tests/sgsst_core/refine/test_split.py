@@ -178,7 +178,7 @@ def test_lengths_are_split_to_a_size_with_the_fewest_pieces() -> None:
         assert fewer is None or length / ratio_of(fewer) > 2.0
 
 
-def test_children_inherit_harmonics_that_stay_in_the_file(tmp_path: Path) -> None:
+def test_children_inherit_stored_harmonics(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene.ply", cloud(300, degree=3))
     pieces = torch.ones(300, 3, dtype=torch.uint8)
     pieces[::7, 1] = 3

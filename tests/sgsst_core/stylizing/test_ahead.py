@@ -25,7 +25,7 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.device import DEVICE, PretendTensor
 from tests.pretend_cuda.runtime import pretend_cuda
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import cameras, style, wall
 
 pytest.importorskip("triton")
@@ -60,7 +60,7 @@ class Photos:
         self._cameras = cameras(VIEWS, side, side)
         self._paths = [folder / f"{index}.png" for index in range(VIEWS)]
         for index, path in enumerate(self._paths):
-            save_png(path, picture(2 * side, 2 * side, seed=index, dtype=torch.float32))
+            save_png(path, synthetic_image(2 * side, 2 * side, seed=index, dtype=torch.float32))
             if index == broken:
                 path.write_bytes(path.read_bytes()[:-100])
 

@@ -18,7 +18,7 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, wall
 
 
-def picture(height: int = 40, width: int = 60) -> torch.Tensor:
+def synthetic_image(height: int = 40, width: int = 60) -> torch.Tensor:
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
 
 
@@ -30,7 +30,7 @@ def ramp(height: int, width: int, slope_y: float, slope_x: float) -> torch.Tenso
 
 
 def test_rotations_by_90_degrees_only_move_pixels() -> None:
-    style = picture()
+    style = synthetic_image()
     assert torch.equal(rotated(style, 90), torch.rot90(style, 1, (0, 1)))
     assert torch.equal(rotated(style, -90), torch.rot90(style, -1, (0, 1)))
     assert torch.equal(rotated(style, 360), style)
@@ -101,13 +101,13 @@ def test_uniform_style_gets_the_mean_of_the_scene() -> None:
 
 
 def test_default_settings_leave_the_style_unchanged() -> None:
-    style = Style.of(picture())
+    style = Style.of(synthetic_image())
     assert prepared_style(style, make_settings("standard"), torch.zeros(2, 3), torch.ones(2).double()) is style
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0])
 def test_style_scale_uses_statistics_of_a_resized_style(tiny_weights: BackboneWeights, scale: float) -> None:
-    style, view = picture(96, 120), (64, 96)
+    style, view = synthetic_image(96, 120), (64, 96)
     size = style_size((96, 120), view, scale)
     assert size == (round(64 * scale), round(80 * scale))
     network = FeatureNetwork(tiny_weights)
@@ -135,7 +135,7 @@ def test_style_size_has_the_limit_of_views() -> None:
 
 def test_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("standard", style_rotation=90, preserve_colors="match", style_scale=2, coarsest_side=24)
-    scene, style = wall(), picture()
+    scene, style = wall(), synthetic_image()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
     (used,) = stylizer.job.style.images
     assert used.shape == (60, 40, 3)

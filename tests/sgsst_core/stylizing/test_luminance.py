@@ -26,7 +26,7 @@ from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.optimizer import ColorOptimizer
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.warm_start import luminance_start
-from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -100,9 +100,13 @@ def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) 
 
 def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> None:
     weights = replace(tiny_weights, gray=True)
-    image, content, painting = picture(129, 161, seed=1), picture(129, 161, seed=2), picture(100, 120, seed=3)
+    image, content, painting = (
+        synthetic_image(129, 161, seed=1),
+        synthetic_image(129, 161, seed=2),
+        synthetic_image(100, 120, seed=3),
+    )
     painting = resize_area(painting, style_size((100, 120), (129, 161)))
-    coverage = (picture(129, 161, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+    coverage = (synthetic_image(129, 161, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
     expected, gradient = sos_reference(weights, image, painting, content, coverage=coverage, coarsest=70)
     for tile_size in (None, 64):
         loss = SosLoss(FeatureNetwork(weights, dtype=torch.float64), tile_size=tile_size, coarsest=70)
@@ -115,8 +119,8 @@ def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> Non
 
 def test_colors_of_equal_luminance_have_equal_features(tiny_weights: BackboneWeights) -> None:
     network = FeatureNetwork(replace(tiny_weights, gray=True), dtype=torch.float64)
-    image = picture(40, 48, seed=1)
-    other = image + torch.tensor([0.587, -0.299, 0.0], dtype=torch.float64) * picture(40, 48, seed=5)[..., :1]
+    image = synthetic_image(40, 48, seed=1)
+    other = image + torch.tensor([0.587, -0.299, 0.0], dtype=torch.float64) * synthetic_image(40, 48, seed=5)[..., :1]
     first, second = (network.forward(each, cache=False).features for each in (image, other))
     for layer, features in first.items():
         torch.testing.assert_close(features, second[layer])
@@ -127,7 +131,7 @@ def test_style_gets_the_luminance_of_the_scene() -> None:
     colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=generator)
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
     settings = make_settings(preserve_colors="luminance")
-    painting = Style.of(0.5 + 0.1 * picture(64, 64, seed=2).float())
+    painting = Style.of(0.5 + 0.1 * synthetic_image(64, 64, seed=2).float())
     (found,) = prepared_style(painting, settings, (colors - 0.5) / SH_C0, weights).images
     assert torch.equal(found[..., 0], found[..., 1])
     share, values = weights / weights.sum(), luminance(colors.double())
@@ -141,7 +145,7 @@ def test_style_gets_the_luminance_of_the_scene() -> None:
 def test_mixture_as_a_whole_gets_the_luminance_of_the_scene() -> None:
     """Dark and bright images stay dark and bright; only the mixture has the scene's mean and deviation."""
     colors = 0.4 + 0.05 * torch.randn(5000, 3, generator=torch.Generator().manual_seed(1))
-    dark, bright = (0.2 + 0.1 * picture(40, 60, seed=2), 0.6 + 0.1 * picture(60, 40, seed=3))
+    dark, bright = (0.2 + 0.1 * synthetic_image(40, 60, seed=2), 0.6 + 0.1 * synthetic_image(60, 40, seed=3))
     mixture = Style.weighted([dark.float(), bright.float()], [3, 1])
     ones = torch.ones(5000, dtype=torch.float64)
     found = prepared_style(mixture, make_settings(preserve_colors="luminance"), (colors - 0.5) / SH_C0, ones)

@@ -184,7 +184,7 @@ def test_scenes_are_drawn_in_the_requested_mode(tiny_weights: BackboneWeights) -
     assert not torch.equal(antialiased.sh_dc, run(scene, tiny_weights).sh_dc)
 
 
-def test_progress_is_shown_on_a_terminal_only_if_asked_for(
+def test_progress_is_shown_on_a_terminal_only_on_request(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes any output for a terminal

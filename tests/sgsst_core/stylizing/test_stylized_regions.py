@@ -27,7 +27,7 @@ from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.result_colors import transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.unseen import neighbors_change_by_region
-from tests.sgsst_core.pictures import relative_error
+from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -26,7 +26,7 @@ from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, Progress, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -324,7 +324,7 @@ def test_cameras_that_see_nothing_are_refused(tiny_weights: BackboneWeights, sce
 
 
 def test_given_photos_are_the_content(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
+    photo = synthetic_image(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings(warm_start=False)
     own = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights)
     given = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights, photos=lambda index: photo)

@@ -19,7 +19,7 @@ from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.training_background import Color, drawn_color, put_behind
-from tests.sgsst_core.pictures import picture, relative_error
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -110,7 +110,7 @@ def test_step_gradient_matches_a_job_with_its_background(
 
 
 def test_photos_get_the_color_in_uncovered_pixels(tiny_weights: BackboneWeights) -> None:
-    photo = picture(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
+    photo = synthetic_image(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
     settings = make_settings(training_background="random", steps_sos=2)
     stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
     coverage = stylizer.job.view_targets.coverage(0)[0][..., None]

@@ -11,7 +11,7 @@ from torch import Tensor
 from sgsst_core.constants import SH_C0
 from sgsst_core.style import Style
 from sgsst_core.stylizing.warm_start import warm_start, with_moments
-from tests.sgsst_core.pictures import picture
+from tests.sgsst_core.synthetic_images import synthetic_image
 
 Start = Callable[[Tensor, Tensor, Style], Tensor]
 
@@ -35,7 +35,7 @@ def colors_of(sh_dc: Tensor) -> Tensor:
 def test_weighted_mean_and_covariance_match_the_style(scale: float) -> None:
     generator = torch.Generator().manual_seed(0)
     # A style of low contrast in the middle of the range, so that no color is clamped.
-    style = 0.45 + 0.1 * picture(40, 50, seed=3).float()
+    style = 0.45 + 0.1 * synthetic_image(40, 50, seed=3).float()
     sh_dc = torch.randn(500, 3, generator=generator) @ torch.tensor([[1.0, 0.5, 0], [0, 1, 0.3], [0, 0, 0.2]])
     weights = scale * torch.rand(500, generator=generator, dtype=torch.float64) ** 4
     found = moments(colors_of(with_moments(sh_dc, weights, Style.of(style))), weights)
@@ -47,7 +47,7 @@ def test_weighted_mean_and_covariance_match_the_style(scale: float) -> None:
 
 @pytest.mark.parametrize("start", [with_moments, warm_start])
 def test_matching_colors_are_unchanged(start: Start) -> None:
-    style = picture(30, 30, seed=2).float()
+    style = synthetic_image(30, 30, seed=2).float()
     sh_dc = (style.reshape(-1, 3) - 0.5) / SH_C0
     found = start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style))
     if start is with_moments:
@@ -82,7 +82,7 @@ def test_style_images_count_by_their_weights() -> None:
 @pytest.mark.parametrize("case", ["gray scene", "one color", "one Gaussian", "style of one color", "black style"])
 def test_flat_scenes_and_styles_give_finite_colors_in_range(case: str, start: Start) -> None:
     generator = torch.Generator().manual_seed(1)
-    style = picture(30, 30, seed=2).float()
+    style = synthetic_image(30, 30, seed=2).float()
     sh_dc = torch.randn(50, 3, generator=generator)
     if case == "gray scene":
         sh_dc = sh_dc[:, :1].expand(-1, 3).contiguous()

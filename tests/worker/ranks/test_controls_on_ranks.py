@@ -9,7 +9,7 @@ import torch
 
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.scene.gaussians import Scene
-from tests.sgsst_core.pictures import relative_error
+from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, wall
 from tests.worker.ranks.spawn import on_ranks
 from tests.worker.ranks.test_exact_ranks import stylize

@@ -26,8 +26,8 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.view_targets import ViewTargets
 from sgsst_core.stylizing.views import Views
 from tests.networks import comparing_pixels, tiny_weights
-from tests.sgsst_core.pictures import picture, relative_error
 from tests.sgsst_core.stylizing.test_refining import on_a_rank
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
 
@@ -61,7 +61,7 @@ def gradient(
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     survey = survey_views(scene, [camera], rasterizer)
     weighted = survey.uncovered_share > 0.01
-    picture_ = Style.of(picture(90, 110, seed=4, dtype=dtype))
+    picture_ = Style.of(synthetic_image(90, 110, seed=4, dtype=dtype))
     regions = regions and regions.resolved(survey.total_blend_weights)
     styles = JobStyles.prepared(picture_, regions, make_settings(), scene.sh_dc, survey.total_blend_weights)
     views = Views(
@@ -126,7 +126,7 @@ def test_division_by_speed_preserves_the_gradient() -> None:
 def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> None:
     """Some of the three ranks have no pixel of a region, and one region is frozen."""
     scene, camera = wall(), cameras(1, 128, 96)[0]
-    other = Style.of(picture(64, 80, seed=5, dtype=torch.float64))
+    other = Style.of(synthetic_image(64, 80, seed=5, dtype=torch.float64))
     every = (Region("rest"), Region("a", style=other, weight=3.0), Region("b", freeze=True))
     labels = (scene.means[:, 1] > 0.8).to(torch.uint8) + 2 * (scene.means[:, 0] > 1).to(torch.uint8)
     regions = Regions(every, labels.clamp(max=2))

@@ -21,7 +21,7 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights
 from tests.ports import free_port
-from tests.sgsst_core.pictures import relative_error
+from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
 from worker.ranks.process_group import _backend, _meet

@@ -18,7 +18,7 @@ from sgsst_core.planning.probe import probe_link
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.ports import free_port
-from tests.sgsst_core.pictures import relative_error
+from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, cameras, style, wall
 from worker.ranks.process_group import process_group
 

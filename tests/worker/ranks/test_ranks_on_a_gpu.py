@@ -15,7 +15,7 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights
 from tests.pretend_cuda.device import counts
-from tests.sgsst_core.pictures import relative_error
+from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, cameras, style
 from tests.worker.ranks.spawn import on_ranks
 

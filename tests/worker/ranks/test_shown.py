@@ -21,7 +21,7 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views
 from tests.networks import CHANNELS, tiny_weights
-from tests.sgsst_core.pictures import relative_error
+from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
 

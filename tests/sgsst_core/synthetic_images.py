@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 
-def picture(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
+def synthetic_image(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
     """Return an image [height, width, 3] from 0 to 1 with edges, gradients and texture."""
     generator = torch.Generator().manual_seed(seed)
     result = torch.zeros((1, 3, height, width), dtype=torch.float64)
