@@ -1,4 +1,4 @@
-"""Tests against other programs: splat-transform and GaussForge read what is written, and vice versa.
+"""Tests against other programs, such as splat-transform: they read what is written, and vice versa.
 
 They come from npm and PyPI at fixed versions. Without npm, its tests are skipped.
 """
@@ -19,6 +19,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from sgsst_core.files.formats import RESULT_FORMATS, by_name
+from sgsst_core.files.formats.frame import Y_UP, Frame
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held
@@ -30,7 +31,28 @@ PACKAGES = (
     "@playcanvas/splat-transform@3.7.0",
     "gltf-validator@2.0.0-dev.3.10",
     "@mkkellogg/gaussian-splats-3d@0.4.7",
+    "@babylonjs/core@9.28.0",
+    "@babylonjs/loaders@9.28.0",
 )
+#: What Babylon.js reads from a GLB, before it is sent to a GPU: records of .splat, then harmonics of 8 bits.
+BABYLON_SCRIPT = """
+globalThis.XMLHttpRequest = class {};
+const { readFileSync, writeFileSync } = await import("fs");
+const { NullEngine } = await import("@babylonjs/core/Engines/nullEngine.js");
+const { Scene } = await import("@babylonjs/core/scene.js");
+const { GaussianSplattingMesh } = await import("@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js");
+const { AppendSceneAsync } = await import("@babylonjs/core/Loading/sceneLoader.js");
+await import("@babylonjs/loaders/glTF/glTFFileLoader.js");
+await import("@babylonjs/loaders/glTF/2.0/glTFLoader.js");
+await import("@babylonjs/loaders/glTF/2.0/Extensions/KHR_gaussian_splatting.js");
+const [glb, out] = process.argv.slice(1);
+GaussianSplattingMesh.prototype.updateDataAsync = async (records, harmonics) => {
+  writeFileSync(out, Buffer.from(records));
+  harmonics.forEach((part, index) => writeFileSync(out + index, Buffer.from(part)));
+};
+await AppendSceneAsync(readFileSync(glb), new Scene(new NullEngine()), { pluginExtension: ".glb" });
+process.exit(0);
+"""
 #: Conversion of a PLY to .ksplat at a compression level and an SH degree.
 KSPLAT_SCRIPT = """
 globalThis.window = globalThis.document = {};
@@ -178,6 +200,27 @@ def test_ksplat_of_reference_writer_is_read(modules: Path, scene: Scene, tmp_pat
         assert float((held(found.sh_rest) - held(within.sh_rest)).abs().max()) <= 1.51 / 255 * 2
         rounded = replace(rounded, sh_rest=within.sh_rest)
     assert_same(rounded, within, 4e-3, opacities=1.01 / 255)
+
+
+def test_babylon_reads_glb(modules: Path, scene: Scene, tmp_path: Path) -> None:
+    """The Gaussians are those of the scene, rotated by 180 degrees about z, up to the rounding of 8 bits."""
+    ours, theirs = tmp_path / "ours.glb", tmp_path / "theirs.splat"
+    within = replace(scene, sh_dc=scene.sh_dc.clamp(-1.7, 1.7), opacities=scene.opacities.clamp(-5, 5))
+    write_scene(ours, within, by_name("glb"))
+    command = ["node", "--input-type=module", "-e", BABYLON_SCRIPT, *map(str, (ours, theirs))]
+    done = subprocess.run(command, cwd=modules, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    arrays = {name: held(getattr(within, name)).numpy().copy() for name in TENSORS}
+    Frame.of(Y_UP).apply(arrays)
+    expected = Scene(*(torch.from_numpy(arrays[name]) for name in TENSORS))
+    found = read_scene(theirs).scene
+    assert float((found.sh_dc - expected.sh_dc).abs().max()) <= 0.51 / 255 / 0.282
+    bare = replace(expected, sh_dc=found.sh_dc, sh_rest=found.sh_rest)
+    assert_same(found, bare, 0.015, opacities=0.51 / 255)  # its bytes of quaternions are half a step off
+    parts = [np.fromfile(f"{theirs}{index}", "u1").reshape(-1, 16)[: len(scene)] for index in range(2)]
+    harmonics = np.concatenate(parts, axis=1)[:, :24].reshape(-1, 8, 3)
+    rounded = np.clip(held(expected.sh_rest).double().numpy() * 128 + 128, 0, 255)
+    assert float(np.abs(harmonics - rounded).max()) <= 0.5
 
 
 def attributes_of(path: Path) -> dict[str, np.ndarray]:
