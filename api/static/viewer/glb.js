@@ -6,6 +6,7 @@
  */
 import { SceneError } from "./byte_reader.js";
 import { HARMONICS, OPACITY, ROTATION, SCALES, COLOR, unpacked } from "./packed.js";
+import { extrasRendering } from "./render_tag.js";
 import { words } from "../words.js";
 
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
@@ -29,19 +30,20 @@ export async function glb(reader) {
   if (head.getUint32(4, true) !== 2 || size > MAX_JSON) throw new SceneError(words.scene.unreadable);
   const text = new TextDecoder().decode(await reader.take(size));
   const bytes = new DataView((await reader.take(8)).buffer).getUint32(0, true);
-  const found = attributesOf(text, bytes), { count, degree, places } = found, coefficients = places.length - NAMES.length;
+  const { count, degree, places, rendering } = attributesOf(text, bytes), coefficients = places.length - NAMES.length;
   /** @type {DataView | null} */
   let data = null;
   return unpacked(count, degree, async (begin, into, width, some) => {
     data ??= new DataView((await reader.take(bytes)).buffer);
     for (let i = 0; i < some; i++) unpack(data, places, begin + i, into, i * width, coefficients);
-  });
+  }, rendering);
 }
 
 /** @typedef {{offset: number, stride: number}} Place place of an attribute's values in the data */
 
 /**
- * Return the number of Gaussians, their SH degree, and the places of their attributes: those of `NAMES`, then harmonics.
+ * Return the number of Gaussians, their SH degree, the places of their attributes (those of `NAMES`, then harmonics),
+ * and their render mode.
  *
  * @param {string} text the JSON document
  * @param {number} bytes size of the data
@@ -75,7 +77,7 @@ function attributesIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
     if (!plain || componentType !== FLOAT || sparse || !inside) throw new SceneError(words.scene.notShown("This kind of GLB"));
     return { offset, stride };
   });
-  return { count, degree, places };
+  return { count, degree, places, rendering: extrasRendering(primitive.extras) };
 }
 
 /**

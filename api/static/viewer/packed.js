@@ -8,6 +8,7 @@
 import { SceneError } from "./byte_reader.js";
 import { BATCH } from "./packing.js";
 import { DEGREES, floats } from "./ply.js";
+import { ANTIALIASED, CLASSIC, plyRendering } from "./render_tag.js";
 import { decompress } from "../vendor/fzstd/fzstd.js";
 import { words } from "../words.js";
 
@@ -33,9 +34,10 @@ const OTHERS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];
  * @param {number} count
  * @param {number} degree
  * @param {(begin: number, rows: Float32Array, width: number, count: number) => void | Promise<void>} unpack fills `count` rows
+ * @param {import("./render_tag.js").Rendering} rendering
  * @returns {SceneFile}
  */
-export function unpacked(count, degree, unpack) {
+export function unpacked(count, degree, unpack, rendering = CLASSIC) {
   const rest = ((degree + 1) ** 2 - 1) * 3, width = HARMONICS + rest;
   const at = Object.fromEntries([...NAMES, ...Array.from({ length: rest }, (_, i) => `f_rest_${i}`)].map((name, place) => [name, place]));
   async function* batches() {
@@ -45,7 +47,7 @@ export function unpacked(count, degree, unpack) {
       yield rows;
     }
   }
-  return { count, degree, width, at, batches };
+  return { count, degree, width, at, rendering, batches };
 }
 
 /**
@@ -76,7 +78,7 @@ const STEPS = Float32Array.from({ length: 256 }, (_, i) => (i === 0 ? -4 : i ===
  * @param {import("./ply.js").Header} header
  * @returns {SceneFile}
  */
-export function compressedPly(reader, { elements }) {
+export function compressedPly(reader, { elements, comments }) {
   const [chunk, vertex, sh] = elements, rest = sh ? Object.keys(sh.columns).length : 0;
   const wrong = chunk.name !== "chunk" || vertex?.name !== "vertex" || !(vertex.count > 0) || vertex.stride !== 16
     || chunk.count !== Math.ceil(vertex.count / CHUNK) || !(chunk.stride > 0) || !("packed_position" in vertex.columns)
@@ -91,7 +93,7 @@ export function compressedPly(reader, { elements }) {
     if (!rest) return;
     const bytes = await reader.take(count * rest);
     for (let i = 0; i < count; i++) for (let n = 0; n < rest; n++) into[i * width + HARMONICS + n] = STEPS[bytes[i * rest + n]];
-  });
+  }, plyRendering(comments, []));
 }
 
 /**
@@ -206,6 +208,8 @@ function spzScene(head, load, newest) {
   if (!count || degree > 4) throw new SceneError(words.scene.notGaussians);
   // degree 4 is skipped
   const drawn = Math.min(degree, 3), stored = ((degree + 1) ** 2 - 1) * 3, rest = ((drawn + 1) ** 2 - 1) * 3, coefficients = rest / 3;
+  // Spark sets the flag for all scenes; it writes old versions, without extension records.
+  const flags = head.getUint8(14), antialiased = Boolean(flags & 1) && (version === SPZ_4 || Boolean(flags & 2));
   /** @type {SpzAttributes | null} */
   let read = null;
   return unpacked(count, drawn, async (begin, into, width, some) => {
@@ -218,7 +222,7 @@ function spzScene(head, load, newest) {
       }
       if (rotated) rotate(into, i * width, coefficients);
     }
-  });
+  }, antialiased ? ANTIALIASED : CLASSIC);
 }
 
 /**

@@ -1,7 +1,8 @@
 // @ts-check
 /** Readers of PLY headers, and of Gaussians as the reference code of 3D Gaussian Splatting writes them. */
 import { SceneError } from "./byte_reader.js";
-import { BATCH } from "./packing.js";
+import { BATCH, SCALE_LOW } from "./packing.js";
+import { isFlat, plyRendering } from "./render_tag.js";
 import { words } from "../words.js";
 
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
@@ -9,7 +10,7 @@ import { words } from "../words.js";
 /**
  * @typedef {{offset: number, type: string}} Column `offset`: bytes from the start of a row
  * @typedef {{name: string, count: number, stride: number, columns: Record<string, Column>}} Element `stride`: bytes of a row
- * @typedef {{begin: number, elements: Element[]}} Header `begin`: bytes of the header
+ * @typedef {{begin: number, elements: Element[], comments: string[]}} Header `begin`: bytes of the header
  */
 
 const SIZES = /** @type {Record<string, number>} */ ({
@@ -33,7 +34,9 @@ export async function readHeader(reader) {
     if (end) {
       const begin = end.index + end[0].length;
       await reader.take(begin);
-      return { begin, elements: elementsOf(text.slice(0, end.index).split(/\r?\n/)) };
+      const lines = text.slice(0, end.index).split(/\r?\n/);
+      const comments = lines.filter((line) => line.startsWith("comment ")).map((line) => line.slice(8).trim());
+      return { begin, elements: elementsOf(lines), comments };
     }
     if (text.length < size) throw new SceneError(words.scene.cut);
     if (size >= LONGEST_HEADER) throw new SceneError(words.scene.notPly);
@@ -64,22 +67,60 @@ function elementsOf(lines) {
  * @param {Header} header
  * @returns {SceneFile}
  */
-export function plainPly(reader, { elements }) {
+export function plainPly(reader, { elements, comments }) {
   const [vertex] = elements, names = Object.keys(vertex?.columns ?? {}), rest = names.filter((name) => name.startsWith("f_rest_")).length;
-  const wrong = vertex?.name !== "vertex" || !(vertex.count > 0) || !(vertex.stride > 0) || NEEDED.some((name) => !vertex.columns[name]);
+  const wrong = vertex?.name !== "vertex" || !(vertex.count > 0) || !(vertex.stride > 0) || NEEDED.some((name) => !vertex.columns[name] && !(name === "scale_2" && isFlat(names)));
   if (wrong || !(rest in DEGREES)) {
     const variant = vertex?.columns.opacity && vertex.columns.rot_0; // such as colors of 8 bits, or SH degree 4
     throw new SceneError(variant ? words.scene.notShown("This kind of PLY") : words.scene.notGaussians);
   }
+  const flat = isFlat(names), at = Object.fromEntries([...names, ...(flat ? ["scale_2"] : [])].map((name, place) => [name, place]));
   return {
-    count: vertex.count, degree: DEGREES[rest], width: names.length,
-    at: Object.fromEntries(names.map((name, place) => [name, place])),
+    count: vertex.count, degree: DEGREES[rest], width: names.length + Number(flat), at,
+    rendering: plyRendering(comments, names),
     async *batches() {
       for (let begin = 0; begin < vertex.count; begin += BATCH) {
-        yield floats(vertex, await reader.take(Math.min(BATCH, vertex.count - begin) * vertex.stride));
+        const rows = floats(vertex, await reader.take(Math.min(BATCH, vertex.count - begin) * vertex.stride));
+        if (at.filter_3D !== undefined) applyFilter(rows, names.length, at);
+        yield flat ? withoutThickness(rows, names.length) : rows;
       }
     },
   };
+}
+
+/**
+ * Convolve Gaussians with the 3D filters of Mip-Splatting, as `sgsst_core/files/mip_filter.py` does.
+ *
+ * @param {Float32Array} rows
+ * @param {number} width
+ * @param {Record<string, number>} at
+ */
+function applyFilter(rows, width, at) {
+  for (let o = 0; o < rows.length; o += width) {
+    const filter = 2 * Math.log(Math.abs(rows[o + at.filter_3D]));
+    let ratio = 0;
+    for (const place of [at.scale_0, at.scale_1, at.scale_2]) {
+      if (place === undefined) continue;
+      const before = rows[o + place], larger = Math.max(2 * before, filter), smaller = Math.min(2 * before, filter);
+      const after = (larger + Math.log1p(Math.exp(smaller - larger))) / 2;
+      rows[o + place] = after;
+      ratio += before - after;
+    }
+    const logit = rows[o + at.opacity], filtered = ratio - Math.log1p(Math.exp(-logit));
+    if (ratio < 0) rows[o + at.opacity] = filtered - Math.log(-Math.expm1(filtered));
+  }
+}
+
+/**
+ * Return rows with a last value for the missing scale_2.
+ *
+ * @param {Float32Array} rows
+ * @param {number} width
+ */
+function withoutThickness(rows, width) {
+  const count = rows.length / width, found = new Float32Array(count * (width + 1)).fill(SCALE_LOW);
+  for (let row = 0; row < count; row++) found.set(rows.subarray(row * width, (row + 1) * width), row * (width + 1));
+  return found;
 }
 
 /**

@@ -15,6 +15,7 @@ import { words } from "../words.js";
  * @property {number} degree degree of spherical harmonics
  * @property {number} width number of values in a row
  * @property {Record<string, number>} at index of each value in a row
+ * @property {import("./render_tag.js").Rendering} rendering
  * @property {() => AsyncGenerator<Float32Array>} batches `BATCH` rows each, fewer in the last one
  */
 

@@ -35,7 +35,7 @@ async function load(source, room) {
   degree = keptDegree(file, room);
   centers = new Float32Array(file.count * 3);
   reach = new Float32Array(file.count);
-  port.postMessage({ kind: "header", header: { count: file.count, degree: file.degree, size }, degree });
+  port.postMessage({ kind: "header", header: { count: file.count, degree: file.degree, size, rendering: file.rendering }, degree });
   for await (const rows of file.batches()) give(rows, file);
   reader.end();
   port.postMessage({ kind: "done", middle: middle() });

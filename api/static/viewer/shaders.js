@@ -2,9 +2,9 @@
 /**
  * Shaders: EWA splatting as in `sgsst render`, drawn once with two colors.
  *
- * Gaussians are dilated by 0.3 square pixels, alpha is clamped between 1/255 and 0.99, and slopes are clamped at 1.3
- * times half the field of view. The determinant is a sum of squares (Cauchy-Binet), so that thin Gaussians cause no
- * cancellation.
+ * Gaussians are blurred by 0.3 square pixels, or as their file states; if it is antialiased, their opacity is
+ * compensated for that. Alpha is clamped between 1/255 and 0.99, and slopes are clamped at 1.3 times half the field of
+ * view. The determinant is a sum of squares (Cauchy-Binet), so that thin Gaussians cause no cancellation.
  */
 import { harmonicTexels, SCALE_LOW, SCALE_RANGE } from "./packing.js";
 
@@ -49,7 +49,8 @@ uniform sampler2D leftColors, rightColors;
 uniform mat3 axes;          // columns: right, down, forward
 uniform vec3 eye;
 uniform vec2 focal, size, fade;
-uniform float near;
+uniform float near, eps2d;
+uniform bool antialiased;
 out vec3 leftColor, rightColor;
 out vec2 at;
 flat out float opacity;
@@ -73,9 +74,11 @@ void main() {
   vec3 along = (axes[0] * turned) * s, across = (axes[1] * turned) * s, ahead = (axes[2] * turned) * s;
   vec2 most = 0.65 * size / focal, slope = clamp(center.xy / center.z, -most, most);
   vec3 m = focal.x / center.z * (along - slope.x * ahead), n = focal.y / center.z * (across - slope.y * ahead);
-  float A = dot(m, m) + 0.3, B = dot(m, n), C = dot(n, n) + 0.3;
+  float A = dot(m, m) + eps2d, B = dot(m, n), C = dot(n, n) + eps2d;
   vec3 minors = cross(m, n);
-  float determinant = dot(minors, minors) + 0.3 * (A + C - 0.3);
+  float unblurred = dot(minors, minors), determinant = unblurred + eps2d * (A + C - eps2d);
+  if (antialiased) opacity *= sqrt(unblurred / determinant);
+  if (!(opacity * 255. >= 1.)) return;
   float longer = 0.5 * (A + C) + sqrt(0.25 * (A - C) * (A - C) + B * B), shorter = determinant / longer;
   vec2 d = A >= C ? vec2(longer - C, B) : vec2(B, longer - A);
   d = dot(d, d) > 1e-20 ? normalize(d) : vec2(1, 0);

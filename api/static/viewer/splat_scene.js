@@ -5,7 +5,7 @@ import { words } from "../words.js";
 
 /** @typedef {{center: number[], radius: number, low: number[], high: number[]}} Middle */
 /** @typedef {import("./depth_order.js").Pose} Pose */
-/** @typedef {{count: number, degree: number, size: number}} Shown values of a file's header */
+/** @typedef {{count: number, degree: number, size: number, rendering: import("./render_tag.js").Rendering}} Shown values of a file's header */
 
 /** Maximum bytes of textures; lower on devices with little memory, such as phones. */
 const MEMORY = (/** @type {any} */ (navigator).deviceMemory ?? 8) >= 8 ? 1.5e9 : 4e8;

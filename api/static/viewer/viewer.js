@@ -1,6 +1,7 @@
 // @ts-check
 /** Viewer of one or two scenes with two color sets and a wipe between them. It draws only after a change. */
 import { ViewCamera } from "./camera.js";
+import { CLASSIC } from "./render_tag.js";
 import { lineFragment, lineVertex, overBackground, splatFragment, splatVertex, wholeVertex } from "./shaders.js";
 import { SplatScene } from "./splat_scene.js";
 import { words } from "../words.js";
@@ -310,6 +311,9 @@ export class Viewer {
     this.setView(at, width, height);
     gl.uniform2f(at("fade"), 1 - (left.fade ?? 0), 1 - (right.fade ?? 0));
     gl.uniform1f(at("cut"), cut);
+    const { antialiased, eps2d } = scene.header?.rendering ?? CLASSIC;
+    gl.uniform1f(at("eps2d"), eps2d);
+    gl.uniform1i(at("antialiased"), Number(antialiased));
     const textures = { geometry: scene.geometry, leftColors: scene.colors.get(left.colors) ?? own, rightColors: scene.colors.get(right.colors) ?? own, harmonics: scene.harmonics };
     Object.entries(textures).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);

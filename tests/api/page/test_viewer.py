@@ -6,6 +6,7 @@ import gzip
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,13 @@ from sgsst_core.files.formats.quantized import SH_C0
 from sgsst_core.files.formats.splat import ROW
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import Rendering
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.page.browser import Watched, decoded, psnr, rendered, serve_files, view_script
+from tests.sgsst_core.files.test_filtered_and_flat_scenes import with_filter, without_thickness
 from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.slow
@@ -86,6 +91,50 @@ def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path
     for camera in views[:2]:
         found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
         assert psnr(found, rendered(ply, camera)) >= FAITHFUL, camera.name
+    watched.check()
+
+
+@pytest.mark.parametrize("eps2d", [0.3, 0.1])
+@pytest.mark.parametrize("form", ["ply", "compressed.ply", "spz", "v4.spz", "glb"])
+def test_antialiased_scenes_are_shown_as_such(visit: Visit, tmp_path: Path, form: str, eps2d: float) -> None:
+    scene = replace(dust(), rendering=Rendering("antialiased", eps2d))
+    ply, _, _ = write_files(tmp_path, scene, cameras(2, 120, 90))
+    write_scene(ply, scene, by_name(form))
+    assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=True)
+
+
+def test_filtered_and_flat_scenes_are_shown(visit: Visit, tmp_path: Path) -> None:
+    ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
+    watched = visit("/#/jobs")
+    with_filter(ply, dust(), torch.linspace(0, 0.02, len(dust())))
+    assert_shown_like(watched, tmp_path, ply, differs=True)
+    without_thickness(ply, dust())
+    assert_shown_like(watched, tmp_path, ply, differs=False)
+
+
+def test_flag_that_spark_sets_is_ignored(visit: Visit, tmp_path: Path) -> None:
+    ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
+    write_scene(ply, replace(dust(), rendering=Rendering("antialiased")), by_name("spz"))
+    data = bytearray(gzip.decompress(ply.read_bytes())[:-12])
+    data[14] = 1
+    ply.write_bytes(gzip.compress(bytes(data)))
+    assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=False)
+
+
+def dust() -> Scene:
+    """Return a scene of many Gaussians smaller than a pixel."""
+    return replace(wall(sh_degree=1), scales=torch.tensor([0.02, 0.012, 0.01]).log().repeat(616, 1))
+
+
+def assert_shown_like(watched: Watched, folder: Path, scene: Path, *, differs: bool) -> None:
+    """Assert that the page shows a scene like `sgsst render`, and whether a classic render differs clearly."""
+    camera = cameras(2, 120, 90)[0]
+    found = decoded(shown(watched, folder, camera.name, (camera.width, camera.height)))
+    assert psnr(found, rendered(scene, camera)) >= FAITHFUL
+    classic = read_scene(scene).rendered("classic", None).scene
+    image = make_rasterizer("cpu", classic).render(scene_colors(classic, camera), camera)
+    expected = np.rint(image.clamp(0, 1).double().numpy() * 255)
+    assert (psnr(found, expected) < 35) == differs
     watched.check()
 
 
