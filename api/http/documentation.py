@@ -146,6 +146,7 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
         schemas[model.__name__] = schema
     for path in document["paths"].values():
         for method, operation in path.items():
+            operation["summary"] = operation["description"].partition("\n")[0].partition(". ")[0].rstrip(".")
             for parameter in operation.get("parameters", []):
                 # The header is required. It has a default only because tus requires status 412, not 422, without it.
                 if parameter["name"] == "Tus-Resumable":
