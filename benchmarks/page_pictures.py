@@ -74,7 +74,7 @@ def take(
     ids = [submit(service, files | {"style": style}, parameters | {"name": f"plush, {style.stem}"}) for style in styles]
     page.goto(f"{service.url}/#/jobs/{ids[0]}")
     page.locator(".preview img").wait_for()
-    page.get_by_text("All scales · step").wait_for()
+    page.get_by_text("Adding detail · step").wait_for()
     wait_for(lambda: shown_step(page) >= options.steps // 2, "half of the steps")
     save(watched, "watch", folder)
     page.locator(".badge", has_text="Done").wait_for()

@@ -436,7 +436,7 @@ def test_client_commands(service: Service, files: dict[str, Path], expected: byt
     assert json.loads((tmp_path / "plan.json").read_text())["decisions"]
     wrong = sgsst("submit", str(files["style"]), "--style", str(files["style"]), "--orbit", "3")
     assert (wrong.returncode, "is not a scene file" in wrong.stderr) == (2, True)
-    assert sgsst("status", "job_00000000000000000000").returncode == 2
+    assert sgsst("status", "job_00000000000000000000").returncode == 3
 
     with Client(service.url) as client:
         found = client.wait(
