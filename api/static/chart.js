@@ -65,7 +65,7 @@ export class LossChart {
       /** @type {[number, number][]} */ (points.filter((p) => (value(p) ?? 0) > 0).map((p) => [p.seconds, value(p)]));
     const scales = Math.max(0, ...sos.map((point) => point.scales?.length ?? 0)), mean = (/** @type {Point} */ p) => p.mean_loss ?? p.loss;
     return [
-      { name: words.chart.single, kind: "single", line: line(sos, (p) => p.loss) },
+      ...(sos.some((p) => p.mean_loss) ? [{ name: words.chart.single, kind: "single", line: line(sos, (p) => p.loss) }] : []),
       { name: words.chart.coarse, kind: "coarse", line: line(of("coarse"), mean) },
       ...(scales > 1 ? Array.from({ length: scales }, (_, n) => ({ name: words.chart.scale(n), kind: `scale scale${n % 5}`, line: line(sos, (p) => (p.mean_scales ?? p.scales)?.[n]) })) : []),
       { name: words.chart.all, kind: "all", line: line(sos, mean) },

@@ -48,6 +48,22 @@ def test_result_is_downloaded_in_every_format(visit: Visit, finished: str) -> No
     watched.check()
 
 
+def test_chart_ends_with_the_loss_of_the_result(visit: Visit, service: Service, finished: str) -> None:
+    """The page draws the mean over a round of views, which the job's result states too, and single views thin."""
+    job = httpx.get(f"{service.url}/v1/jobs/{finished}").json()
+    points = httpx.get(f"{service.url}/v1/jobs/{finished}/progress").json()["points"]
+    assert points[-1]["mean_loss"] == pytest.approx(job["result"]["loss_after"])
+    assert points[-1]["mean_loss"] != points[-1]["loss"]
+    watched = visit(f"/#/jobs/{finished}")
+    legend = watched.page.locator(".legend")
+    legend.get_by_text("mean of all views").wait_for()
+    legend.get_by_text("single views").wait_for()
+    label = watched.page.get_by_role("img", name="Loss against seconds").get_attribute("aria-label")
+    shown = float(label.split(" to ")[1].split(" in ")[0].replace(",", ""))
+    assert shown == pytest.approx(job["result"]["loss_after"], rel=0.01)
+    watched.check()
+
+
 def test_result_comes_before_deletion_on_a_phone(visit: Visit, finished: str) -> None:
     watched = visit(f"/#/jobs/{finished}", width=390, height=844)
     page = watched.page
