@@ -5,6 +5,7 @@ import { readCameras } from "./cameras.js";
 import { h, put } from "./dom.js";
 import { labels } from "./names.js";
 import { Stage } from "./stage.js";
+import { requestedRendering } from "./viewer/render_tag.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./viewer/viewer.js").Side} Side */
@@ -73,7 +74,8 @@ export class ResultStage {
     const scene = viewer.open(new URL(`/v1/jobs/${job.id}/inputs/scene`, location.href).href);
     this.stage.show({ scene, colors: "own" });
     try {
-      await scene.headerRead;
+      const header = await scene.headerRead;
+      header.rendering = requestedRendering(header.rendering, job.parameters);
       scene.ready.then(() => this.standFirst(), (error) => this.tell(error));
       this.original = scene;
       this.choices.set("original", { name: say.original, side: { scene, colors: "own" } });
@@ -94,7 +96,7 @@ export class ResultStage {
     const { viewer } = this.stage, name = this.jobs.length > 1 ? labels(this.jobs)[this.jobs.indexOf(job)] : say.stylized;
     if (!viewer || this.signal.aborted) return;
     const fade = job.parameters.sh_attenuation ?? 0;
-    if (this.original && sceneOf(job) === sceneOf(this.jobs[0])) {
+    if (this.original && sceneOf(job) === sceneOf(this.jobs[0]) && drawnAlike(job, this.jobs[0])) {
       try {
         const answer = await ask("GET", artifactPath(job.id, "colors.f16"), { signal: this.signal });
         await this.original.addColors(job.id, /** @type {ReadableStream<Uint8Array>} */ (answer.body));
@@ -142,6 +144,9 @@ export class ResultStage {
     this.stage.end();
   }
 }
+
+/** @param {any} a @param {any} b @returns {boolean} whether two jobs draw their scene in the same render mode */
+const drawnAlike = ({ parameters: a }, { parameters: b }) => a.render_mode === b.render_mode && a.eps2d === b.eps2d;
 
 /** @param {any} job @returns {string} digest of the job's scene */
 export const sceneOf = (job) => job.inputs.find((/** @type {any} */ input) => input.role === "scene")?.sha256 ?? job.id;

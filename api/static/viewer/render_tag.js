@@ -51,5 +51,18 @@ export function extrasRendering(extras) {
  */
 export const isFlat = (names) => names.includes("scale_1") && !names.includes("scale_2") && !names.includes("scale");
 
+/**
+ * Return the render mode of a job, whose parameters may replace what the file states.
+ *
+ * @param {Rendering} stated
+ * @param {{render_mode?: string, eps2d?: number | null}} parameters
+ * @returns {Rendering}
+ */
+export function requestedRendering(stated, { render_mode = "auto", eps2d }) {
+  const antialiased = render_mode === "auto" ? stated.antialiased : render_mode === "antialiased";
+  const own = antialiased === stated.antialiased ? stated.eps2d : EPS2D;
+  return { antialiased, eps2d: eps2d ?? own };
+}
+
 /** @param {number} eps2d */
 const usable = (eps2d) => (eps2d > 0 && eps2d <= MAX_EPS2D ? eps2d : null);

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import resized
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, drop, expand, set_options, submit
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
@@ -271,6 +276,28 @@ def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service
         wanted = rendered(path, camera)
         watched.wipe(key)
         assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered image
+    watched.check()
+
+
+def test_requested_render_mode_is_shown(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """The stored scene states no mode, so that the job's parameters decide."""
+    small = files["scene"].with_name("small.ply")
+    scene = wall(100, 80)
+    scene = replace(scene, scales=torch.full_like(scene.scales, math.log(0.006)))
+    write_scene(small, scene)
+    job_id = done(service, submit(service, files | {"scene": small}, name="antialiased", render_mode="antialiased"))
+    result = files["scene"].with_name("stylized.ply")
+    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    assert read_scene(result).scene.rendering.antialiased
+    watched = visit(f"/#/jobs/{job_id}", width=600, height=500)
+    watched.page.get_by_label("Camera", exact=True).select_option("1")
+    camera = resized(read_cameras(files["cameras"])[1], 384)
+    watched.wipe("Home")
+    wanted = rendered(result, camera)
+    classic = read_scene(result).rendered("classic", None).scene
+    other = make_rasterizer("cpu", classic).render(scene_colors(classic, camera), camera).clamp(0, 1).numpy() * 255
+    found = frame_of(watched, wanted)
+    assert psnr(found, wanted) > psnr(found, other) + 6
     watched.check()
 
 
