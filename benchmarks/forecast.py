@@ -1,6 +1,6 @@
 """Forecast of the time of a step on one H200, from counted operations, bytes and kernel launches.
 
-python -m benchmarks.forecast [--launches 494]
+python -m benchmarks.forecast [--launches 509]
 
 Nothing here is measured on a GPU: peak rates come from the data sheet, and `SHARES` below contains assumed fractions of
 them. The work of feature network, image pyramid, colors and content loss is counted by running the project's own code
@@ -41,8 +41,8 @@ BANDWIDTH, MEMORY, L2 = 4.8e12, 141e9, 50e6
 #: Thread instructions per second: the data sheet counts a fused multiply-add as two float32 operations.
 LANES = PEAKS["float32"] / 2
 PRECISIONS = ("float32", "tf32", "bfloat16")
-#: Kernel launches of a step on a fully cached view of an object scan in bfloat16, as counted by `device_counts`.
-LAUNCHES = 494
+#: Kernel launches of a step on a fully cached view in bfloat16, as counted by `device_counts`.
+LAUNCHES = 509
 #: Launches to compute a view's tile intersections: two multi-pass sorts, a multi-pass sum, kernels and copies.
 LIST_LAUNCHES = 40
 #: Instructions per pixel for a pair of Gaussian and raster tile, from the source of `blend_weights` and its callers:
