@@ -26,6 +26,7 @@ from triton.compiler import ASTSource
 
 from benchmarks.machine import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
+from sgsst_core.features import pooling_triton_kernels as pooling_kernels
 from sgsst_core.features import statistics_kernels
 from sgsst_core.features.statistics import (
     FLUSH,
@@ -147,6 +148,15 @@ KERNELS: dict[str, Target] = {
     "render": Target(kernels.render, _CUTS, 8),
     "slot_gradients": Target(kernels.slot_gradients, _CUTS, 8),
     "add_slots": Target(kernels.add_slots, _ADDED, 4, {"slots": "*fp32"}),
+    **{
+        f"max_pool_backward_{form}": Target(
+            pooling_kernels.max_pool_backward,
+            {"CHANNELS": 64, "MASK": torch.iinfo(integers).max, "BLOCK": pooling_kernels.BLOCK.value},
+            4,
+            {"gradient": types, "source": types, "out": types, "height": "i32", "entries": "i32"},
+        )
+        for form, integers, types in (("float32", torch.int32, "*i32"), ("bfloat16", torch.int16, "*i16"))
+    },
     "survey": Target(kernels.survey, _CUTS, 8, {"height": "i32"}),
     "add_slot_weights": Target(kernels.add_slot_weights, _ADDED, 4, {"slots": "*fp32"}),
     "count_pieces": Target(cached_kernels.count_pieces, _CUTS, 8),

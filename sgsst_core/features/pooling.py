@@ -1,7 +1,8 @@
 """2x2 max pooling of ReLU outputs, and a backward pass through both the pooling and the ReLU.
 
-The backward pass recomputes the positions of maxima instead of storing them. On a CPU, one kernel recomputes them and
-distributes the gradient, since both need the ReLU's output. `max_pool_backward_reference` is the reference.
+The backward pass recomputes the positions of maxima instead of storing them. One kernel, of Numba on a CPU and of
+Triton on a GPU, recomputes them and distributes the gradient, since both need the ReLU's output.
+`max_pool_backward_reference` is the reference.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from sgsst_core.devices import on_device
+from sgsst_core.scene.spherical_harmonics import triton_runs_on
 
 #: Integer types by bytes per value.
 _INTEGERS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
@@ -40,6 +44,8 @@ def max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
         gradient: Gradient of the maxima, [1, c, h // 2, w // 2].
         source: ReLU output, [1, c, h, w]. If a window has several equal maxima, the first one gets the gradient.
     """
+    if has_kernel(source):
+        return fused_max_pool_backward(gradient, source)
     if not _is_compiled_for(source):
         return max_pool_backward_reference(gradient, source)
     from sgsst_core.compiled import kernel_threads
@@ -51,6 +57,28 @@ def max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
         slopes, nothing = _integers(_cells(gradient)), cells.dtype.type(0)
         kernels.max_pool_backward(slopes, cells, nothing, _all_but_sign(cells), _integers(out))
     return out.permute(2, 0, 1).unsqueeze(0)
+
+
+def fused_max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
+    """Compute `max_pool_backward` in one launch of a Triton kernel, which reads and writes each value once."""
+    from sgsst_core.features import pooling_triton_kernels as kernels
+
+    cells, slopes = (_cells(values).view(_INTEGERS[values.element_size()]) for values in (source, gradient))
+    height, width, channels = cells.shape
+    out, block = source.new_empty(cells.shape), kernels.BLOCK.value
+    entries = -(-height // 2) * -(-width // 2) * channels
+    if entries:
+        with on_device(source.device):
+            kernels.max_pool_backward[(-(-entries // block),)](
+                slopes, cells, out.view(cells.dtype), height, width, entries,
+                CHANNELS=channels, MASK=torch.iinfo(cells.dtype).max, BLOCK=block,
+            )  # fmt: skip
+    return out.permute(2, 0, 1).unsqueeze(0)
+
+
+def has_kernel(source: Tensor) -> bool:
+    """Return whether there is a Triton kernel for the backward pass of a ReLU output."""
+    return source.device.type == "cuda" and source.element_size() <= 4 and triton_runs_on(source.device)
 
 
 def max_pool_backward_reference(gradient: Tensor, source: Tensor) -> Tensor:

@@ -141,7 +141,7 @@ def compile_instruction(instruction: Instruction) -> Execute:
     elif name == "mov":
         function, types = np.copy, [type_]
     else:
-        function, types = arithmetic(opcode), [type_] * (len(operands) - 1)
+        function, types = arithmetic(opcode), ["u32" if type_.endswith("x2") else type_] * (len(operands) - 1)
         if name in ("shl", "shr"):
             types[1] = "u32"
         if name == "bfe":

@@ -104,6 +104,9 @@ def comparison(opcode: tuple[str, ...]) -> Operation:
 def arithmetic(opcode: tuple[str, ...]) -> Operation:
     """Return the function of an arithmetic, logical or bit instruction; it takes operands of the opcode's type."""
     name, type_ = opcode[0], opcode[-1]
+    if type_.endswith("x2"):  # two values side by side in 32 bits
+        each, half = arithmetic((*opcode[:-1], type_[:-2])), dtype_of(type_[:-2])
+        return lambda *v: each(*(np.ascontiguousarray(one).view(half) for one in v)).view(np.uint32)
     dtype = dtype_of(type_)
     if "wide" in opcode:
         wides: dict[Any, Any] = {np.int32: np.int64, np.uint32: np.uint64, np.int16: np.int32, np.uint16: np.uint32}

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from sgsst_core.features.pooling import fused_max_pool_backward, max_pool_backward_reference
 from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
 from sgsst_core.loss.statistics_terms import fused_add_style_gradient
 from sgsst_core.rasterizer import make_rasterizer
@@ -47,6 +48,23 @@ def test_statistics_of_a_large_image_agree_with_float64() -> None:
         statistics = fused_statistics(image)
     assert relative_error(statistics.mean, exact.mean) < 1e-6
     assert relative_error(statistics.centered, exact.centered) < 1e-6
+
+
+@pytest.mark.parametrize("capability", [80, 90])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("size", [(12, 10), (13, 11), (1, 5)])
+def test_gradients_of_pooling_are_those_of_the_reference(
+    capability: int, dtype: torch.dtype, size: tuple[int, int]
+) -> None:
+    """Values on a coarse grid, so that most windows have ties, and some are all zero."""
+    generator = torch.Generator().manual_seed(0)
+    source = torch.randn((1, *size, 64), generator=generator).round().to(dtype).permute(0, 3, 1, 2).relu_()
+    gradient = torch.randn((1, size[0] // 2, size[1] // 2, 64), generator=generator).to(dtype).permute(0, 3, 1, 2)
+    with compiled_kernels(capability):
+        found = fused_max_pool_backward(gradient, source)
+    expected = torch.zeros_like(source) if min(size) < 2 else max_pool_backward_reference(gradient, source)
+    assert found.is_contiguous(memory_format=torch.channels_last)
+    assert torch.equal(found, expected)
 
 
 def sparse(shape: tuple[int, ...], strides: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -111,6 +129,26 @@ def test_shifted_masks_are_reported() -> None:
             with kernel.changed(number, replace(instruction, opcode=("setp", "le", *instruction.opcode[2:]))):
                 try:
                     reported += not torch.equal(fused_statistics(features).centered, exact.centered)
+                except FaultError:
+                    reported += 1
+    assert reported >= 3
+
+
+def test_shifted_masks_of_pooling_are_reported() -> None:
+    """With odd sides, each mask keeps the windows that the border cuts from reading or writing beyond it."""
+    generator = torch.Generator().manual_seed(0)
+    source = torch.randn((1, 7, 5, 16), generator=generator).permute(0, 3, 1, 2).relu_()
+    gradient = torch.randn((1, 3, 2, 16), generator=generator).permute(0, 3, 1, 2)
+    reported = 0
+    with compiled_kernels(80) as driver:
+        exact = fused_max_pool_backward(gradient, source)
+        kernel = driver.kernels["max_pool_backward"]
+        for number, instruction in enumerate(kernel.program.instructions):
+            if instruction.opcode[:2] != ("setp", "lt"):
+                continue
+            with kernel.changed(number, replace(instruction, opcode=("setp", "le", *instruction.opcode[2:]))):
+                try:
+                    reported += not torch.equal(fused_max_pool_backward(gradient, source), exact)
                 except FaultError:
                     reported += 1
     assert reported >= 3
