@@ -816,7 +816,7 @@ TEXTS = [
     '{"background": [1e999, 0, 0]}',
     '{"background": [2, 0, 0]}',
     '{"background": [0, 0, 0, 0]}',
-    '{"background": "black"}',
+    '{"background": "no color"}',
     '{"name": "\\ud800"}',
     '{"name": "a\\u0000b"}',
     '{"name": {"$ne": null}}',
