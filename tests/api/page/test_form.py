@@ -225,3 +225,28 @@ def test_form_works_without_webgl(browser: Any, service: Service, files: dict[st
     page.get_by_role("button", name="Remove scene.ply").wait_for()
     watched.check("WebGL")
     bare.close()
+
+
+def test_estimate_warns_and_can_be_stopped(visit: Visit, files: dict[str, Path]) -> None:
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    page.locator("[data-name=resolution]").wait_for()
+    page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
+    page.get_by_role("button", name="Add a region").click()
+    page.get_by_role("group", name="Region 1").get_by_label("Name").fill("empty")
+    page.get_by_role("group", name="Region 1").get_by_label("Select").fill("half-space=0,0,1,99")
+    page.get_by_role("group", name="Region 1").get_by_label("Freeze").check()
+    held: list[Any] = []
+    page.route("**/v1/jobs?dry_run=true", lambda route: held.append(route))
+    page.get_by_role("button", name="Estimate time").click()
+    wait_for(lambda: page.evaluate("1") and held, "the request")
+    page.get_by_role("button", name="Stop").click()
+    page.get_by_role("button", name="Stop").wait_for(state="hidden")
+    assert page.get_by_role("button", name="Estimate time").is_enabled()
+    page.unroute_all(behavior="ignoreErrors")
+    page.get_by_role("button", name="Estimate time").click()
+    cost = page.get_by_role("region", name="Estimate")
+    cost.get_by_role("alert").get_by_text("region empty: ignored, because it has no Gaussians").wait_for()
+    cost.get_by_text("for the whole job").wait_for()
+    watched.check("net::ERR")
