@@ -22,6 +22,7 @@ from sgsst_core.files.formats import RESULT_FORMATS, by_name
 from sgsst_core.files.formats.frame import Y_UP, Frame
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.rendering import Rendering
 from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.splat_scenes import cloud
 
@@ -130,6 +131,17 @@ def test_splat_transform_reads_written_scenes(modules: Path, scene: Scene, tmp_p
     write_scene(ours, scene, by_name(name))
     splat_transform(modules, ours, ply)
     assert_same(read_scene(ply).scene, read_scene(ours).scene, VALUES.get(name, 1e-4))
+
+
+@pytest.mark.parametrize("name", READ_BY_SPLAT_TRANSFORM)
+def test_render_mode_is_exchanged_with_splat_transform(modules: Path, scene: Scene, tmp_path: Path, name: str) -> None:
+    antialiased = Rendering("antialiased")
+    ours, ply, theirs = tmp_path / f"ours.{name}", tmp_path / "theirs.ply", tmp_path / f"theirs.{name}"
+    write_scene(ours, replace(scene, rendering=antialiased), by_name(name))
+    splat_transform(modules, ours, ply)
+    assert b"comment SplatRenderMode: mip" in ply.read_bytes()[:1000]
+    splat_transform(modules, ply, theirs)
+    assert read_scene(theirs).scene.rendering == antialiased
 
 
 @pytest.mark.parametrize(
