@@ -62,6 +62,6 @@ def test_violated_bounds_and_unexpected_errors_are_reported(monkeypatch: pytest.
         how, problem = outcome(job)
         assert how == "broken"
         assert "bound 0" in str(problem)
-    how, problem = outcome(replace(job, style=torch.zeros(4, 4, 5)))
+    how, problem = outcome(replace(job, scene=None))  # type: ignore[arg-type]
     assert how == "broken"
     assert "Error" in str(problem)
