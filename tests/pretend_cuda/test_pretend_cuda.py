@@ -122,6 +122,7 @@ def test_device_is_removed_after_the_block() -> None:
         torch.zeros(2, device="cuda")
 
 
+@pytest.mark.slow
 def test_doctor_describes_the_gpu(counts: Counts) -> None:
     assert doctor._gpu().text.startswith("1 x pretend, compute capability 9.0, CUDA ")
     assert doctor._memory(torch.device("cuda", 0)).text == "jobs plan with 105.2 GB of the GPU's memory"

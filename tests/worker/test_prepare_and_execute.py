@@ -52,6 +52,7 @@ def request_(tmp_path: Path) -> StylizeRequest:
     return small_request(tmp_path, 8)
 
 
+@pytest.mark.slow
 def test_planning_is_shown_and_resume_reuses_the_plan(request_: StylizeRequest, tmp_path: Path) -> None:
     whole = small_request(tmp_path / "whole", 8)
     run_job(prepare(whole))

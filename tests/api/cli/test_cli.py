@@ -68,6 +68,7 @@ def second_reader(path: Path) -> dict[str, np.ndarray]:
     return {name: values[:, i] for i, name in enumerate(names)}
 
 
+@pytest.mark.slow
 def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     other = files.style.with_name("other:2.png")
     Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
@@ -97,6 +98,7 @@ def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.Capture
     assert "the weight 0 is not a finite number greater than 0" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     other = files.style.with_name("other.png")
     Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
@@ -221,6 +223,7 @@ def test_stylize_changes_only_f_dc(files: Files, capsys: pytest.CaptureFixture[s
     assert len(report["history"]) == 3
 
 
+@pytest.mark.slow
 def test_same_command_writes_same_bytes(files: Files) -> None:
     main(files.stylize("--steps-sos", "3", "--seed", "5"))
     first = files.out.read_bytes()
@@ -286,6 +289,7 @@ def test_compute_everything_gives_same_scene(files: Files) -> None:
     torch.testing.assert_close(results[0], results[1], rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_photos_are_content_images(files: Files, tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -337,6 +341,7 @@ def test_orbit_auto_chooses_number_of_views(files: Files, capsys: pytest.Capture
     assert "--radius" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_drop_invalid_drops_invalid_gaussians(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     scene = wall()
     scene.opacities[7] = float("nan")
@@ -349,6 +354,7 @@ def test_drop_invalid_drops_invalid_gaussians(files: Files, capsys: pytest.Captu
     assert report["scene"]["dropped"] == 1
 
 
+@pytest.mark.slow
 def test_target_loss_stops_run_and_report_has_loss_over_time(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(files.stylize("--steps-sos", "60", "--target-loss", "0.8", "--learning-rate", "0.1")) == 0
     shown = capsys.readouterr().out
@@ -360,6 +366,7 @@ def test_target_loss_stops_run_and_report_has_loss_over_time(files: Files, capsy
     assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_converged_run_stops_early(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     """With almost no learning rate the loss does not fall, so the run ends after two windows of 24 steps."""
     options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9", "--no-bounded"]
@@ -419,6 +426,7 @@ def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pyt
     assert len(read_scene(folder / "standard.ply").scene) == len(wall())
 
 
+@pytest.mark.slow
 def test_bench_quality_writes_table_plot_images_and_scenes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     folder = files.out.with_name("bench")
     command = ["bench", "quality", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
@@ -538,6 +546,7 @@ def _shown_until(terminal: int, pattern: str | None) -> str:
     return shown
 
 
+@pytest.mark.slow
 def test_time_budget_writes_result_and_checkpoint(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     options = files.stylize("--steps-sos", "5")
     assert main([*options, "--max-seconds", "0.000001"]) == 0
@@ -561,6 +570,7 @@ def test_time_budget_writes_result_and_checkpoint(files: Files, capsys: pytest.C
     assert "this job is finished" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_new_job_mentions_old_checkpoint(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     main(files.stylize("--steps-sos", "3", "--max-seconds", "0.000001"))
     capsys.readouterr()

@@ -178,6 +178,7 @@ def test_short_help_and_completion(capsys: pytest.CaptureFixture[str]) -> None:
     assert found.stdout.split() == ["download"], found.stderr
 
 
+@pytest.mark.slow
 def test_service_that_restarts_is_waited_for(files: list[str], tmp_path: Path) -> None:
     """A refused connection ends a command only if the service has not responded before."""
     from api.client import Client

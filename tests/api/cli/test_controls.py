@@ -32,7 +32,7 @@ def command(name: str, folder: Path, *options: str) -> list[str]:
     return [name, str(ply), "--style", str(style), "--cameras", str(cameras), "--backbone", "vgg16", *options]
 
 
-@pytest.mark.parametrize("form", ["compressed.ply", "spz"])
+@pytest.mark.parametrize("form", [pytest.param("compressed.ply", marks=pytest.mark.slow), "spz"])
 def test_controls_take_effect_and_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
     out = tmp_path / "new" / f"out.{form}"
     steps = ["--steps-coarse", "1", "--steps-sos", "3"]

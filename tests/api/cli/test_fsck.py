@@ -46,7 +46,7 @@ def server() -> Iterator[str]:
         yield url
 
 
-@pytest.fixture(params=["local", "s3"])
+@pytest.fixture(params=["local", pytest.param("s3", marks=pytest.mark.slow)])
 def service(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Files]:
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "data"))
     monkeypatch.setenv("SGSST_MIN_FREE_BYTES", "0")
@@ -141,6 +141,7 @@ def kinds(found: dict[str, dict[str, str]]) -> dict[str, str]:
     return {name: finding["kind"] for name, finding in found.items()}
 
 
+@pytest.mark.slow
 def test_fsck_finds_a_thousand_lost_and_damaged_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

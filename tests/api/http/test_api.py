@@ -191,6 +191,7 @@ def test_style_scale_beyond_image_limit_is_rejected(client: httpx.Client, files:
         assert refused(answer, 422, "invalid-settings")["input"] == "style"
 
 
+@pytest.mark.slow
 def test_plan_lists_controls(client: httpx.Client, files: dict[str, bytes]) -> None:
     asked = {"preserve_colors": "luminance", "sh_attenuation": 0.5, "scales": [1, 0.5], "coarsest_side": 16}
     answer = client.post("/v1/jobs?dry_run=true", files=form(files), data={"parameters": json.dumps(asked)})
@@ -207,6 +208,7 @@ def test_missing_and_surplus_files_are_rejected(client: httpx.Client, files: dic
     refused(client.post("/v1/jobs", files=form(files, cameras=("a.exe", b"x"))), 422, "invalid-cameras")
 
 
+@pytest.mark.slow
 def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes]) -> None:
     """Styles keep their order, whether uploaded or sent, and each needs one weight."""
     other = png(40, 30, zlib.compress(bytes(30 * (1 + 3 * 40))))

@@ -642,7 +642,7 @@ NAMES = [
 ]
 
 
-@pytest.mark.parametrize("role", ["scene", "style", "photos"])
+@pytest.mark.parametrize("role", ["scene", "style", pytest.param("photos", marks=pytest.mark.slow)])
 def test_file_names_cannot_escape_folder(client: httpx.Client, service: Service, files: Files, role: str) -> None:
     before = {path for path in service.data.parent.rglob("*") if "blobs" not in path.parts}
     photos = [("photos", (f"view_{i}.png", picture("PNG", 64, 48))) for i in range(3)] if role == "photos" else []

@@ -50,6 +50,7 @@ def events(client: httpx.Client, files: dict[str, bytes], **parameters: Any) -> 
         return [sent for sent in source.iter_sse() if sent.data]
 
 
+@pytest.mark.slow
 def test_events_report_views_and_same_plan(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         *planning, last = events(client, files)
@@ -123,6 +124,7 @@ def photo(name: str) -> tuple[str, tuple[str, bytes]]:
     return "photos", (name, file.getvalue())
 
 
+@pytest.mark.slow
 def test_plan_lists_camera_and_photo_decisions(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         asked = request({**files, "cameras": blender(k1=0.1)})

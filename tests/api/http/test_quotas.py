@@ -163,6 +163,7 @@ def test_rejected_requests_release_quota(service: Service, files: dict[str, byte
             assert on_disk(service) <= before, f"request {number} has left its files"
 
 
+@pytest.mark.slow
 def test_dry_runs_and_full_queues_release_quota(tmp_path: Path, files: dict[str, bytes]) -> None:
     quick = {"parameters": json.dumps({"preset": "preview", "backbone": "vgg16", "resolution": 128})}
     with (
@@ -244,6 +245,7 @@ def stored_bytes(service: Service, owner: str) -> int:
 # --- one key beside another ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: dict[str, bytes]) -> None:
     """If the process that checks a hostile key's files is stopped, further files of that key wait, and no others."""
     with (

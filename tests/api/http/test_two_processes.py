@@ -173,6 +173,7 @@ def test_upload_is_locked_across_processes(pair: Pair) -> None:
     assert len(statuses & {409, 423}) == 1, statuses
 
 
+@pytest.mark.slow
 def test_interleaved_patches_from_two_processes(pair: Pair) -> None:
     run(pair, 300, seed=1)
 

@@ -71,6 +71,7 @@ def test_last_part_can_be_sent_again(files: dict[str, Path], tmp_path: Path, lin
         assert not any((service.data / "uploads").iterdir())
 
 
+@pytest.mark.slow
 def test_job_can_use_the_finished_upload_at_once(files: dict[str, Path], tmp_path: Path) -> None:
     with Service(tmp_path / "data", alone=True) as service:
         where = begin(service, files["scene"])

@@ -166,6 +166,7 @@ def test_api_and_dispatcher_share_a_bucket_and_no_folder(
     assert "<Key>" not in listing.text
 
 
+@pytest.mark.slow
 def test_parts_of_an_upload_go_to_any_api_process(environment: dict[str, str], tmp_path: Path) -> None:
     shared = {"SGSST_ARTIFACTS": "s3://results/uploads", "SGSST_DATABASE": f"sqlite:///{tmp_path / 'shared.db'}"}
     content = os.urandom(SIZE + 1000)

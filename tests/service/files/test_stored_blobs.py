@@ -281,6 +281,7 @@ def test_only_the_interrupted_chunk_is_fetched_again(fleet: Fleet, monkeypatch: 
     assert sum(method == "GET" for method, _ in fleet.s3.asked[before:]) == 11 + 2
 
 
+@pytest.mark.slow
 def test_store_outage_is_reported_as_unavailable(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"the scene"
     sha256 = fleet.take(fleet.host("one"), data)

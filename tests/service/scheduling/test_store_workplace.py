@@ -196,6 +196,7 @@ def _open_and_wait(job: StoreWorkplace, ready: Any) -> None:
     rank.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alone", [True, False])
 def test_folder_of_a_killed_rank_is_removed(job: StoreWorkplace, tmp_path: Path, alone: bool) -> None:
     """The helper process removes the folder; if it is killed too, the next rank on this machine does."""

@@ -48,6 +48,7 @@ def test_variants_are_evaluated_at_equal_times(tiny_weights: BackboneWeights, tm
     assert values["pareto_front"]
 
 
+@pytest.mark.slow
 def test_all_variants_are_evaluated_with_the_papers_loss(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -216,6 +216,7 @@ def test_view_without_cached_content_is_not_captured(tiny_weights: BackboneWeigh
     assert (graphs.captured, graphs.problem) == (0, None)
 
 
+@pytest.mark.slow
 def test_gpu_tiles_need_no_64_bit_indices(counts: Counts, tiny_weights: BackboneWeights) -> None:
     network = FeatureNetwork(tiny_weights, device="cuda")
     side, channels = 40_000, max(network.channels("relu1_1"), network.channels("relu1_2"))

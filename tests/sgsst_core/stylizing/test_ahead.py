@@ -170,6 +170,7 @@ def test_photos_with_cached_features_are_read_once(
     assert sorted(photos.asked) == list(range(VIEWS))
 
 
+@pytest.mark.slow
 def test_unreadable_photo_fails_the_step_that_needs_it(
     tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
 ) -> None:

@@ -206,6 +206,7 @@ def test_refinement_matches_one_rank() -> None:
         assert found.psnr == pytest.approx(alone.psnr, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ranks", "views_per_step"), [(1, 2), (2, 2), (4, 2), (3, 2), (2, 4)])
 def test_several_views_per_step_do_not_depend_on_rank_count(ranks: int, views_per_step: int) -> None:
     scene = wall()

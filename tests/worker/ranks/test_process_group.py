@@ -228,6 +228,7 @@ def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("expected", "patient"), [(None, True), (20.0, True), (0.1, False)], ids=["preparing", "slow", "quick"]
 )
