@@ -237,7 +237,8 @@ def test_compressed_scene_and_results_in_other_formats(
         for form in (each.name for each in EXTRA_FORMATS):
             first = client.get(where, params={"format": form})
             assert first.status_code == 200, first.text
-            assert first.headers["content-disposition"] == f'attachment; filename="stylized.{form}"'
+            suggested = f'attachment; filename="{scene.stem}_style-stylized.{form}"'
+            assert first.headers["content-disposition"].startswith(suggested)
             assert first.headers["content-type"] == by_name(form).media_type
             found = read(tmp_path, first.content)
             assert (found.format, len(found.scene)) == (form, len(ply.scene))
