@@ -25,7 +25,7 @@ from tests.small_scenes import wall, write_files
 pytestmark = pytest.mark.slow
 #: The job has to run for longer than two backups take, even on a busy machine.
 PARAMETERS = {
-    "steps_sos": 700,
+    "steps_sos": 1500,
     "early_stop": False,
     "steps_coarse": 0,
     "backbone": "vgg16",
