@@ -175,7 +175,7 @@ def test_core_commands_name_the_missing_extra(core: Path, tmp_path: Path, argume
 
 def test_core_includes_the_client(core: Path, tmp_path: Path) -> None:
     done = subprocess.run([core / "sgsst", "submit", "missing.ply", "--style", "a.jpg"], capture_output=True, text=True)
-    assert "missing.ply: is not a file" in done.stderr
+    assert "missing.ply: not a file" in done.stderr
 
 
 def test_migrations_create_the_database(installed: Path, tmp_path: Path) -> None:

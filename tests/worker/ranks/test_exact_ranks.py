@@ -182,8 +182,8 @@ def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str
 )
 @pytest.mark.slow
 def test_fifty_steps_match_one_rank_and_are_reproducible(scene: Scene) -> None:
-    """The learning rate is small: at that of `standard`, thirty steps amplify rounding errors by 1e4."""
-    values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False, "learning_rate": 0.01}
+    """The learning rate is small: twice as large, fifty steps amplify rounding errors by 1e4 on some processors."""
+    values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False, "learning_rate": 0.005}
     alone = stylize(ALONE, scene, 3, values)
     first, second = on_ranks(2, stylize, scene, 3, values)
     assert torch.equal(first["colors"], second["colors"])
