@@ -8,9 +8,9 @@ from pathlib import Path
 from rich.table import Table
 from torch import Tensor
 
-from sgsst_core.errors import OutputError, SettingsError
+from sgsst_core.errors import OutputError
 from sgsst_core.files.images import load_image
-from sgsst_core.quality.study import VARIANTS, Share, write_study
+from sgsst_core.quality.study import Share, check_names, write_study
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
@@ -42,8 +42,7 @@ def make_study(
         InvalidInputError: If an input cannot be used; the first one is reported.
     """
     named = [_named(text) for text in variants]
-    if len(named) not in VARIANTS:
-        raise SettingsError(f"{len(named)} scenes: a study compares {VARIANTS[0]} to {VARIANTS[-1]}. Name as many.")
+    check_names([name for name, _ in named])
     if page.is_dir() or page.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{page}: not the name of an HTML file. Give one, such as study.html.")
     check_folder(page.parent)

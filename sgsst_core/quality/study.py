@@ -111,6 +111,18 @@ class Share:
     high: float
 
 
+def check_names(names: Sequence[str]) -> None:
+    """Check the names of a study's variants.
+
+    Raises:
+        SettingsError: If there are not 2 to 4, or two are equal.
+    """
+    if len(names) not in VARIANTS:
+        raise SettingsError(f"Number of scenes: {len(names)}. A study compares {VARIANTS[0]} to {VARIANTS[-1]}.")
+    if len(set(names)) < len(names):
+        raise SettingsError("Two scenes have the same name. Name them as NAME=FILE.")
+
+
 def write_study(
     page: Path,
     key: Path,
@@ -133,10 +145,7 @@ def write_study(
         SettingsError: If the number of variants is not 2 to 4, or two have the same name.
         OutputError: If a file cannot be written.
     """
-    if len(names) not in VARIANTS:
-        raise SettingsError(f"{len(names)} variants: a study compares {VARIANTS[0]} to {VARIANTS[-1]}.")
-    if len(set(names)) < len(names):
-        raise SettingsError("Two variants have the same name. Name them as NAME=FILE.")
+    check_names(names)
     tokens = [[secrets.token_hex(8) for _ in names] for _ in range(views)]
     images = {}
     for index in range(len(names)):
@@ -206,7 +215,7 @@ def _read(kind: type[F], path: Path) -> F:
     try:
         return kind.model_validate_json(path.read_bytes())
     except OSError as error:
-        raise StudyError(f"{path}: cannot be read: {error.strerror}.") from error
+        raise StudyError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"

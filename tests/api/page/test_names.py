@@ -52,7 +52,7 @@ def test_job_is_renamed(visit: Visit, service: Service, files: dict[str, Path]) 
 
 
 def test_compared_jobs_have_different_labels(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """Labels are the names of the styles; equal ones are told apart, and both sides never show the same job."""
+    """Labels are the names of the styles, made distinct where they are equal; both sides never show the same job."""
     night = files["style"].with_name("night.png")
     Image.new("RGB", (64, 64), (20, 30, 90)).save(night)
     quick = STEPS | {"steps_coarse": 1, "steps_sos": 1, "name": "same"}
