@@ -73,6 +73,7 @@ def list_artifacts(job_id: JobId, context: ContextDep, caller: CallerDep) -> Art
 #: Media types of results (`service.files.artifacts`), and how the content of each starts.
 _CONTENT = {
     "application/octet-stream": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
+    "model/gltf-binary": "glTF\x02\0\0\0",
     "application/json": {"version": 1, "decisions": []},
     "text/html": "<!doctype html><html lang=en><title>Report</title></html>",
     "text/plain": "14:02:11 info    stylizing 616 Gaussians, 3 views\n",

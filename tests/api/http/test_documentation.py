@@ -13,6 +13,7 @@ from api.http.app import create_app
 from api.http.problems import MEDIA_TYPE
 from service.errors import LeaseLostError, ServiceError
 from service.settings import ServiceSettings
+from sgsst_core.files.formats import RESULT_FORMATS
 
 DOCUMENT: dict[str, Any] = create_app(ServiceSettings()).openapi()
 SCHEMAS: dict[str, Any] = DOCUMENT["components"]["schemas"]
@@ -125,3 +126,8 @@ def test_document_lists_every_error_code() -> None:
     }
     internal = {LeaseLostError.code}
     assert {kind.code for kind in subclasses(ServiceError)} - internal <= documented
+
+
+def test_media_type_of_every_result_format_is_documented() -> None:
+    content = DOCUMENT["paths"]["/v1/jobs/{job_id}/artifacts/{name}"]["get"]["responses"]["200"]["content"]
+    assert {each.media_type for each in RESULT_FORMATS} <= content.keys()

@@ -90,7 +90,7 @@ def test_what_was_entered_survives_other_views(visit: Visit, files: dict[str, Pa
     page.get_by_role("button", name="Add a region").click()
     page.get_by_role("group", name="Region 1").get_by_label("Name").fill("left")
     page.get_by_role("link", name="Jobs").click()
-    page.get_by_role("link", name="New").click()
+    page.get_by_role("link", name="New", exact=True).click()
     for path in files.values():
         page.get_by_role("button", name=f"Remove {path.name}").wait_for()
     page.get_by_text("616 Gaussians").wait_for()

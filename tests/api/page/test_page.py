@@ -120,7 +120,7 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     page.locator(".badge", has_text="Canceled").wait_for()
 
     sent.clear()  # the same files again: the service has them
-    page.get_by_role("link", name="New").click()
+    page.get_by_role("link", name="New", exact=True).click()
     set_options(watched, **LONG)
     choose(watched, files | {"scene": big})
     page.get_by_role("button", name="Start").click()
@@ -400,7 +400,7 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
         ann.page.goto(f"{service.url}/#/jobs/{job_id}")
         ann.page.locator(".badge", has_text="Done").wait_for()
         ann.settled()
-        ann.page.get_by_role("link", name="New").click()
+        ann.page.get_by_role("link", name="New", exact=True).click()
         choose(ann, {"scene": files["scene"]})
         ann.context.clear_cookies()  # as if the session had expired
         ann.page.get_by_role("link", name="Jobs").click()
@@ -408,7 +408,7 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
         ann.page.get_by_label("API key").fill(keys[0])
         ann.page.get_by_role("button", name="Sign in").click()
         ann.page.locator(".tile", has_text="of ann").wait_for()
-        ann.page.get_by_role("link", name="New").click()
+        ann.page.get_by_role("link", name="New", exact=True).click()
         ann.page.get_by_role("button", name="Remove scene.ply").wait_for()
         ann.page.get_by_role("button", name="Sign out").click()
         ann.page.locator("main").get_by_text("You signed out.").wait_for()
