@@ -1,4 +1,4 @@
-"""Parser of style options: image files with optional weights, FILE or FILE:WEIGHT."""
+"""Parser of files with optional weights, FILE or FILE:WEIGHT: style images, and scenes of a blend."""
 
 from __future__ import annotations
 
@@ -28,6 +28,14 @@ class StyleFile:
         return str(self.path) if self.weight == 1 else f"{self.path}:{self.weight!r}"
 
 
+def split_weight(text: str, exists: Callable[[Path], bool] = Path.exists) -> tuple[Path, float]:
+    """Return the path and weight of FILE or FILE:WEIGHT; see `parse_style`. The weight is 1 if there is none."""
+    match = _WEIGHTED.fullmatch(text)
+    if match is None or exists(Path(text)):
+        return Path(text), 1.0
+    return Path(match["path"]), float(match["weight"])
+
+
 def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> StyleFile:
     """Parse FILE or FILE:WEIGHT.
 
@@ -40,15 +48,11 @@ def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> Styl
     Raises:
         SettingsError: If the weight is not finite or not above 0.
     """
-    match = _WEIGHTED.fullmatch(text)
-    if match is None or exists(Path(text)):
-        return StyleFile(Path(text))
-    weight = float(match["weight"])
+    path, weight = split_weight(text, exists)
     if not (math.isfinite(weight) and weight > 0):
-        raise SettingsError(
-            f"--style {text}: the weight {match['weight']} is not a finite number greater than 0. Give one."
-        )
-    return StyleFile(Path(match["path"]), weight)
+        given = text.rpartition(":")[2]
+        raise SettingsError(f"--style {text}: the weight {given} is not a finite number greater than 0. Give one.")
+    return StyleFile(path, weight)
 
 
 def parse_styles(texts: Sequence[str]) -> tuple[StyleFile, ...]:

@@ -14,7 +14,7 @@ from api.cli.bench_commands import bench_app
 from api.cli.console import BAD_INPUT, CONFLICT, FAILURE, INTERRUPTED, NOT_FOUND, error_console, out_console
 from api.cli.doctor_command import doctor
 from api.cli.extras import missing_extra
-from api.cli.scene_commands import check, convert, plan, render
+from api.cli.scene_commands import blend, check, convert, plan, render
 from api.cli.study_commands import study_app
 from api.cli.stylize_commands import demo, stylize
 from api.cli.weights_commands import weights_app
@@ -37,6 +37,7 @@ for command in (
     check,
     render,
     convert,
+    blend,
     demo,
     doctor,
     *client_commands.COMMANDS,

@@ -1,4 +1,4 @@
-"""Commands that read a scene without stylizing it: `plan`, `check`, `render` and `convert`."""
+"""Commands that read a scene without stylizing it: `plan`, `check`, `render`, `convert` and `blend`."""
 
 from __future__ import annotations
 
@@ -129,3 +129,27 @@ def convert(
     if converted.loss is not None:
         print_field("compared", converted.loss.text(scene.name))
     print_field("scene", f"{out}, {converted.count:,} Gaussians")
+
+
+@with_options(ViewOptions, only=("drop_invalid", "spz_axes"))
+def blend(
+    scenes: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SCENE[:WEIGHT]...",
+            help="Scenes that differ only in color, such as a scene and its results. Weights are divided by their sum; "
+            "scene.ply:-0.5 stylized.ply:1.5 exaggerates the style by half.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help=f"Scene to write: {RESULT_SUFFIXES}.", show_default=False)],
+    *,
+    options: ViewOptions,
+) -> None:
+    """Blend scenes that differ only in color: a scene and its results, or several results."""
+    from api.cli.scene_tools import blend_files
+
+    blended = blend_files(scenes, out, drop_invalid=options.drop_invalid, spz_axes=options.spz_axes)
+    for path, weight in blended:
+        print_field("weight", f"{weight:.4g} of {path}")
+    print_field("scene", out)

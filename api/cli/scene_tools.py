@@ -1,4 +1,4 @@
-"""Implementation of the commands `plan`, `check`, `render` and `convert`.
+"""Implementation of the commands `plan`, `check`, `render`, `convert` and `blend`.
 
 The functions check all inputs, compute, and write the outputs, but print nothing. `stylize` is implemented by
 `worker.prepare` and `worker.execute`, on one rank or several.
@@ -12,13 +12,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sgsst_core.decision import Decision
-from sgsst_core.errors import OutputError
+from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.blending import blend_scenes, normalized
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.sog import META_NAME
+from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
+from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
@@ -46,6 +49,7 @@ from worker.request import (
     check_is_not_scene,
     result_format,
 )
+from worker.styles import split_weight
 
 #: Number of views of an orbit that a converted scene is compared in.
 _COMPARED_VIEWS = 3
@@ -248,3 +252,33 @@ def _write_as(out: Path, scene: Scene) -> int:
     else:
         write_scene(out, scene, result_format(out))
     return out.stat().st_size
+
+
+# --- blend ---------------------------------------------------------------------------------------------------------
+
+
+def blend_files(texts: Sequence[str], out: Path, *, drop_invalid: bool, spz_axes: SpzAxes) -> list[tuple[Path, float]]:
+    """Write the weighted mean of scenes that differ only in color, and return each scene with its normalized weight.
+
+    Args:
+        texts: FILE or FILE:WEIGHT of each scene.
+        out: Scene file to write.
+        drop_invalid: Whether to drop invalid Gaussians; see `read_scene`.
+        spz_axes: Axes of SPZ files.
+
+    Raises:
+        InvalidInputError: If the weights, a scene or the output cannot be used.
+    """
+    paths, weights = zip(*map(split_weight, texts), strict=True)
+    if len(paths) < 2:
+        raise SettingsError("There is one scene to blend. Give at least two, such as scene.ply:0.3 stylized.ply:0.7.")
+    fractions = normalized(weights)
+    result_format(out)
+    for path in paths:
+        check_is_not_scene(out, path)
+    check_folder(out.parent)
+    files = [read_scene(path, drop_invalid=drop_invalid, spz_axes=spz_axes) for path in paths]
+    blend = blend_scenes(files, weights)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save(out, blend)
+    return list(zip(paths, fractions, strict=True))

@@ -29,6 +29,7 @@ from api.cli.scene_tools import view_file_names
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
 from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.gaussians import TENSORS
 from sgsst_core.scene.rendering import Rendering
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
@@ -974,6 +975,36 @@ def test_convert_refuses_what_it_cannot_write(files: Files, capsys: pytest.Captu
     blind = files.cameras.with_name("blind.json")
     blind.write_text("[]")
     assert main(["convert", str(files.ply), str(files.out), "--cameras", str(blind)]) == 2
+    assert files.ply.read_bytes() == before
+    assert not files.out.parent.exists()
+
+
+def test_blend_mixes_a_scene_and_its_result(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, result = read_scene(files.ply), files.ply.with_name("result.ply")
+    write_stylized(scene, result, -scene.scene.sh_dc)
+    assert main(["blend", f"{files.ply}:-0.5", f"{result}:1.5", "--out", str(files.out)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"weight: -0.5 of {files.ply}" in said
+    assert torch.allclose(read_scene(files.out).scene.sh_dc, -2 * scene.scene.sh_dc)
+    assert main(["blend", str(files.ply), str(result), "--out", str(files.out.with_suffix(".spz"))]) == 0
+    assert read_scene(files.out.with_suffix(".spz")).scene.sh_dc.abs().max() < 0.02
+
+
+def test_blend_refuses_what_it_cannot_blend(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    smaller = files.ply.with_name("smaller.ply")
+    write_scene(smaller, read_scene(files.ply).scene.subset(torch.arange(9)))
+    before = files.ply.read_bytes()
+    for arguments, message in (
+        ([files.ply], "There is one scene to blend"),
+        ([files.ply, smaller], "has 9 Gaussians"),
+        ([files.ply, f"{files.ply}:-1"], "sum 0"),
+        ([files.ply, files.ply.with_name("missing.ply")], "missing.ply: cannot be read"),
+        ([files.ply, files.style], "is not a scene file"),
+    ):
+        assert main(["blend", *map(str, arguments), "--out", str(files.out)]) == 2
+        assert message in " ".join(capsys.readouterr().err.split())
+    assert main(["blend", str(files.ply), str(files.ply), "--out", str(files.ply)]) == 2
+    assert main(["blend", str(files.ply), str(files.ply), "--out", str(files.out.with_name("a.splat"))]) == 2
     assert files.ply.read_bytes() == before
     assert not files.out.parent.exists()
 
