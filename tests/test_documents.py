@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from sgsst_core.files.formats import FORMATS
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 #: Maximum line length; rows of a table are exempt, because they cannot be wrapped.
@@ -61,3 +63,20 @@ def test_cited_tests_exist(document: Path) -> None:
     named = set(re.findall(r"`(?:[\w/]+\.py::)?(test_\w+|Test\w+)`", document.read_text()))
     sources = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
     assert {name for name in named if not re.search(rf"(?:def |class |^){name}\b", sources, re.M)} == set()
+
+
+def usage_rows(heading: str) -> list[list[str]]:
+    """Return the cells of the table in `docs/usage.md` with a heading."""
+    lines = (ROOT / "docs" / "usage.md").read_text().partition(heading)[2].splitlines()
+    rows = [line for line in lines[2:] if line.startswith("|") or not line]
+    return [row.strip("|").split(" | ") for row in rows[: rows.index("")]]
+
+
+def test_usage_lists_every_scene_format() -> None:
+    listed = {suffix for row in usage_rows("| scene format |") for suffix in re.findall(r"`(\.[\w.]+)`", row[0])}
+    assert {each.suffix for each in FORMATS} == listed | {".v4.spz"}
+
+
+def test_usage_lists_every_capture() -> None:
+    captures = {path.name for path in (ROOT / "tests/sgsst_core/files/captures").iterdir()}
+    assert {name for row in usage_rows("| from | give |") for name in re.findall(r"`(\w+)`", row[-1])} == captures
