@@ -12,7 +12,7 @@ from sgsst_core.options import RENAMED, Option
 from sgsst_core.settings import checked
 from worker.options import StylizeOptions
 from worker.region_requests import MOST_REGIONS, RegionOptions, RegionRequest, region_requests
-from worker.styles import MOST_PICTURES
+from worker.styles import MOST_STYLE_IMAGES
 
 #: Names without control characters: they are shown in terminals, and some databases cannot store zero bytes.
 _NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
@@ -36,7 +36,7 @@ class JobParameters(StylizeOptions):
     ] = Field(
         None,
         min_length=1,
-        max_length=MOST_PICTURES,
+        max_length=MOST_STYLE_IMAGES,
         description="Weight of each style image that belongs to no region, in upload order: images are mixed in "
         "proportion. Default: equal weights.",
     )

@@ -132,11 +132,11 @@ class Declared:
 
 def declared(model: type[BaseModel]) -> dict[str, Declared]:
     """Return the fields of a model that are options, keyed by the name shown to users."""
-    found = [
+    options = [
         Declared(field, info, next((item for item in info.metadata if isinstance(item, Option)), Option()))
         for field, info in model.model_fields.items()
     ]
-    return {each.name: each for each in found if not each.option.instead}
+    return {each.name: each for each in options if not each.option.instead}
 
 
 def _plain(value: object) -> str:

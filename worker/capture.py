@@ -60,14 +60,14 @@ class Capture:
         """
         if folder is None:
             return replace(self, decisions=(*self.decisions, *_about_pinholes(self.cameras)))
-        found = check_photos(folder, self.cameras)
-        missing = [camera.name for camera, photo in zip(self.cameras, found, strict=True) if photo is None]
-        kept = [index for index, photo in enumerate(found) if photo is not None]
-        photos = [photo for photo in found if photo is not None]
-        cameras = [undistorted(self.cameras[index]) for index in kept]
-        sizes = [self.photo_sizes[index] for index in kept]
-        kept_width = min((new.width / self.cameras[i].width for new, i in zip(cameras, kept, strict=True)), default=1.0)
-        lines = [*_about_undistorted(cameras, kept_width), *_about_photos(sizes, photos, missing)]
+        matches = check_photos(folder, self.cameras)
+        missing = [camera.name for camera, photo in zip(self.cameras, matches, strict=True) if photo is None]
+        used = [index for index, photo in enumerate(matches) if photo is not None]
+        photos = [photo for photo in matches if photo is not None]
+        cameras = [undistorted(self.cameras[index]) for index in used]
+        sizes = [self.photo_sizes[index] for index in used]
+        widths = [new.width / self.cameras[i].width for new, i in zip(cameras, used, strict=True)]
+        lines = [*_about_undistorted(cameras, min(widths, default=1.0)), *_about_photos(sizes, photos, missing)]
         return Capture(cameras, self.orbit, sizes, photos, (*self.decisions, *lines))
 
     def checked(self, scene: Scene, near: float) -> Capture:
@@ -175,13 +175,15 @@ def _models(cameras: Sequence[Camera]) -> str:
     return f"{count} of {len(cameras)} cameras have lens distortion ({', '.join(models)})" if models else ""
 
 
-def _about_undistorted(cameras: Sequence[Camera], kept_width: float) -> list[Decision]:
+def _about_undistorted(cameras: Sequence[Camera], width_fraction: float) -> list[Decision]:
     """Return the line about undistorted photos, given the least fraction of their width that views show."""
     models = _models(cameras)
     if not models:
         return []
     size = (
-        "their size" if kept_width == 1 else f"at least {kept_width:.0%} of their width, as much as their photos fill"
+        "their size"
+        if width_fraction == 1
+        else f"at least {width_fraction:.0%} of their width, as much as their photos fill"
     )
     return [Decision("lenses", "the photos are undistorted", f"{models}; views keep {size}")]
 

@@ -21,7 +21,7 @@ from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.report.charts import write_loss_chart
 from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
-from sgsst_core.report.document import bought, build_report, plan_json, sent_json
+from sgsst_core.report.document import build_report, loss_over_time, plan_json, sent_json
 from sgsst_core.report.page import write_page
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, relative_loss, round_evaluation
@@ -45,7 +45,7 @@ class Result:
         step, total: Number of completed steps, and number of all steps.
         before: Loss of the unstylized scene on the evaluation views; empty if the job was interrupted.
         after: Loss of the last round of views; empty if the job was interrupted.
-        bought: Loss as a function of the time spent; see `report.bought`. None if no step was made on all scales.
+        loss_over_time: Summary for the report (`loss_over_time`); None if no step was made on all scales.
         report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
         packed: Measured loss of quality in the compressed file; None if no compressed file was requested.
         weights: Weights of the scales in `before` and `after`.
@@ -56,7 +56,7 @@ class Result:
     total: int
     before: Evaluation
     after: Evaluation
-    bought: dict[str, Any] | None = None
+    loss_over_time: dict[str, Any] | None = None
     report_error: str | None = None
     packed: CompressionLoss | None = None
     weights: ScaleWeights = EVEN
@@ -103,7 +103,7 @@ def execute(
     if job.resumed:
         stylizer.load_state(job.resumed.state)
     if first:
-        _make_room(job.outputs)
+        _clear_outputs(job.outputs)
     stylizer.job.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.job.plan)))
     if first:
         _write_views(job, warn)
@@ -124,7 +124,7 @@ def execute(
     return result
 
 
-def _make_room(outputs: Outputs) -> None:
+def _clear_outputs(outputs: Outputs) -> None:
     """Create the output folder, and delete temporary files of an attempt that was killed."""
     outputs.ply.parent.mkdir(parents=True, exist_ok=True)
     for path in outputs.all:
@@ -183,7 +183,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     round_length, weights = stylizer.job.round_length, stylizer.job.loss.weights
     after = round_evaluation(stylizer.history, round_length, weights) if stylizer.history else measure.evaluate()
     error = _write_reports(job, stopped, before, after, packed) if first else None
-    found = bought(stylizer, before)
+    over_time = loss_over_time(stylizer, before)
     problem = str(error) if error else None
     return Result(
         stopped,
@@ -191,7 +191,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
         stylizer.job.total_steps,
         before,
         after,
-        found,
+        over_time,
         problem,
         packed,
         weights,

@@ -97,8 +97,8 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     capture = _capture_on_all_ranks(source, scene_file.scene, images, collectives).fitted(settings)
     together(collectives, lambda: check_scales(settings.scales, capture.cameras, settings.coarsest_side))
     together(collectives, lambda: check_style_size(style, capture.cameras, settings.style_scale))
-    found = together(collectives, lambda: capture.with_photos(images))
-    capture = collectives.broadcast(lambda: found.checked(scene_file.scene, source.near))
+    with_photos = together(collectives, lambda: capture.with_photos(images))
+    capture = collectives.broadcast(lambda: with_photos.checked(scene_file.scene, source.near))
     cameras, photos = capture.cameras, capture.photos
     regions = read_regions(request, scene_file, cameras, collectives)
     stamps = collectives.broadcast(lambda: repr([_stamp(photo) for photo in photos]) if photos else "")
@@ -216,9 +216,9 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
         value = make()
     except SgsstError as own:
         error = own
-    for found in collectives.all_gather(error):
-        if found is not None:
-            raise found
+    for raised in collectives.all_gather(error):
+        if raised is not None:
+            raise raised
     return value  # type: ignore[return-value]
 
 
@@ -234,15 +234,15 @@ def _same_fingerprint(own: str | None, collectives: Collectives) -> str:
     Args:
         own: Fingerprint of this rank; None if another rank of the same machine read the scene.
     """
-    found = collectives.all_gather((own, socket.gethostname()))
-    for other, host in found:
-        if other is not None and other != found[0][0]:
+    fingerprints = collectives.all_gather((own, socket.gethostname()))
+    for other, host in fingerprints:
+        if other is not None and other != fingerprints[0][0]:
             raise SettingsError(
-                f"The files of this job are not the same on {found[0][1]} and {host}: scene, cameras, style or weights "
-                "differ. Give paths on a file system that all machines share."
+                f"The files of this job are not the same on {fingerprints[0][1]} and {host}: scene, cameras, style or "
+                "weights differ. Give paths on a file system that all machines share."
             )
-    assert found[0][0] is not None  # rank 0 always reads the scene itself
-    return found[0][0]
+    assert fingerprints[0][0] is not None  # rank 0 always reads the scene itself
+    return fingerprints[0][0]
 
 
 def _stamp(photo: Photo) -> tuple[object, ...]:

@@ -88,8 +88,8 @@ def _settings_to_choose() -> dict[str, Any]:
         kind = info.annotation if shown else info.annotation | None  # type: ignore[operator]
         presets = preset_texts(setting) if text.startswith(BY_PRESET) else {}
         option = setting.option if shown else replace(setting.option, default=text, name="", presets=presets)
-        told = Field(info.default if shown else None, description=info.description)
-        fields[name] = (Annotated[kind, *constraints, option], told)
+        default = Field(info.default if shown else None, description=info.description)
+        fields[name] = (Annotated[kind, *constraints, option], default)
     return fields
 
 

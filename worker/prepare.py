@@ -130,7 +130,7 @@ def prepare(
     source, images = request.source, request.images
     styles = tuple(file.path for file in request.styles)
     sources = Sources(source.scene, scene_file.dropped, styles, source.cameras, images, inputs.weights)
-    workers = {"asked": collectives.size, **_workers_used(stylizer), "attempts": []}
+    workers = {"requested": collectives.size, **_workers_used(stylizer), "attempts": []}
     return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
 
 
@@ -189,16 +189,16 @@ def _find_checkpoint(
             "--resume out."
         )
     try:
-        found = checkpoints.load(job_id, warn, resume.run)
+        checkpoint = checkpoints.load(job_id, warn, resume.run)
     except CheckpointError:
         if resume.required:
             raise
         return None
-    if resume.required and settings.max_seconds and found.state.seconds >= settings.max_seconds:
+    if resume.required and settings.max_seconds and checkpoint.state.seconds >= settings.max_seconds:
         raise CheckpointError(
-            f"{outputs.checkpoint}: the job has run for {found.state.seconds:.0f} s already, and --max-seconds counts "
-            f"these too. Give more than {found.state.seconds:.0f}, or omit --max-seconds."
+            f"{outputs.checkpoint}: the job has run for {checkpoint.state.seconds:.0f} s already, and --max-seconds "
+            f"counts these too. Give more than {checkpoint.state.seconds:.0f}, or omit --max-seconds."
         )
-    if found.written_by["torch"] != torch.__version__:
-        warn(f"The checkpoint was written with PyTorch {found.written_by['torch']}: last digits may differ.")
-    return found
+    if checkpoint.written_by["torch"] != torch.__version__:
+        warn(f"The checkpoint was written with PyTorch {checkpoint.written_by['torch']}: last digits may differ.")
+    return checkpoint

@@ -57,13 +57,13 @@ def home() -> tuple[str, ...]:
 
 def kill(processes: Sequence[ProcessId], timeout: float = 10.0) -> None:
     """Kill processes of this machine, including suspended ones, and wait until they have ended."""
-    found = [process for identity in processes if (process := identity.find()) is not None]
-    for process in found:
+    alive = [process for identity in processes if (process := identity.find()) is not None]
+    for process in alive:
         try:
             process.kill()
         except psutil.Error:
             continue
-    psutil.wait_procs(found, timeout)
+    psutil.wait_procs(alive, timeout)
 
 
 def die_with_parent() -> None:

@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.settings import checked
-from worker.styles import MOST_PICTURES, StyleFile, parse_style
+from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style
 
 #: Name of the region of all Gaussians that no selection contains.
 REST = "rest"
@@ -96,7 +96,7 @@ class RegionOptions(BaseModel):
     style: (
         Annotated[str, Field(min_length=1, max_length=300)]
         | Annotated[
-            list[Annotated[str, Field(min_length=1, max_length=300)]], Field(min_length=1, max_length=MOST_PICTURES)
+            list[Annotated[str, Field(min_length=1, max_length=300)]], Field(min_length=1, max_length=MOST_STYLE_IMAGES)
         ]
         | None
     ) = Field(
@@ -192,38 +192,38 @@ def region_options(
     Raises:
         SettingsError: If a text is malformed, a name is used twice, or a region is unknown.
     """
-    found: dict[str, RegionOptions] = {}
+    by_name: dict[str, RegionOptions] = {}
     for text in regions:
         name, separator, spec = text.partition(":")
         if not separator or not re.fullmatch(_NAME, name):
             raise SettingsError(f"--region {text}: expected NAME:SPEC, such as face:sphere=0,1.4,0,0.3. {_HOW}")
-        if name in found:
+        if name in by_name:
             raise SettingsError(f"--region {text}: a region {name} already exists. Give each region a unique name.")
-        found[name] = checked(RegionOptions, {"name": name, "select": spec})
-    given = set(found)
+        by_name[name] = checked(RegionOptions, {"name": name, "select": spec})
+    given = set(by_name)
 
     def known(name: str, option: str) -> RegionOptions:
         if name != REST and name not in given:
-            names = ", ".join([*found, REST]) if REST not in found else ", ".join(found)
+            names = ", ".join([*by_name, REST]) if REST not in by_name else ", ".join(by_name)
             raise SettingsError(f"{option}: there is no region {name!r}. Use one of {names}, or add it with --region.")
-        return found.get(name, RegionOptions(name=REST))
+        return by_name.get(name, RegionOptions(name=REST))
 
     for text in styles:
         name, _, file = text.partition("=")
         region = known(name, f"--region-style {text}")
         if not file:
             raise SettingsError(f"--region-style {text}: expected NAME=FILE. Give the path of a style image.")
-        found[name] = region.model_copy(update={"style": [*region.style_texts, file]})
+        by_name[name] = region.model_copy(update={"style": [*region.style_texts, file]})
     for text in weights:
         name, _, value = text.partition("=")
         region = known(name, f"--region-weight {text}")
         weight = _number(value, text, "--region-weight")
         if not 0 < weight <= 1e12:
             raise SettingsError(f"--region-weight {text}: the weight must be greater than 0 and at most 1e12.")
-        found[name] = region.model_copy(update={"weight": weight})
+        by_name[name] = region.model_copy(update={"weight": weight})
     for name in frozen:
-        found[name] = known(name, f"--region-freeze {name}").model_copy(update={"freeze": True})
-    return tuple(found.values())
+        by_name[name] = known(name, f"--region-freeze {name}").model_copy(update={"freeze": True})
+    return tuple(by_name.values())
 
 
 def region_requests(
@@ -234,12 +234,13 @@ def region_requests(
     Raises:
         SettingsError: If a region is invalid, there are too many regions, or two have the same name.
     """
-    found = [each.request(exists) for each in options]
-    names = [region.name for region in found]
-    for region in found:
-        if len(region.styles) > MOST_PICTURES:
+    requests = [each.request(exists) for each in options]
+    names = [region.name for region in requests]
+    for region in requests:
+        if len(region.styles) > MOST_STYLE_IMAGES:
             raise SettingsError(
-                f"Region {region.name!r} has {len(region.styles)} style images. At most {MOST_PICTURES} are allowed."
+                f"Region {region.name!r} has {len(region.styles)} style images. At most {MOST_STYLE_IMAGES} are "
+                "allowed."
             )
         if names.count(region.name) > 1:
             raise SettingsError(f"There are two regions {region.name!r}. Give each region a unique name.")
@@ -253,5 +254,5 @@ def region_requests(
     selecting = len([name for name in names if name != REST])
     if selecting > MOST_REGIONS:
         raise SettingsError(f"There are {selecting} regions. At most {MOST_REGIONS} are allowed.")
-    rest = next((region for region in found if region.name == REST), None)
-    return (*([rest] if rest else []), *(region for region in found if region.name != REST))
+    rest = next((region for region in requests if region.name == REST), None)
+    return (*([rest] if rest else []), *(region for region in requests if region.name != REST))

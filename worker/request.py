@@ -139,9 +139,9 @@ class Outputs:
     @property
     def all(self) -> list[Path]:
         """Return the paths of all output files except the older checkpoint, which is only created by renaming."""
-        found = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
-        found.append(self.colors)
-        return found if self.packed is None else [*found, self.packed]
+        paths = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
+        paths.append(self.colors)
+        return paths if self.packed is None else [*paths, self.packed]
 
     @property
     def checkpoints(self) -> Checkpoints:

@@ -95,17 +95,17 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
     """
     rows = len(file.scene) if file.retained is None else len(file.retained)
     try:
-        found = np.load(path, mmap_mode="r", allow_pickle=False)
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # TokenError: unclosed bracket
         raise SceneError(f"{path}: cannot be read as .npy: {error}. Write it with numpy.save.") from error
-    if not isinstance(found, np.ndarray) or found.dtype.kind not in "biuf":
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
         raise SceneError(f"{path}: does not hold an array of flags or numbers. Write it with numpy.save.")
-    if found.shape != (rows,):
+    if values.shape != (rows,):
         raise SceneError(
-            f"{path}: has the shape {found.shape}, but {file.path} has {rows:,} Gaussians. It must be ({rows},)."
+            f"{path}: has the shape {values.shape}, but {file.path} has {rows:,} Gaussians. It must be ({rows},)."
         )
-    flags = found == 1
-    if not bool((flags | (found == 0)).all()):
+    flags = values == 1
+    if not bool((flags | (values == 0)).all()):
         raise SceneError(f"{path}: has values other than 0 and 1. Give a flag for each Gaussian.")
     return torch.from_numpy(np.array(flags if file.retained is None else flags[file.retained]))
 
@@ -116,10 +116,10 @@ def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], nea
     Raises:
         ImageError: If there are no masks, or if a mask cannot be used.
     """
-    found = [(camera, mask) for camera, mask in zip(cameras, find_masks(folder, cameras), strict=True) if mask]
-    masks = [partial(_load_mask, mask, camera) for camera, mask in found]
+    masked = [(camera, mask) for camera, mask in zip(cameras, find_masks(folder, cameras), strict=True) if mask]
+    masks = [partial(_load_mask, mask, camera) for camera, mask in masked]
     rasterizer = make_rasterizer("cpu", file.scene, near=near)
-    inside, total = count_votes(rasterizer, [camera for camera, _ in found], masks, len(file.scene))
+    inside, total = count_votes(rasterizer, [camera for camera, _ in masked], masks, len(file.scene))
     if not bool((total > 0).any()):
         raise ImageError(f"{folder}: no view that has a mask sees a Gaussian. Give masks of other views.")
     return decide_by_votes(file.scene.means, inside, total)

@@ -11,7 +11,7 @@ from pathlib import Path
 from sgsst_core.errors import SettingsError
 
 #: Maximum number of images of a style. More are probably a mistake.
-MOST_PICTURES = 16
+MOST_STYLE_IMAGES = 16
 _WEIGHTED = re.compile(r"(?P<path>.+):(?P<weight>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", re.DOTALL)
 
 
@@ -61,6 +61,6 @@ def parse_styles(texts: Sequence[str]) -> tuple[StyleFile, ...]:
     Raises:
         SettingsError: If a weight is invalid, or there are no images or too many.
     """
-    if not 1 <= len(texts) <= MOST_PICTURES:
-        raise SettingsError(f"There are {len(texts)} style images. Give between 1 and {MOST_PICTURES}.")
+    if not 1 <= len(texts) <= MOST_STYLE_IMAGES:
+        raise SettingsError(f"There are {len(texts)} style images. Give between 1 and {MOST_STYLE_IMAGES}.")
     return tuple(parse_style(text) for text in texts)

@@ -247,8 +247,8 @@ def _slope(disparity: Array, axis: int) -> Array:
     noise.
     """
     ahead = (np.roll(disparity, -2, axis) - disparity) / 2
-    behind = (disparity - np.roll(disparity, 2, axis)) / 2
-    return np.where(ahead * behind > 0, np.sign(ahead) * np.minimum(np.abs(ahead), np.abs(behind)), 0.0)
+    backward = (disparity - np.roll(disparity, 2, axis)) / 2
+    return np.where(ahead * backward > 0, np.sign(ahead) * np.minimum(np.abs(ahead), np.abs(backward)), 0.0)
 
 
 def _gaussians(samples: Samples, camera_x: float) -> tuple[Array, Array, Array, Array]:

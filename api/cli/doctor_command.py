@@ -22,14 +22,14 @@ def doctor(json_: JsonOption = False) -> None:
     """
     from sgsst_core.bench.doctor import examine
 
-    found = []
+    findings = []
     for finding in examine():
-        found.append(finding)
+        findings.append(finding)
         if not json_:
             out_console.print(f"{_MARKS[finding.state]:<9}{finding.topic:<12}{finding.text}")
     if json_:
-        out_console.print(json.dumps([asdict(finding) for finding in found], indent=2))
-    states = {finding.state for finding in found}
+        out_console.print(json.dumps([asdict(finding) for finding in findings], indent=2))
+    states = {finding.state for finding in findings}
     if "problem" in states:
         raise typer.Exit(FAILURE)
     if "warning" in states:

@@ -236,11 +236,11 @@ def _check_target(out: Path, compare: bool) -> None:
 
 def _about_lost_mode(out: Path, scene: Scene) -> list[Decision]:
     """Return the line about a render mode that the format of a written file cannot state."""
-    found = CLASSIC if out.suffix.lower() in USD_SUFFIXES else read_scene_header(out).tag.rendering
-    if found == scene.rendering:
+    stated = CLASSIC if out.suffix.lower() in USD_SUFFIXES else read_scene_header(out).tag.rendering
+    if stated == scene.rendering:
         return []
     reason = f"its format cannot state {scene.rendering.text}"
-    return [Decision("rendering", f"warning: {out.name} will be drawn {found.text}", reason)]
+    return [Decision("rendering", f"warning: {out.name} will be drawn {stated.text}", reason)]
 
 
 def _write_as(out: Path, scene: Scene) -> int:

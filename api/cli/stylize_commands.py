@@ -218,14 +218,14 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
 
 def _loss_over_time(result: Result) -> list[str]:
     """Return when the loss fell to certain fractions of its initial value, and its decrease at the end."""
-    bought = result.bought
-    if bought is None:
+    loss_over_time = result.loss_over_time
+    if loss_over_time is None:
         return []
     lines = [
         f"down to {entry['relative']:.0%} of the initial loss on all scales after {clock(entry['seconds'])}"
-        for entry in bought["reached"]
+        for entry in loss_over_time["reached"]
     ]
-    last = bought["last_tenth"]
+    last = loss_over_time["last_tenth"]
     if last:
         lines.append(f"from {last['from']:.2%} to {last['to']:.2%} in the last tenth of the time")
     return lines

@@ -176,8 +176,8 @@ def _add_problem_schemas(document: dict[str, Any]) -> None:
             for status, answer in operation["responses"].items():
                 problem = answer.get("content", {}).get(MEDIA_TYPE)
                 if problem:
-                    found = {code: example["value"] for code, example in problem["examples"].items()}
-                    examples.setdefault(int(status), {}).update(found)
+                    known = {code: example["value"] for code, example in problem["examples"].items()}
+                    examples.setdefault(int(status), {}).update(known)
     for status, by_code in sorted(examples.items()):
         properties = copy.deepcopy(schemas["Problem"]["properties"])
         properties["status"] |= {"const": status}

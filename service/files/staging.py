@@ -13,7 +13,7 @@ from service.parameters import MAX_JOB_NAME
 from sgsst_core.files.camera_advice import advice_for_name
 from sgsst_core.files.formats import format_of_name
 from worker.region_requests import MOST_REGIONS, RegionRequest
-from worker.styles import MOST_PICTURES
+from worker.styles import MOST_STYLE_IMAGES
 
 #: Name of the stylized scene; the names of a job's other files are derived from it.
 RESULT = "stylized.ply"
@@ -21,7 +21,7 @@ RESULT = "stylized.ply"
 CHECKPOINT = ".checkpoint"
 ROLES = ("scene", "style", "cameras", "photos")
 #: Maximum number of style images: those that belong to no region, plus one for each region.
-MOST_STYLES = MOST_PICTURES + MOST_REGIONS
+MOST_STYLES = MOST_STYLE_IMAGES + MOST_REGIONS
 #: Maximum number of camera files: a COLMAP model has up to five (cameras, images, points3D, rigs, frames), and a
 #: transforms.json may come with a dataparser_transforms.json.
 MAX_CAMERA_FILES = 8

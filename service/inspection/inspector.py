@@ -317,5 +317,5 @@ def findings_of(answer: Mapping[str, Any]) -> dict[str, Any]:
     if "error" in answer:
         error = answer["error"]
         raise RefusedInputError(error["message"], error["code"], error["input"])
-    findings: dict[str, Any] = answer["found"]
+    findings: dict[str, Any] = answer["findings"]
     return findings

@@ -291,12 +291,12 @@ def _check_frames_have_sizes(path: Path) -> None:
 
 
 def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
-    """Return the final response of a child: `{"found": ...}` or `{"error": {"code", "message", "input"}}`."""
+    """Return the final response of a child: `{"findings": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
         os.chdir(request["folder"])
         staged = Staged.of_json(request["staged"])
         work = WORK[request["work"]]
-        return {"found": work(staged, JobParameters(**request["parameters"]), request["limits"], show)}
+        return {"findings": work(staged, JobParameters(**request["parameters"]), request["limits"], show)}
     except MemoryError as error:
         return _over_limit("Reading it takes more memory than allowed.", getattr(error, "role", None))
     except SgsstError as error:
@@ -481,7 +481,7 @@ def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
 
 def _is_response(answer: Any) -> bool:
     """Return whether the message of an untrusted child has the format that the calling process accepts."""
-    if not isinstance(answer, dict) or not answer.keys() & {"planning", "found", "error"}:
+    if not isinstance(answer, dict) or not answer.keys() & {"planning", "findings", "error"}:
         return False
     planning = answer.get("planning", {})
     if not isinstance(planning, dict) or (planning and planning.keys() != {"step", "total", "fraction", "eta_s"}):
@@ -490,7 +490,7 @@ def _is_response(answer: Any) -> bool:
     if not isinstance(error, dict) or error.keys() != {"code", "message", "input"}:
         return False
     texts = [error["code"], error["message"], error["input"] or ""]
-    return isinstance(answer.get("found", {}), dict) and all(isinstance(text, str) for text in texts)
+    return isinstance(answer.get("findings", {}), dict) and all(isinstance(text, str) for text in texts)
 
 
 def main() -> None:

@@ -118,18 +118,18 @@ def rasterizer_checks(fast: Rasterizer, scene: Scene, camera: Camera) -> Iterato
     coverage = _off(fast.coverage(camera), reference.coverage(camera))
     yield Check("coverage", float(coverage[~band].max()), image_bound)
     expected = reference.color_gradient(pixels, camera)
-    found = float(_off(fast.color_gradient(pixels, camera), expected).norm() / expected.norm())
-    yield Check("gradient", found, gradient_bound)
+    error = float(_off(fast.color_gradient(pixels, camera), expected).norm() / expected.norm())
+    yield Check("gradient", error, gradient_bound)
 
 
 def network_checks(weights: BackboneWeights, device: torch.device, sizes: CheckSizes) -> Iterator[Check]:
     """Compare float32 features and their statistics with float64, on synthetic weights."""
     image = texture(sizes.height, sizes.width)
     exact = FeatureNetwork(weights, STYLE_LAYERS, torch.float64).forward(image, cache=False).features
-    found = FeatureNetwork(weights, STYLE_LAYERS, device=device).forward(image.to(device), cache=False).features
-    yield Check("features", max(_relative(found[layer], exact[layer]) for layer in exact), _FEATURE_BOUND)
+    actual = FeatureNetwork(weights, STYLE_LAYERS, device=device).forward(image.to(device), cache=False).features
+    yield Check("features", max(_relative(actual[layer], exact[layer]) for layer in exact), _FEATURE_BOUND)
     errors = []
-    for features in found.values():
+    for features in actual.values():
         if features.numel():
             reference = layer_statistics_reference(features.cpu().double())
             errors.append(_relative(layer_statistics(features).centered, reference.centered))
@@ -196,14 +196,14 @@ class Step:
         return float(sum(_different(self.run(), expected) > 0 for _ in range(repeats)))
 
 
-def _off(found: Tensor, expected: Tensor) -> Tensor:
-    return (found.cpu().double() - expected).abs()
+def _off(actual: Tensor, expected: Tensor) -> Tensor:
+    return (actual.cpu().double() - expected).abs()
 
 
-def _relative(found: Tensor, expected: Tensor) -> float:
-    return float((found.cpu().double() - expected.cpu().double()).norm() / expected.cpu().double().norm())
+def _relative(actual: Tensor, expected: Tensor) -> float:
+    return float((actual.cpu().double() - expected.cpu().double()).norm() / expected.cpu().double().norm())
 
 
-def _different(found: Tensor, expected: Tensor) -> float:
+def _different(actual: Tensor, expected: Tensor) -> float:
     """Return the number of values that are not equal; NaN differs from everything."""
-    return float((found != expected).sum())
+    return float((actual != expected).sum())

@@ -87,8 +87,8 @@ def findings() -> Iterator[Finding]:
     gpu = torch.cuda.is_available()
     device = torch.device("cuda", torch.cuda.current_device()) if gpu else torch.device("cpu")
     yield _memory(device)
-    rasterizer, found = _rasterizer(gpu=gpu)
-    yield found
+    rasterizer, finding = _rasterizer(gpu=gpu)
+    yield finding
     yield _precision(device)
     yield from _results(rasterizer, device)
 

@@ -256,7 +256,7 @@ def _prepare(stylizer: _TimedStylizer) -> float:
         phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.fractions]
         stylizer.job.style_targets(stylizer.job.views.cameras[index])
         scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
-        stylizer.job.view_targets.target(index, scales, stylizer.behind(index))
+        stylizer.job.view_targets.target(index, scales, stylizer.drawn_background(index))
         stylizer.cache_weights(index)
         stylizer.job.views.render(index, stylizer.job.views.colors(index, stylizer.sh_dc.detach()))
     return time.perf_counter() - started

@@ -77,8 +77,8 @@ class Outcome:
             "seconds": self.seconds,
             **asdict(self.judgment),
             "consistency": {
-                name: {"rmse": found.rmse, "lpips": found.lpips, "pairs": len(found.pairs)} if found else None
-                for name, found in ranges.items()
+                name: {"rmse": values.rmse, "lpips": values.lpips, "pairs": len(values.pairs)} if values else None
+                for name, values in ranges.items()
             },
         }
 
@@ -160,10 +160,10 @@ def compare_quality(
     novel_views.lpips = lpips
 
     def outcome(name: str, what: str, sh_dc: Tensor) -> Outcome:
-        found: NovelViewMoment = novel_views.measure(sh_dc)
+        moment: NovelViewMoment = novel_views.measure(sh_dc)
         judgment = judge.judge(sh_dc)
         assert judgment is not None
-        return Outcome(name, what, sh_dc, judgment, found.short, found.long)
+        return Outcome(name, what, sh_dc, judgment, moment.short, moment.long)
 
     blend_weights = stylizer.job.plan.survey.total_blend_weights
     transferred = warm_start(scene.sh_dc, blend_weights, Style.of(style))
@@ -175,8 +175,8 @@ def compare_quality(
     for curve in curves:
         if curve.sh_dc is not None:
             last = curve.points[-1]
-            found = outcome(curve.variant.name, curve.variant.what, curve.sh_dc)
-            outcomes.append(replace(found, loss=last.relative, steps=last.step, seconds=last.seconds))
+            last_outcome = outcome(curve.variant.name, curve.variant.what, curve.sh_dc)
+            outcomes.append(replace(last_outcome, loss=last.relative, steps=last.step, seconds=last.seconds))
     return Quality(outcomes, curves, judge, style)
 
 

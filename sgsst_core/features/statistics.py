@@ -126,10 +126,10 @@ def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -
     precision = torch.promote_types(features.dtype, torch.float32)
     on_cpu = features.device.type == "cpu"
     shift = _shift(features, position_weights) if on_cpu else features.to(precision).mean(dim=(0, 1))
-    found = _statistics_about(shift, features, position_weights)
-    if on_cpu and _is_far(shift, found):
-        found = _statistics_about(found.mean.to(precision), features, position_weights)
-    return found
+    statistics = _statistics_about(shift, features, position_weights)
+    if on_cpu and _is_far(shift, statistics):
+        statistics = _statistics_about(statistics.mean.to(precision), features, position_weights)
+    return statistics
 
 
 def blocks_of(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
@@ -168,11 +168,11 @@ def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
     return some.mean(dim=0, dtype=torch.float64).to(torch.promote_types(features.dtype, torch.float32))
 
 
-def _is_far(shift: Tensor, found: LayerStatistics) -> bool:
+def _is_far(shift: Tensor, statistics: LayerStatistics) -> bool:
     """Return whether the shift is so far from the mean that cancellation lost digits. Synchronizes with the device."""
-    offset = (found.mean - shift).abs()
+    offset = (statistics.mean - shift).abs()
     rounding = torch.finfo(shift.dtype).eps * shift.abs()
-    return bool(((offset > _FAR * found.std()) & (offset > _FAR * rounding)).any())
+    return bool(((offset > _FAR * statistics.std()) & (offset > _FAR * rounding)).any())
 
 
 def _statistics_about(shift: Tensor, features: Tensor, position_weights: Tensor | None) -> LayerStatistics:

@@ -460,12 +460,12 @@ def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     largest = float(expected.amax())  # none is negative
     _leave_nan(expected)
     try:
-        found = _fused_convolution(x, step)
+        output = _fused_convolution(x, step)
     except RuntimeError:  # cuDNN has no engine for it
         return None
-    same_layout = found.stride() == expected.stride()
-    difference = float(expected.sub_(found).abs_().amax())
-    return found if same_layout and difference <= _TRIAL_TOLERANCE * largest else None
+    same_layout = output.stride() == expected.stride()
+    difference = float(expected.sub_(output).abs_().amax())
+    return output if same_layout and difference <= _TRIAL_TOLERANCE * largest else None
 
 
 def _leave_nan(like: Tensor) -> None:

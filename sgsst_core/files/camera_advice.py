@@ -107,9 +107,9 @@ def refuse_folder(folder: Path) -> None:
         ("sfm_data.json", _OPENMVG),
         ("bundle.out", _BUNDLER),
     ):
-        found = next(folder.glob(pattern), None)
-        if found is not None:
-            raise _refusal(found, advice)
+        match = next(folder.glob(pattern), None)
+        if match is not None:
+            raise _refusal(match, advice)
 
 
 def _refusal(path: Path, advice: str) -> CameraError:

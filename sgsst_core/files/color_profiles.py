@@ -89,12 +89,12 @@ def _without_float_conversions(data: bytes) -> bytes:
     They may have any number of steps: a profile of 1 MB would take hours. Every profile has another conversion, by
     tables or a matrix, with a fixed number of steps (ICC.1:2010, section 8).
     """
-    found = bytearray(data)
-    tags = int.from_bytes(found[128:132], "big")
-    for position in range(132, min(132 + 12 * tags, len(found)), 12):
-        if found[position : position + 3] == b"D2B":
-            found[position] = ord("x")
-    return bytes(found)
+    profile = bytearray(data)
+    tags = int.from_bytes(profile[128:132], "big")
+    for position in range(132, min(132 + 12 * tags, len(profile)), 12):
+        if profile[position : position + 3] == b"D2B":
+            profile[position] = ord("x")
+    return bytes(profile)
 
 
 @functools.cache

@@ -172,10 +172,10 @@ def _check_scans(path: Path) -> None:
     """
     data = path.read_bytes()
     scans = position = 0
-    while (found := _JPEG_MARKER.search(data, position)) and found[1][0] != _END_OF_IMAGE:
-        position = found.end()
-        if found[1][0] not in _BARE_MARKERS:
-            scans += found[1][0] == _START_OF_SCAN
+    while (marker := _JPEG_MARKER.search(data, position)) and marker[1][0] != _END_OF_IMAGE:
+        position = marker.end()
+        if marker[1][0] not in _BARE_MARKERS:
+            scans += marker[1][0] == _START_OF_SCAN
             position += max(2, int.from_bytes(data[position : position + 2], "big"))
         if scans > MAX_JPEG_SCANS:
             raise ImageError(f"{path}: is a progressive JPEG of more than {MAX_JPEG_SCANS} scans. Save it as PNG.")
@@ -239,8 +239,8 @@ def _to_rgb(path: Path, image: Image.Image, profile: ColorProfile | None, backgr
         if transparent:
             image.putalpha(stored.getchannel("A"))
     if transparent:
-        behind = tuple(round(255 * channel) for channel in background)
-        image = Image.alpha_composite(Image.new("RGBA", image.size, behind), image)
+        rgb = tuple(round(255 * channel) for channel in background)
+        image = Image.alpha_composite(Image.new("RGBA", image.size, rgb), image)
     pixels: NDArray[np.float32] = np.divide(np.asarray(image.convert("RGB")), 255, dtype=np.float32)
     return pixels
 

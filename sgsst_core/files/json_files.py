@@ -31,7 +31,7 @@ def json_numbers(values: Any, count: int) -> NDArray[np.float64]:
         ValueError: If there are more or fewer, or any is a text, a truth value or a list.
         OverflowError: If an integer is too large.
     """
-    found = values if isinstance(values, list) else [values]
-    if len(found) != count or not all(type(value) in (int, float, type(None)) for value in found):
-        raise ValueError(f"{len(found)} values in place of {count} numbers, or values that are not numbers")
-    return np.array(found, np.float64)
+    numbers = values if isinstance(values, list) else [values]
+    if len(numbers) != count or not all(type(value) in (int, float, type(None)) for value in numbers):
+        raise ValueError(f"{len(numbers)} values in place of {count} numbers, or values that are not numbers")
+    return np.array(numbers, np.float64)

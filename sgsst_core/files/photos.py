@@ -72,9 +72,9 @@ class PhotoFolder:
         known = wanted.suffix.lower() in self._extensions
         parts = tuple(part for part in (wanted.with_suffix("") if known else wanted).parts if part not in ("..", "/"))
         for start in range(len(parts)):
-            found = self._index.get(parts[start:], [])
-            if found:
-                direct = [path for path in found if path.parent == self._folder.joinpath(*parts[start:-1])] or found
+            paths = self._index.get(parts[start:], [])
+            if paths:
+                direct = [path for path in paths if path.parent == self._folder.joinpath(*parts[start:-1])] or paths
                 return [path for path in direct if path.suffix == wanted.suffix] or direct
         return []
 
@@ -95,15 +95,15 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
         raise ImageError(f"{folder}: is not a folder of photos. Give the folder that the cameras' names refer to.")
     files = PhotoFolder(folder)
     matches = [files.named(camera.name) for camera in cameras]
-    missing = [camera.name for camera, found in zip(cameras, matches, strict=True) if not found]
-    several = [camera.name for camera, found in zip(cameras, matches, strict=True) if len(found) > 1]
+    missing = [camera.name for camera, paths in zip(cameras, matches, strict=True) if not paths]
+    several = [camera.name for camera, paths in zip(cameras, matches, strict=True) if len(paths) > 1]
     for what, names, most in (("no photo", missing, MOST_MISSING * len(cameras)), ("more than one photo", several, 0)):
         if len(names) > most:
             raise ImageError(
                 f"{folder}: holds {what} for {len(names)} of {len(cameras)} views: {some_names(names)}. Photos are "
                 "found by the cameras' names, with or without extension: give the folder that holds exactly these."
             )
-    return [_fitting(found[0], camera) if found else None for camera, found in zip(cameras, matches, strict=True)]
+    return [_fitting(paths[0], camera) if paths else None for camera, paths in zip(cameras, matches, strict=True)]
 
 
 def some_names(names: Sequence[str]) -> str:
@@ -123,18 +123,18 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     if not folder.is_dir():
         raise ImageError(f"{folder}: is not a folder of masks. Give the folder that the cameras' names refer to.")
     files = PhotoFolder(folder)
-    found: list[Photo | None] = []
+    masks: list[Photo | None] = []
     for camera in cameras:
         paths = files.named(camera.name)
         if len(paths) > 1:
             raise ImageError(f"{folder}: holds more than one mask for view {camera.name}. Leave one.")
-        found.append(_fitting(paths[0], camera) if paths else None)
-    if not any(found):
+        masks.append(_fitting(paths[0], camera) if paths else None)
+    if not any(masks):
         raise ImageError(
             f"{folder}: holds no mask for any of {len(cameras)} views. Masks are found by the cameras' names, with or "
             f"without extension, such as {cameras[0].name}."
         )
-    return found
+    return masks
 
 
 def load_photo(photo: Photo, camera: Camera, *, color_managed: bool = True) -> Tensor:

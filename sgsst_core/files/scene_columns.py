@@ -157,12 +157,12 @@ class SceneColumns:
         rest = sorted(
             (name for name in totals if name not in _ORDER), key=lambda name: int(name.removeprefix("f_rest_"))
         )
-        found = []
+        invalid = []
         for name in [*(name for name in _ORDER if name in totals), *rest]:
             counts = dict(zip(("NaN", "infinite"), totals[name], strict=True))
-            found.append(f"{name} ({', '.join(f'{number} {what}' for what, number in counts.items() if number)})")
+            invalid.append(f"{name} ({', '.join(f'{number} {what}' for what, number in counts.items() if number)})")
         bad = int((~retained).sum())
-        flawed = [f"hold NaN or infinite values: {', '.join(found)}"] if found else []
+        flawed = [f"hold NaN or infinite values: {', '.join(invalid)}"] if invalid else []
         if len(unrotated):
             flawed += [
                 f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {min(unrotated)})"

@@ -77,9 +77,9 @@ def are_activated(opacities: Tensor, scales: Tensor) -> bool:
     in_range = not bool(((opacities < 0) | (opacities > 1)).any())
     positive = not bool((scales < 0).any())
     if in_range != positive:
-        found = "`opacities` in 0..1 and logarithms as `scales`" if in_range else "positive `scales` and logits"
+        values = "`opacities` in 0..1 and logarithms as `scales`" if in_range else "positive `scales` and logits"
         raise SceneError(
-            f"The scene has {found}. Give logarithms and logits as gsplat's trainers keep them, or neither; a `Scene` "
+            f"The scene has {values}. Give logarithms and logits as gsplat's trainers keep them, or neither; a `Scene` "
             "holds logarithms and logits of any sign."
         )
     return in_range

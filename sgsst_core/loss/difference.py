@@ -13,8 +13,8 @@ class Difference:
     """Difference between two gradients.
 
     Attributes:
-        relative_error: |found - exact| / |exact| in the Euclidean norm. If the exact gradient is 0, the error is 0 if
-            the found gradient is also 0, and 1 otherwise.
+        relative_error: |actual - exact| / |exact| in the Euclidean norm. If the exact gradient is 0, the error is 0 if
+            the actual gradient is also 0, and 1 otherwise.
         cosine: Cosine of the angle between the gradients. If one gradient is 0, the cosine is 1 if both are 0, and 0
             otherwise.
     """
@@ -23,11 +23,11 @@ class Difference:
     cosine: float
 
     @staticmethod
-    def of(found: Tensor, exact: Tensor) -> Difference:
+    def of(actual: Tensor, exact: Tensor) -> Difference:
         """Compare two gradients of the same shape in float64. If a value is not finite, the error is infinite."""
-        error, length = (found - exact).double().norm(), exact.double().norm()
-        product = float((found.double() * exact.double()).sum())
-        lengths = float(found.double().norm() * length)
+        error, length = (actual - exact).double().norm(), exact.double().norm()
+        product = float((actual.double() * exact.double()).sum())
+        lengths = float(actual.double().norm() * length)
         if not math.isfinite(lengths):
             return Difference(math.inf, 0.0)
         return Difference(

@@ -102,13 +102,13 @@ def paper_scales(weights: BackboneWeights, image: Path = STARRY_NIGHT) -> dict[s
         small = painting.convert("RGB").resize((size[0], size[1]), Image.Resampling.LANCZOS)
     pixels = torch.from_numpy(np.array(small, dtype=np.float32)) / 255
     nothing = (torch.tensor(CAFFE_MEAN) / 255).expand(pixels.shape)
-    found, of_nothing = _features(weights, pixels), _features(weights, nothing)
+    features, of_nothing = _features(weights, pixels), _features(weights, nothing)
     scales = {}
     for layer, published in PUBLISHED.items():
         if layer == _CONTENT:
-            factor = (published / float((found[layer] - of_nothing[layer]).square().mean())) ** (1 / 2)
+            factor = (published / float((features[layer] - of_nothing[layer]).square().mean())) ** (1 / 2)
         else:
-            difference = _gram(found[layer]) - _gram(of_nothing[layer])
+            difference = _gram(features[layer]) - _gram(of_nothing[layer])
             factor = (published / float(difference.square().mean())) ** (1 / 4)
         scales[layer] = float(f"{factor:.2g}")
     return scales

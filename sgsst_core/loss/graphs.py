@@ -177,13 +177,13 @@ class LossGraphs:
     def _captured(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph | None:
         """Capture, cache and return the graph for a key; return None if capturing fails."""
         try:
-            found = self._graphs[key] = self._capture(key, image, style, view)
+            graph = self._graphs[key] = self._capture(key, image, style, view)
         except Exception as error:  # any failure falls back to eager mode
             self.problem = f"{type(error).__name__}: {error}"
             self._graphs.clear()
             self._static.clear()
             return None
-        return found
+        return graph
 
     def _capture(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph:
         loss, device = self.loss, self.loss.network.device
@@ -201,14 +201,14 @@ class LossGraphs:
                 torch.cuda.stream(self._stream),
                 torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"),
             ):
-                found = loss.evaluate(static_image, style, static_view, scales)
-                assert found.image_gradient is not None
+                result = loss.evaluate(static_image, style, static_view, scales)
+                assert result.image_gradient is not None
                 # Copy to memory that other graphs do not reuse for activations.
-                values.copy_(found.values)
-                gradient.copy_(found.image_gradient)
+                values.copy_(result.values)
+                gradient.copy_(result.image_gradient)
         finally:
             loss.timer = timer
-        return _Graph(graph, static_image, static_view, SosResult(found.scales, values, gradient, found.weights))
+        return _Graph(graph, static_image, static_view, SosResult(result.scales, values, gradient, result.weights))
 
     def _static_inputs(self, key: _Key, image: Tensor, view: ViewTarget) -> tuple[Tensor, ViewTarget]:
         """Return static tensors in the formats of an image and of its view's targets; their values are not set."""

@@ -158,8 +158,8 @@ class Matches:
             inverse[part] = torch.where(lengths <= rounding * style.length, torch.inf, lengths).reciprocal()
             block *= inverse[part][:, :, None]
             if position_weights is not None and units.device.type == "cpu":
-                found = position_weights[part] > 0
-                cosine[part][found], nearest[part][found] = search(block[found], units)
+                covered = position_weights[part] > 0
+                cosine[part][covered], nearest[part][covered] = search(block[covered], units)
             else:
                 values, positions = search(block.reshape(-1, block.shape[2]), units)
                 cosine[part], nearest[part] = values.view(lengths.shape), positions.view(lengths.shape)

@@ -78,10 +78,10 @@ def style_loss_reference(
         position_weights: [h, w]; None for equal weights.
         weights: Weights of the terms.
     """
-    found = _statistics(features, position_weights)
-    loss = weights.gram / features.shape[-1] ** 2 * (found.gram - target.gram).square().mean()
-    loss = loss + weights.mean * (found.mean - target.mean).square().mean()
-    return loss + weights.std * (found.std - target.std).square().mean()
+    own = _statistics(features, position_weights)
+    loss = weights.gram / features.shape[-1] ** 2 * (own.gram - target.gram).square().mean()
+    loss = loss + weights.mean * (own.mean - target.mean).square().mean()
+    return loss + weights.std * (own.std - target.std).square().mean()
 
 
 def _statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerTarget:

@@ -74,13 +74,13 @@ class TargetBuilder:
         vectors = {
             scale: self._style_vectors([pyramid[scale] for pyramid in pyramids], style.weights) for scale in pyramids[0]
         }
-        if self._matched and all(found is None for found in vectors.values()):
+        if self._matched and all(each is None for each in vectors.values()):
             height, width = _size(pyramids[0][min(pyramids[0])])  # from the scales with a positive weight
             raise ImageError(
                 f"The style is used at {width} x {height} pixels, too few to match features with. "
                 "Use a larger style image, larger views, or --style-loss sos."
             )
-        return {scale: (StyleTarget(layers.get(scale, {}), found),) for scale, found in vectors.items()}
+        return {scale: (StyleTarget(layers.get(scale, {}), each),) for scale, each in vectors.items()}
 
     def _style_pyramid(self, image: Tensor, view_size: Size) -> dict[int, Tensor]:
         """Return a style image at the scales that are evaluated for views of a given size, on the network's device."""

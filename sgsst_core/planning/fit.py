@@ -121,20 +121,22 @@ def compare_photos(
     if doubtful:
         some = spread(doubtful, _VIEWS)
         stored = mean(likeness.psnr(photos[index], cameras[index]) or 0.0 for index in some)
-        turned = mean(likeness.psnr(replace(photos[index], oriented=True), cameras[index]) or 0.0 for index in some)
-        if turned > stored:
+        oriented = mean(likeness.psnr(replace(photos[index], oriented=True), cameras[index]) or 0.0 for index in some)
+        if oriented > stored:
             photos = [replace(photo, oriented=True) if photo.ambiguous else photo for photo in photos]
-        used = f"the EXIF orientation of {len(doubtful)} photos is {'applied' if turned > stored else 'ignored'}"
-        reason = f"PSNR against renders is {max(stored, turned):.1f} dB so, and {min(stored, turned):.1f} dB otherwise"
+        used = f"the EXIF orientation of {len(doubtful)} photos is {'applied' if oriented > stored else 'ignored'}"
+        reason = (
+            f"PSNR against renders is {max(stored, oriented):.1f} dB so, and {min(stored, oriented):.1f} dB otherwise"
+        )
         decisions.append(Decision("photos", used, reason))
     pairs = spread(list(zip(photos, cameras, strict=True)), _VIEWS)
     values = [likeness.psnr(photo, camera) for photo, camera in pairs]
-    found = median([value for value in values if value is not None] or [math.inf])
-    if found < _UNLIKE_PSNR:
+    psnr = median([value for value in values if value is not None] or [math.inf])
+    if psnr < _UNLIKE_PSNR:
         decisions.append(
             Decision(
                 "photos",
-                f"warning: they differ from the scene's renders ({found:.1f} dB PSNR; at least {_UNLIKE_PSNR:.0f} are "
+                f"warning: they differ from the scene's renders ({psnr:.1f} dB PSNR; at least {_UNLIKE_PSNR:.0f} are "
                 "expected)",
                 "they may be cropped, belong to other cameras, or the scene is in another coordinate frame; compare "
                 "them with the images of `sgsst render`",

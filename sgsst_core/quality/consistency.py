@@ -236,11 +236,11 @@ def find_warp(
     for top in range(0, camera.height, step):
         band = slice(top, top + step)
         x, y, z = project_pixels(depth.depth[band], top, camera, other)
-        found = depth.known[band] & (z > 0) & (x >= 0) & (x <= other.width) & (y >= 0) & (y <= other.height)
-        source, weight = _around(other_depth, x[found], y[found], z[found], tolerance)
+        projected = depth.known[band] & (z > 0) & (x >= 0) & (x <= other.width) & (y >= 0) & (y <= other.height)
+        source, weight = _around(other_depth, x[projected], y[projected], z[projected], tolerance)
         fraction = weight.sum(dim=0)
         agrees = fraction > 1 - _FOREIGN_FRACTION
-        pixels.append(found.view(-1).nonzero()[agrees, 0] + top * camera.width)
+        pixels.append(projected.view(-1).nonzero()[agrees, 0] + top * camera.width)
         sources.append(source[:, agrees])
         weights.append(weight[:, agrees] / fraction[agrees])
     return Warp((camera.height, camera.width), torch.cat(pixels), torch.cat(sources, dim=1), torch.cat(weights, dim=1))

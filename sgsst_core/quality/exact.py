@@ -30,12 +30,12 @@ from sgsst_core.stylizing.views import Views
 
 def approximations(stylizer: Stylizer) -> list[str]:
     """Return the names of a job's approximations whose gradient error exceeds rounding; empty if there are none."""
-    found = []
+    names = []
     if stylizer.job.network.precision != "float32":
-        found.append("TF32 convolutions" if stylizer.job.network.tf32 else f"{stylizer.job.network.precision} features")
+        names.append("TF32 convolutions" if stylizer.job.network.tf32 else f"{stylizer.job.network.precision} features")
     if stylizer.job.plan.cached_weights == "half":
-        found.append("half-precision blend weights")
-    return found
+        names.append("half-precision blend weights")
+    return names
 
 
 def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:

@@ -99,9 +99,9 @@ def findings_of(
         survey: Existing survey of the cameras; None renders the views.
     """
     rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: nothing is allocated yet
-    found = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, survey=survey)]
+    findings = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, survey=survey)]
     images = () if style is None else Style.of(style).images
-    return [*found, *(finding for image in images for finding in style_findings(image, cameras))]
+    return [*findings, *(finding for image in images for finding in style_findings(image, cameras))]
 
 
 def scene_findings(file: SceneFile) -> list[Finding]:
@@ -151,9 +151,9 @@ class _Scene:
                     counts[number] += count
                     order = value.double() if questions[number].largest else -value.double()
                     index = int(torch.where(extreme, order, -math.inf).argmax())
-                    found = (float(order[index]), part.start + index, float(value[index]))
-                    if worst[number][1] < 0 or found[0] > worst[number][0]:
-                        worst[number] = found
+                    extreme_value = (float(order[index]), part.start + index, float(value[index]))
+                    if worst[number][1] < 0 or extreme_value[0] > worst[number][0]:
+                        worst[number] = extreme_value
         return [
             Finding(subject, ask.what, count, len(self.scene), f"Gaussian {self._row(at)}: {value:.3g}", ask.done)
             for ask, count, (_, at, value) in zip(questions, counts, worst, strict=True)
@@ -248,13 +248,13 @@ class _Scene:
         )
 
     def harmonics(self) -> list[Finding]:
-        found = []
+        findings = []
         for name, values in (("DC", self.scene.sh_dc), ("higher", self.scene.sh_rest)):
             if values.shape[1]:
                 done = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
                 question = _Question(f"{name} SH coefficients above {LARGE_COEFFICIENT:g}", done)
-                found += self.ask(_large_coefficients(values), question)
-        return found
+                findings += self.ask(_large_coefficients(values), question)
+        return findings
 
     def distance(self) -> list[Finding]:
         far = float(self.center.norm()) / self.extent
@@ -396,13 +396,13 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
         seen = sees_something(coverage)
         uncovered.append(float((1 - coverage).mean(dtype=torch.float64)) if seen else 1.0)
         blend_weights += weights.cpu()
-    found = (
+    findings = (
         [Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops the job")]
         if refused
         else []
     )
-    found += _uncovered(uncovered, cameras)
-    return found if refused else [*found, *_seldom_seen(file, blend_weights)]
+    findings += _uncovered(uncovered, cameras)
+    return findings if refused else [*findings, *_seldom_seen(file, blend_weights)]
 
 
 def _uncovered(fractions: list[float], cameras: Sequence[Camera]) -> list[Finding]:
@@ -450,24 +450,24 @@ def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
 def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
     """Return the findings about a style image [H, W, 3]."""
     height, width = int(style.shape[0]), int(style.shape[1])
-    found = []
+    findings = []
     spread = float(style.double().std(dim=(0, 1), correction=0).max())
     if spread < FLAT_STYLE:
         done = "its features hardly vary, so the scene is pulled toward one flat color"
-        found.append(Finding("style", "one color throughout", 1, 1, f"standard deviation {spread:.2g}", done))
+        findings.append(Finding("style", "one color throughout", 1, 1, f"standard deviation {spread:.2g}", done))
     aspect = max(height, width) / min(height, width)
     if aspect > LONG_STYLE:
         done = "used as a whole; its shorter side determines its size in the loss"
-        found.append(Finding("style", "extreme aspect ratio", 1, 1, f"{width} x {height}", done))
+        findings.append(Finding("style", "extreme aspect ratio", 1, 1, f"{width} x {height}", done))
     used = [style_size((height, width), (camera.height, camera.width)) for camera in cameras]
     tiny = [size for size in used if min(size) < ALIGNMENT]
     if tiny:
         done = f"feature layers without a cell are skipped in the loss; use an image of at least {ALIGNMENT} pixels"
         smallest = min(tiny, key=min)
-        found.append(
+        findings.append(
             Finding("style", "too small for deep layers", 1, 1, f"used at {smallest[1]} x {smallest[0]}", done)
         )
-    return found
+    return findings
 
 
 def _large_coefficients(values: Tensor | StoredHarmonics) -> _Check:

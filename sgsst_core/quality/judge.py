@@ -36,7 +36,7 @@ from sgsst_core.stylizing.job_styles import JobStyles
 #: bounds the cost of large views.
 JUDGED_SIDE = 1024
 #: Gray values of the backgrounds that each view is judged on: black and white.
-_BEHIND = (0.0, 1.0)
+_BACKGROUNDS = (0.0, 1.0)
 #: Minimum coverage of judged views.
 _LEAST_COVERAGE = 1e-3
 #: Minimum coverage of every pixel that an interior feature sees.
@@ -143,7 +143,7 @@ class Judge:
     def renders(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
         """Render colors `sh_dc` [N, 3] on black and on white, as images [H, W, 3]."""
         image, coverage = self._render(sh_dc.detach().to(self._rasterizer.device), camera)
-        return [self._on(image, coverage, camera, behind) for behind in _BEHIND]
+        return [self._on(image, coverage, camera, level) for level in _BACKGROUNDS]
 
     def _view(self, camera: Camera, sh_dc: Tensor) -> list[_Measures]:
         """Return the measures of a view, on black and on white background."""
@@ -151,12 +151,12 @@ class Judge:
         before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
         weights = coverage.to(self._lpips.device)
         parts = self._parts(camera, weights)
-        found = []
-        for behind in _BEHIND:
-            stylized, original = (self._on(values, coverage, camera, behind) for values in (image, before))
+        measures = []
+        for level in _BACKGROUNDS:
+            stylized, original = (self._on(values, coverage, camera, level) for values in (image, before))
             own, theirs = self._lpips.features(stylized), self._lpips.features(original)
             distance = self._lpips.between(own, theirs, (camera.height, camera.width)).map
-            found.append(
+            measures.append(
                 (
                     sum(fraction * judge.distance(own, part) for judge, part, fraction in parts),
                     sum(fraction * judge.color_distance(stylized, part) for judge, part, fraction in parts),
@@ -165,7 +165,7 @@ class Judge:
                     *_interior(own, parts),
                 )
             )
-        return found
+        return measures
 
     def _covered(self, camera: Camera) -> float:
         """Return the fraction of a view that is judged."""
@@ -180,9 +180,9 @@ class Judge:
             rest = rest_colors(self._sh_rest, self._means, camera)
         return self._rasterizer.render(view_colors(sh_dc, rest), camera), self._rasterizer.coverage(camera)
 
-    def _on(self, image: Tensor, coverage: Tensor, camera: Camera, behind: float) -> Tensor:
+    def _on(self, image: Tensor, coverage: Tensor, camera: Camera, level: float) -> Tensor:
         """Return the image on another background color, clamped to 0 to 1."""
-        return shown(image + (1 - coverage)[..., None] * (behind - self._background), camera, self._lpips.device)
+        return shown(image + (1 - coverage)[..., None] * (level - self._background), camera, self._lpips.device)
 
     def _parts(self, camera: Camera, coverage: Tensor) -> list[tuple[_StyleJudge, Tensor, float]]:
         """Return each style's judge with its position weights [h, w] and its fraction of the judged area.
@@ -210,8 +210,8 @@ def _interior(
         features: Features [h, w, c] of the image, by layer.
         parts: Judge, position weights [H, W] and fraction of the area of each region.
     """
-    found = [(judge.interior(features, part), fraction) for judge, part, fraction in parts]
-    known = [(pair, fraction) for pair, fraction in found if pair is not None]
+    distances = [(judge.interior(features, part), fraction) for judge, part, fraction in parts]
+    known = [(pair, fraction) for pair, fraction in distances if pair is not None]
     total = sum(fraction for _, fraction in known)
     if not known:
         return None, None
@@ -266,14 +266,14 @@ class _StyleJudge:
             coverage: Coverage [H, W] of the object or of the region.
         """
         targets = self._layers((int(coverage.shape[0]), int(coverage.shape[1])))
-        found = []
+        distances = []
         for values, least, target in zip(features, self._lpips.least_coverage(coverage), targets, strict=True):
             inside = values[least >= _INTERIOR][None]  # [1, n, c]
             if inside.shape[1] >= _LEAST_INTERIOR:
                 ones = torch.ones(inside.shape[:2], device=inside.device)
                 sliced = _relative_difference(_quantiles(inside, ones), target.quantiles)
-                found.append((_relative(_gram(inside, ones), target.gram), sliced))
-        return (fmean(gram for gram, _ in found), fmean(sliced for _, sliced in found)) if found else None
+                distances.append((_relative(_gram(inside, ones), target.gram), sliced))
+        return (fmean(gram for gram, _ in distances), fmean(sliced for _, sliced in distances)) if distances else None
 
     def _layers(self, view: tuple[int, int]) -> list[_LayerTarget]:
         """Return the style's features of each layer for a view size."""

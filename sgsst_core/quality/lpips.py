@@ -185,7 +185,7 @@ def _vgg16(
         )
 
     def features(rgb: Tensor) -> list[Tensor]:
-        found = network.forward(rgb, cache=False).features
-        return [found[layer] for layer in _VGG16_LAYERS]
+        outputs = network.forward(rgb, cache=False).features
+        return [outputs[layer] for layer in _VGG16_LAYERS]
 
     return features

@@ -139,8 +139,8 @@ class Measurements:
             novel_views.lpips, stylizer.job.styles, novel_views.scene, novel_views.rasterizer, views, background
         )
         colors = {"before": stylizer.job.scene.sh_dc, "after": stylizer.stylized()}
-        found = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
-        stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in found.items() if one} or None
+        judgments = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
+        stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in judgments.items() if one} or None
 
     def _measure_start(self) -> None:
         if self.level.start and not self._stylizer.measured:

@@ -133,13 +133,13 @@ def choose_novel_cameras(
     if rasterizer_of is not None and len(scene) > _OUTLOOK_GAUSSIANS:
         scene = sampled(scene, _OUTLOOK_GAUSSIANS)
         rasterizer = rasterizer_of(scene)
-    found: dict[CameraKey, Outlook] = {}  # by camera, because a camera is a neighbor of two views
+    outlooks: dict[CameraKey, Outlook] = {}  # by camera, because a camera is a neighbor of two views
 
     def outlook(camera: Camera) -> Outlook:
         key = camera_key(camera)
-        if key not in found:
-            found[key] = _outlook(camera, scene, rasterizer)
-        return found[key]
+        if key not in outlooks:
+            outlooks[key] = _outlook(camera, scene, rasterizer)
+        return outlooks[key]
 
     clear = {index for index in used if _is_clear(novel[index], parents[index], outlook)}
     return NovelCameras(

@@ -179,7 +179,7 @@ class NovelViews:
             style = self._style_targets(self.cameras[index])
             for scale, terms in self._loss.evaluate(image(index), style, target, gradient=False).terms.items():
                 values.setdefault(scale, []).append(terms["gram"])
-        return {scale: sum(found) / len(found) for scale, found in sorted(values.items())}
+        return {scale: sum(own) / len(own) for scale, own in sorted(values.items())}
 
     def _consistency(self, gap: int, image: Callable[[int], Tensor]) -> Consistency | None:
         if not self.pairs[gap]:

@@ -57,8 +57,8 @@ def small_gaussians(scene: Scene, cameras: Sequence[Camera], near: float) -> tup
     for camera in cameras:
         opacity, after = np.zeros(len(scene)), np.zeros(len(scene))
         for each, values in ((scene, opacity), (compensated, after)):
-            found = project(each, camera, near=near, shapes=shapes)
-            values[found.gaussians] = np.exp2(found.values[:, Column.LOG2_OPACITY])
+            projection = project(each, camera, near=near, shapes=shapes)
+            values[projection.gaussians] = np.exp2(projection.values[:, Column.LOG2_OPACITY])
         opaque = opacity > _OPAQUE
         counts.append((int((opaque & (after < _SMALL * opacity)).sum()), int(opaque.sum())))
     small, total = np.mean(counts, axis=0).round().astype(int)
@@ -68,8 +68,8 @@ def small_gaussians(scene: Scene, cameras: Sequence[Camera], near: float) -> tup
 def _difference(scene: Scene, rendering: Rendering, views: Sequence[Camera], near: float) -> str:
     """Return how much renders in another mode differ, as text."""
     try:
-        found = scene_psnr(scene, replace(scene, rendering=rendering), views, near=near)
+        psnr = scene_psnr(scene, replace(scene, rendering=rendering), views, near=near)
     except TooManyIntersectionsError:  # reported as a finding of the views
         return ""
-    differ = "the same renders as" if found is None else f"{found:.1f} dB PSNR against"
+    differ = "the same renders as" if psnr is None else f"{psnr:.1f} dB PSNR against"
     return f"{differ} {rendering.text}, in {len(views)} views"

@@ -177,17 +177,17 @@ def count_votes(key: Path, files: Sequence[Path]) -> list[Share]:
     variant_of = [dict(zip(tokens, known.variants, strict=True)) for tokens in known.views]
     by_voter: dict[str, Votes] = {}
     for path in files:
-        found = _read(Votes, path)
-        if found.study != known.study:
+        result = _read(Votes, path)
+        if result.study != known.study:
             raise StudyError(f"{path}: holds votes of another study than {key}.")
-        views = [vote.view for vote in found.votes]
+        views = [vote.view for vote in result.votes]
         if len(set(views)) < len(views) or any(
-            vote.view >= len(variant_of) or vote.chosen not in variant_of[vote.view] for vote in found.votes
+            vote.view >= len(variant_of) or vote.chosen not in variant_of[vote.view] for vote in result.votes
         ):
             raise StudyError(f"{path}: holds votes that the study's page does not make. Save them again.")
-        before = by_voter.get(found.voter)
-        if before is None or len(before.votes) < len(found.votes):
-            by_voter[found.voter] = found
+        before = by_voter.get(result.voter)
+        if before is None or len(before.votes) < len(result.votes):
+            by_voter[result.voter] = result
     chosen = [variant_of[vote.view][vote.chosen] for votes in by_voter.values() for vote in votes.votes]
     if not chosen:
         raise StudyError("There are no votes in these files.")

@@ -70,9 +70,9 @@ class Regions:
         """
         return len(self.active) > 1 or self.frozen_in_view or self.every[self.active[0]].weight != 1
 
-    def members(self, place: int) -> Tensor:
-        """Return the mask [N] bool of the Gaussians in the region with index `place`."""
-        return self.labels == place
+    def members(self, index: int) -> Tensor:
+        """Return the mask [N] bool of the Gaussians in the region with this index."""
+        return self.labels == index
 
     def with_checked_styles(self) -> Regions:
         """Check the regions' styles, and convert their images; see `Style.given`."""
@@ -97,18 +97,18 @@ class Regions:
             SettingsError: If every Gaussian that a view sees is frozen.
         """
         labels = self.labels.clone()
-        for place, region in enumerate(self.every):
-            own = labels == place
-            if place and not region.freeze and not bool((weights[own] > 0).any()):
+        for index, region in enumerate(self.every):
+            own = labels == index
+            if index and not region.freeze and not bool((weights[own] > 0).any()):
                 labels[own] = 0
         seen = torch.bincount(labels[weights > 0].long(), minlength=len(self.every)) > 0
-        active = tuple(place for place, region in enumerate(self.every) if seen[place] and not region.freeze)
+        active = tuple(index for index, region in enumerate(self.every) if seen[index] and not region.freeze)
         if not active:
             raise SettingsError(
                 "Every Gaussian that a view sees is frozen: nothing would change. Freeze fewer regions."
             )
-        kept = any(bool(seen[place]) for place, region in enumerate(self.every) if region.freeze)
-        return replace(self, labels=labels, active=active, frozen_in_view=kept)
+        frozen_in_view = any(bool(seen[index]) for index, region in enumerate(self.every) if region.freeze)
+        return replace(self, labels=labels, active=active, frozen_in_view=frozen_in_view)
 
 
 def check_regions(regions: Regions, sh_attenuation: float = 0.0) -> None:

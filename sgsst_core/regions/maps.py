@@ -31,19 +31,19 @@ class RegionMaps:
 
         They are exactly 0 where a region is not visible.
         """
-        behind = self._pass(camera, rows, ())
+        background = self._pass(camera, rows, ())
         parts = [
-            self._pass(camera, rows, self._active[first : first + 3]) - behind for first in range(0, self.count, 3)
+            self._pass(camera, rows, self._active[first : first + 3]) - background for first in range(0, self.count, 3)
         ]
         return torch.cat(parts, dim=2)[:, :, : self.count].clamp(0, 1)
 
-    def _pass(self, camera: Camera, rows: Rows | None, places: tuple[int, ...]) -> Tensor:
+    def _pass(self, camera: Camera, rows: Rows | None, regions: tuple[int, ...]) -> Tensor:
         """Render up to three region masks; without regions, render the background.
 
         The background is bit-identical in all passes, so it can be subtracted.
         """
         rasterizer = self._rasterizer
         colors = torch.zeros((len(self._labels), 3), dtype=rasterizer.dtype, device=rasterizer.device)
-        for channel, place in enumerate(places):
-            colors[:, channel] = self._labels == place
+        for channel, region in enumerate(regions):
+            colors[:, channel] = self._labels == region
         return rasterizer.render(colors, camera, rows)

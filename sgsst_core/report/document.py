@@ -110,7 +110,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
                 str(scale): after[scale].total / before[scale].total for scale in before if scale in after
             },
         },
-        "bought": bought(stylizer, before),
+        "loss_over_time": loss_over_time(stylizer, before),
         "measuring": _measuring_json(stylizer),
         "novel_views": novel_views_json(stylizer.measured),
         "approximations": approximations_json(stylizer.measured),
@@ -168,7 +168,7 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
             "name": region.name,
             "select": region.select or None,
             "gaussians": int(regions.members(index).sum()),
-            "share": float(weights[regions.members(index)].sum() / weights.sum()),
+            "fraction": float(weights[regions.members(index)].sum() / weights.sum()),
             "style": region.style and region.style.text,
             "weight": region.weight,
             "freeze": region.freeze,
@@ -180,17 +180,17 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
 
 def _refined_json(plan: Plan) -> dict[str, Any] | None:
     """Return how Gaussians were split, with the effect on unstylized renders; None if refinement was not requested."""
-    made = plan.refinement
-    if made is None:
+    refinement = plan.refinement
+    if refinement is None:
         return None
     return {
-        "gaussians_before": len(made.pieces),
-        "gaussians": made.gaussians,
-        "split": made.split,
-        "taken_back": made.taken_back,
-        "size": made.size,
-        "psnr": made.psnr,
-        "lowest_psnr": made.lowest_psnr,
+        "gaussians_before": len(refinement.pieces),
+        "gaussians": refinement.gaussians,
+        "split": refinement.split,
+        "taken_back": refinement.taken_back,
+        "size": refinement.size,
+        "psnr": refinement.psnr,
+        "lowest_psnr": refinement.lowest_psnr,
     }
 
 
@@ -263,7 +263,7 @@ def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
     seconds, expected = stylizer.seconds_by_part.get("measuring", 0.0), stylizer.job.plan.prediction
     fraction = stylizer.job.settings.measure
     return {
-        "share": fraction,
+        "fraction": fraction,
         "allowed": allowed_seconds(fraction, expected.job - expected.measuring) if expected else None,
         "seconds": round(seconds, 3),
         "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
@@ -278,19 +278,19 @@ def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
 
 def sent_json(history: Sequence[StepRecord]) -> dict[str, dict[str, int]] | None:
     """Return the median bytes that the first rank sends per step, by phase and kind; None for a single rank."""
-    found: dict[str, dict[str, int]] = {}
+    medians: dict[str, dict[str, int]] = {}
     for stage in ("coarse", "sos"):
         steps = [record.sent for record in history if record.stage == stage and record.sent]
         if steps:
-            found[stage] = {kind: int(median(step.get(kind, 0) for step in steps)) for kind in TRAFFIC}
-    return found or None
+            medians[stage] = {kind: int(median(step.get(kind, 0) for step in steps)) for kind in TRAFFIC}
+    return medians or None
 
 
 #: Relative losses for which the report states the time of reaching them.
 _REACHED = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 
 
-def bought(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
+def loss_over_time(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
     """Summarize how the loss fell over time.
 
     The loss is the mean over the last round of views, relative to the unstylized scene.
@@ -338,7 +338,7 @@ def _cameras_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
     covered = set(stylizer.job.views.covered)
     return {
         "path": str(sources.cameras) if sources.cameras else None,
-        "form": "file" if sources.cameras else "orbit",
+        "source": "file" if sources.cameras else "orbit",
         "content": str(sources.photos) if sources.photos else "unstylized renders",
         "count": len(cameras),
         "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in cameras})],

@@ -109,8 +109,8 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
 
 
 def _consistency(moments: Sequence[dict[str, Any]], reach: str, metric: str) -> list[float | None]:
-    found = [consistency_at(moment, reach).get(metric) for moment in moments]
-    return [value if value is None or math.isfinite(value) else None for value in found]
+    consistencies = [consistency_at(moment, reach).get(metric) for moment in moments]
+    return [value if value is None or math.isfinite(value) else None for value in consistencies]
 
 
 def _known(values: Sequence[float | None]) -> bool:

@@ -31,7 +31,7 @@ from sgsst_core.stylizing.state import BEFORE_STEPS
 #: Maximum number of list members shown in the collapsed section, followed by their total number.
 _LIST = 40
 #: Fields of a report that have a section of their own on the page.
-_SECTIONS = ("history", "novel_views", "approximations", "bought", "findings", "plan", "seconds_by_part")
+_SECTIONS = ("history", "novel_views", "approximations", "loss_over_time", "findings", "plan", "seconds_by_part")
 _STOPPED = {
     "finished": "all planned steps are done",
     "max-seconds": "stopped at the time limit",
@@ -83,7 +83,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         style=_style_names(report),
         facts=_facts(report),
         result=_result(report),
-        bought=_bought(report),
+        loss_over_time=_loss_over_time(report),
         sheet=base64.b64encode(sheet).decode("ascii") if sheet else None,
         views=base64.b64encode(views).decode("ascii") if views else None,
         colors=PAGE,
@@ -172,10 +172,10 @@ def _result(report: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def _bought(report: dict[str, Any]) -> dict[str, Any] | None:
+def _loss_over_time(report: dict[str, Any]) -> dict[str, Any] | None:
     """Format when each relative loss was reached, and how the loss changed in the last tenth of the time."""
-    bought = report.get("bought")
-    if not bought:
+    loss_over_time = report.get("loss_over_time")
+    if not loss_over_time:
         return None
     total = report["seconds"]
     reached = [
@@ -185,9 +185,9 @@ def _bought(report: dict[str, Any]) -> dict[str, Any] | None:
             "step": f"{entry['step']:,}",
             "share": percent(entry["seconds"] / total) if total else NOTHING,
         }
-        for entry in bought.get("reached") or []
+        for entry in loss_over_time.get("reached") or []
     ]
-    last = bought.get("last_tenth")
+    last = loss_over_time.get("last_tenth")
     tenth = None
     if last:
         tenth = {
@@ -195,23 +195,23 @@ def _bought(report: dict[str, Any]) -> dict[str, Any] | None:
             "before": percent(last["from"], 3),
             "after": percent(last["to"], 3),
         }
-    return {"relative": percent(bought["relative"], 3), "reached": reached, "last_tenth": tenth}
+    return {"relative": percent(loss_over_time["relative"], 3), "reached": reached, "last_tenth": tenth}
 
 
 # --- other parts ---------------------------------------------------------------------------------------------------
 
 
 def _approximations(report: dict[str, Any]) -> dict[str, Any] | None:
-    found = report.get("approximations")
-    return {"what": ", ".join(found.get("what") or []), "table": approximation_table(report)} if found else None
+    entry = report.get("approximations")
+    return {"what": ", ".join(entry.get("what") or []), "table": approximation_table(report)} if entry else None
 
 
 def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:
     """Return each kind of time with its seconds and percentage, longest first."""
-    found = report.get("seconds_by_part") or {}
-    parts = {_PARTS.get(name, name): seconds for name, seconds in found.items()}
+    by_part = report.get("seconds_by_part") or {}
+    parts = {_PARTS.get(name, name): seconds for name, seconds in by_part.items()}
     measured = sum(parts.values())
-    total = max(report["seconds"] + sum(found.get(name, 0.0) for name in _BESIDE), measured)
+    total = max(report["seconds"] + sum(by_part.get(name, 0.0) for name in _BESIDE), measured)
     if not total:
         return []
     ordered = sorted(parts.items(), key=lambda part: -part[1])

@@ -53,10 +53,10 @@ def novel_views_table(report: dict[str, Any]) -> Table | None:
     for scale in scales:
         columns[f"scale {scale}, absolute"] = [number((moment.get("gram") or {}).get(scale)) for moment in moments]
     for reach in ("short", "long"):
-        found = [consistency_at(moment, reach) for moment in moments]
-        columns[f"RMSE, {reach} range"] = [number(entry.get("rmse")) for entry in found]
-        columns[f"LPIPS, {reach} range"] = [number(entry.get("lpips")) for entry in found]
-        columns[f"compared, {reach} range"] = [percent(entry.get("compared")) for entry in found]
+        consistencies = [consistency_at(moment, reach) for moment in moments]
+        columns[f"RMSE, {reach} range"] = [number(entry.get("rmse")) for entry in consistencies]
+        columns[f"LPIPS, {reach} range"] = [number(entry.get("lpips")) for entry in consistencies]
+        columns[f"compared, {reach} range"] = [percent(entry.get("compared")) for entry in consistencies]
     columns = {title: cells for title, cells in columns.items() if any(cell != NOTHING for cell in cells)}
     return Table([Column(title, True) for title in columns], list(zip(*columns.values(), strict=True)))
 

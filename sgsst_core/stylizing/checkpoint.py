@@ -109,11 +109,13 @@ class Checkpoints:
             if not self.previous.exists():
                 raise
             try:
-                found = load_checkpoint(self.previous, job, run)
+                checkpoint = load_checkpoint(self.previous, job, run)
             except CheckpointError:
                 raise error from None
-            warn(f"The checkpoint before the last one is used, of step {found.state.step}, because of this: {error}")
-            return found
+            warn(
+                f"The checkpoint before the last one is used, of step {checkpoint.state.step}, because of this: {error}"
+            )
+            return checkpoint
 
     def remove(self) -> None:
         """Delete both checkpoints."""

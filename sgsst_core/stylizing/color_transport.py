@@ -55,13 +55,13 @@ def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
 
 def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
     """Return the axes [3, 3] of each round and the maps along them, given samples [n, 3] of both distributions."""
-    found: list[tuple[Tensor, list[_Map]]] = []
+    rounds: list[tuple[Tensor, list[_Map]]] = []
     for axes in _round_axes():
         axes = axes.to(source.device)
         along = zip((source @ axes).unbind(1), (wanted @ axes).unbind(1), strict=True)
-        found.append((axes, [_along(values, others) for values, others in along]))
-        source = _through(source, found[-1:])
-    return found
+        rounds.append((axes, [_along(values, others) for values, others in along]))
+        source = _through(source, rounds[-1:])
+    return rounds
 
 
 def _through(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:

@@ -55,11 +55,12 @@ def round_loss(history: Sequence[StepRecord], round_length: int) -> float:
 
 def round_evaluation(history: Sequence[StepRecord], round_length: int, weights: ScaleWeights = EVEN) -> Evaluation:
     """Return the loss of the last round of views by scale and term, scaled so that its mean is `round_loss`."""
-    found = mean_evaluation([record.terms for record in _last_round(history, round_length)])
-    mean = mean_loss(found, weights)
+    evaluation = mean_evaluation([record.terms for record in _last_round(history, round_length)])
+    mean = mean_loss(evaluation, weights)
     factor = round_loss(history, round_length) / mean if mean > 0 else 1.0
     return {
-        scale: LossTerms(**{name: value * factor for name, value in terms.items()}) for scale, terms in found.items()
+        scale: LossTerms(**{name: value * factor for name, value in terms.items()})
+        for scale, terms in evaluation.items()
     }
 
 

@@ -68,11 +68,11 @@ class JobStyles:
     @property
     def all(self) -> list[Style]:
         """All distinct styles in use."""
-        found: list[Style] = []
+        styles: list[Style] = []
         for style in self.each or (self.own,):
-            if all(style is not other for other in found):
-                found.append(style)
-        return found
+            if all(style is not other for other in styles):
+                styles.append(style)
+        return styles
 
     def to(self, device: torch.device) -> JobStyles:
         """Return the styles with their images on a device."""

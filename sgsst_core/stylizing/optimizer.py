@@ -109,11 +109,11 @@ class ColorOptimizer:
         """
         if not self._bounded and self._chroma_of is None:
             return
-        found = constrained(self._colors, self._chroma_of, bounded=self._bounded)
+        constrained_colors = constrained(self._colors, self._chroma_of, bounded=self._bounded)
         unchanged = ~(largest <= LARGEST_GRADIENT)
         if self._frozen is not None:
             unchanged = unchanged | self._frozen
-        self._colors.copy_(torch.where(unchanged, self._colors, found))
+        self._colors.copy_(torch.where(unchanged, self._colors, constrained_colors))
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Return the first and second moment [n, 3] on the CPU; zeros before the first step."""

@@ -156,7 +156,7 @@ class Stylizer:
         yield
         parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
 
-    def behind(self, index: int) -> Color | None:
+    def drawn_background(self, index: int) -> Color | None:
         """Return the background color of a view in the next step; None for the background of the settings."""
         return drawn_color(self.job.plan.training_background, self.job.settings.seed, self.step, index, self.job.style)
 
@@ -211,17 +211,17 @@ class Stylizer:
         results = []
         cost = 0
         own_views = views[self.job.team.own_group :: self.job.team.groups]
-        for place, index in enumerate(own_views):
+        for position, index in enumerate(own_views):
             scales = phase.scales(self.job.scales(index))
-            behind = self.behind(index)
+            background = self.drawn_background(index)
             with self.job.timer("prepare", whole=True):
                 self.cache_weights(index)
-                target = self.job.view_targets.target(index, scales, behind)
-                self._prefetch(own_views[place + 1 :], phase)
+                target = self.job.view_targets.target(index, scales, background)
+                self._prefetch(own_views[position + 1 :], phase)
                 style = self.job.style_targets(self.job.views.cameras[index])
             assert target.division is not None
             cost += target.division.cost(self.job.group.rank, self.job.network.halo)
-            own, result = self._gradient(index, style, target, scales, behind)
+            own, result = self._gradient(index, style, target, scales, background)
             gradient = own if gradient is None else gradient.add_(own)
             results.append(result)
         assert gradient is not None
@@ -333,14 +333,14 @@ class Stylizer:
         style: StyleTargets,
         target: ViewTarget,
         scales: Sequence[int],
-        behind: Color | None = None,
+        background: Color | None = None,
     ) -> tuple[Tensor, SosResult]:
         """Return dE/dsh_dc [n, 3] of one view over a background color (None: that of the settings), and the loss."""
         with self.job.timer("render"), torch.no_grad():
             colors = self.job.views.colors(index, self.sh_dc.detach())
             image = self.job.views.render(index, colors)
-            if behind is not None:
-                image = self.job.view_targets.put_behind(index, image, behind)
+            if background is not None:
+                image = self.job.view_targets.replace_background(index, image, background)
         with self.job.timer("loss"):
             evaluate = self.job.graphs.evaluate if self.job.graphs is not None else self.job.loss.evaluate
             result = evaluate(image, style, target, scales)

@@ -60,7 +60,7 @@ def _uniform(*numbers: int) -> Color:
     return first / 2**_BITS, second / 2**_BITS, third / 2**_BITS
 
 
-def put_behind(image: Tensor, coverage: Tensor, color: Sequence[float], present: Sequence[float]) -> Tensor:
+def replace_background(image: Tensor, coverage: Tensor, color: Sequence[float], present: Sequence[float]) -> Tensor:
     """Replace the background color of an image [h, w, 3]: image + (1 - coverage) (color - present).
 
     Rendering is linear in the background, and so is the box average: for an image at a scale, use the coverage at that

@@ -16,7 +16,7 @@ from sgsst_core.parallel.division import Piece
 from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.pyramid import downscale
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
-from sgsst_core.stylizing.training_background import Color, put_behind
+from sgsst_core.stylizing.training_background import Color, replace_background
 from sgsst_core.stylizing.views import Views
 
 
@@ -78,7 +78,7 @@ class ViewTargets:
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
         self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
 
-    def target(self, index: int, scales: Sequence[int], behind: Color | None = None) -> ViewTarget:
+    def target(self, index: int, scales: Sequence[int], background: Color | None = None) -> ViewTarget:
         """Return the target of a view at some scales; cached if it fits.
 
         Features are computed only for requested scales: phase 1 needs those of one.
@@ -86,15 +86,15 @@ class ViewTargets:
         Args:
             index: Index of the view.
             scales: Requested scales.
-            behind: Background color, which the content gets too; None for the rasterizer's own. Features with a
+            background: Background color, which the content gets too; None for the rasterizer's own. Features with a
                 background color are used only once, so only the images they are computed from are cached.
         """
         coverage = self.coverage(index) if self.weighted else None
         division = self._division(index, scales, coverage)
         target = ViewTarget(coverage=coverage, division=division, regions=self.region_weights(index))
-        if self.loss.content_weight and behind is not None:
+        if self.loss.content_weight and background is not None:
             for scale, content in self._content_images(index, scales).items():
-                over = self._content_behind(index, content, behind, scale)
+                over = self._content_over(index, content, background, scale)
                 target.content[scale] = self.loss.targets.content_features(over, 0, division.tiles[scale])
         elif self.loss.content_weight:
             image = functools.cache(lambda: self.content(index))
@@ -128,12 +128,14 @@ class ViewTargets:
         maps = self._maps
         return None if maps is None else self._region_weights.get(index, lambda: self._rendered_regions(index, maps))
 
-    def put_behind(self, index: int, image: Tensor, color: Color, scale: int = 0) -> Tensor:
+    def replace_background(self, index: int, image: Tensor, color: Color, scale: int = 0) -> Tensor:
         """Replace the background color of a view's image [h, w, 3] at a scale.
 
         The result is on the network's device.
         """
-        return put_behind(image.to(self.loss.network.device), self.coverage(index)[scale], color, self._background)
+        return replace_background(
+            image.to(self.loss.network.device), self.coverage(index)[scale], color, self._background
+        )
 
     def prefetch(self, index: int, scales: Sequence[int]) -> None:
         """Start reading, on a GPU, the photo of the view whose target is requested next, if it will be needed."""
@@ -168,15 +170,15 @@ class ViewTargets:
 
         return {scale: self._images.get((index, scale), functools.partial(scaled, scale)) for scale in scales}
 
-    def _content_behind(self, index: int, image: Tensor, behind: Color, scale: int) -> Tensor:
+    def _content_over(self, index: int, image: Tensor, color: Color, scale: int) -> Tensor:
         """Return the content of a view at a scale with another background color.
 
         In a photo, the color replaces everything that no Gaussian covers.
         """
         if self.photos is None:
-            return self.put_behind(index, image, behind, scale)
+            return self.replace_background(index, image, color, scale)
         coverage = self.coverage(index)[scale]
-        return put_behind(image * coverage[..., None].to(image.dtype), coverage, behind, (0.0, 0.0, 0.0))
+        return replace_background(image * coverage[..., None].to(image.dtype), coverage, color, (0.0, 0.0, 0.0))
 
     def _division(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> Division:
         """Return the division of work on some scales of a view.

@@ -126,8 +126,8 @@ def in_luminance_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
 
 def _style_luminance(style: Style) -> tuple[Tensor, Tensor]:
     """Return mean and deviation of the luminance of a style's pixels."""
-    found = [luminance(image.reshape(-1, 3).double()) for image in style.images]
-    parts = [_luminance_moments(values, torch.ones_like(values)) for values in found]
+    luminances = [luminance(image.reshape(-1, 3).double()) for image in style.images]
+    parts = [_luminance_moments(values, torch.ones_like(values)) for values in luminances]
     if len(parts) == 1:
         return parts[0]
     moments = [(mean[None], spread.square()[None, None]) for mean, spread in parts]

@@ -85,7 +85,7 @@ def test_job_runs_resumes_and_reports(
     assert second.stylizer.job.plan.rasterizer == plan.rasterizer
     result = run_job(second)
     assert (result.stopped, result.step, result.report_error) == ("finished", 4, None)
-    assert result.bought is not None
+    assert result.loss_over_time is not None
     before, after = (read_scene(path).scene for path in (asked.source.scene, asked.out))
     assert not torch.equal(before.sh_dc, after.sh_dc)
     assert torch.isfinite(after.sh_dc).all()

@@ -204,7 +204,7 @@ def test_temporarily_full_disk_is_a_warning(request_: StylizeRequest, monkeypatc
     left = {path.suffix for path in request_.out.parent.iterdir()}
     assert ".safetensors" not in left
     report = json.loads(request_.out.with_name("s.report.json").read_text())
-    assert report["workers"]["used"] == report["workers"]["asked"] == 1
+    assert report["workers"]["used"] == report["workers"]["requested"] == 1
     assert report["workers"]["attempts"] == []
     assert report["seconds_by_part"]["reading"] > 0
 

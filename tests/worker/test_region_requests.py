@@ -8,7 +8,7 @@ import pytest
 
 from sgsst_core.errors import SettingsError
 from worker.region_requests import MOST_REGIONS, REST, RegionOptions, parse_selection, region_options, region_requests
-from worker.styles import MOST_PICTURES, StyleFile
+from worker.styles import MOST_STYLE_IMAGES, StyleFile
 
 
 @pytest.mark.parametrize(
@@ -91,8 +91,8 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
             rf"There are {MOST_REGIONS + 1} regions\. At most {MOST_REGIONS} are allowed",
         ),
         (
-            (["a:sphere=0,0,0,1"], ["a=x.jpg"] * (MOST_PICTURES + 1), [], []),
-            rf"{MOST_PICTURES + 1} style images\. At most {MOST_PICTURES} are allowed",
+            (["a:sphere=0,0,0,1"], ["a=x.jpg"] * (MOST_STYLE_IMAGES + 1), [], []),
+            rf"{MOST_STYLE_IMAGES + 1} style images\. At most {MOST_STYLE_IMAGES} are allowed",
         ),
     ],
 )

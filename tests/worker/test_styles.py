@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.errors import SettingsError
-from worker.styles import MOST_PICTURES, StyleFile, parse_style, parse_styles
+from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style, parse_styles
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_invalid_weights_are_refused(weight: str) -> None:
 
 
 def test_number_of_styles_is_limited() -> None:
-    assert len(parse_styles(["a.jpg"] * MOST_PICTURES)) == MOST_PICTURES
-    for count in (0, MOST_PICTURES + 1):
+    assert len(parse_styles(["a.jpg"] * MOST_STYLE_IMAGES)) == MOST_STYLE_IMAGES
+    for count in (0, MOST_STYLE_IMAGES + 1):
         with pytest.raises(SettingsError, match=f"There are {count} style images"):
             parse_styles(["a.jpg"] * count)

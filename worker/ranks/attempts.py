@@ -146,12 +146,12 @@ class _Attempts:
         self, request: StylizeRequest, workers: int, listener: Listener, options: WorkerOptions, cluster: Cluster
     ) -> None:
         self._request = request
-        self._asked = self._workers = workers
+        self._requested = self._workers = workers
         self._listener, self._options, self._cluster = listener, options, cluster
         self._run_id = secrets.token_hex(8)
         self._failed: list[FailedAttempt] = []
         self._lost: list[LostAttempt] = []
-        self._relay = Relay(listener, self._tell_resumed)
+        self._relay = Relay(listener, self._report_resumed)
         self._group = RankGroup(self._leave_out)
         self._let_go = False  # whether GPUs were released that the local Ray would still assign to ranks
         self._lost_at = time.monotonic()
@@ -249,7 +249,7 @@ class _Attempts:
             checkpoint_seconds=self._options.checkpoint_seconds,
             preview_folder=self._options.preview_folder,
             preview_seconds=self._options.preview_seconds,
-            workers={"asked": self._asked, "attempts": [asdict(attempt) for attempt in self._lost]},
+            workers={"requested": self._requested, "attempts": [asdict(attempt) for attempt in self._lost]},
             seconds_lost=time.monotonic() - self._relay.safe_at,
             seconds_since_loss=time.monotonic() - self._lost_at,
             workplace=self._workplace(),
@@ -284,14 +284,14 @@ class _Attempts:
         if not rank.place.gpus:
             return
         others = [other for other in self._group.handles if other.place and not other.left_out]
-        kept = [gpu for other in others if other.place for gpu in other.place.gpus]
-        self._workers = len(kept)
+        gpus = [gpu for other in others if other.place for gpu in other.place.gpus]
+        self._workers = len(gpus)
         if self._cluster.local:  # another process may use the GPU now, so the next attempt needs a new local Ray
             self._let_go = True
-            os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(kept)
+            os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(gpus)
         self._listener.left_out(rank.place.gpus)
 
-    def _tell_resumed(self) -> None:
+    def _report_resumed(self) -> None:
         """Report that the job has resumed after a loss, and record how long the recovery took."""
         if not self._lost or self._lost[-1].seconds_to_resume:
             return

@@ -174,7 +174,7 @@ NODE_LABEL = "ray.io/node-id"
 PLACE_SECONDS = 5.0
 
 
-class NoRoomError(Exception):
+class NoCapacityError(Exception):
     """Error if the cluster has no free resources even for one rank."""
 
 
@@ -232,7 +232,7 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
         scene: Bytes of the job's scene in memory.
 
     Raises:
-        NoRoomError: If there are no free resources even for one rank.
+        NoCapacityError: If there are no free resources even for one rank.
     """
     nodes = _nodes()
     gpus = sum(int(node.get("GPU", 0)) for node in nodes)
@@ -249,10 +249,12 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
             threads = 1
         else:
             wanted -= 1
-    raise NoRoomError(f"Ray has no capacity for a worker, which needs {_told(_bundle(nodes, 1, threads, scene))}")
+    raise NoCapacityError(
+        f"Ray has no capacity for a worker, which needs {_in_words(_bundle(nodes, 1, threads, scene))}"
+    )
 
 
-def _told(bundle: dict[str, int]) -> str:
+def _in_words(bundle: dict[str, int]) -> str:
     """Describe the resources of a rank in words."""
     parts = [f"{bundle['CPU']} cores" if bundle["CPU"] > 1 else "a core"]
     parts += ["a GPU"] if "GPU" in bundle else []
@@ -297,8 +299,8 @@ def _places(ranks: int, bundle: dict[str, int], deadline: float) -> tuple[Any, .
     from ray.util import placement_group, placement_group_table
 
     together = placement_group([bundle] * ranks, strategy="PACK" if "GPU" in bundle else "SPREAD")
-    found = together.wait(max(deadline - time.monotonic(), 1.0))
-    nodes = dict(placement_group_table(together)["bundles_to_node_id"]) if found else {}
+    ready = together.wait(max(deadline - time.monotonic(), 1.0))
+    nodes = dict(placement_group_table(together)["bundles_to_node_id"]) if ready else {}
     give_back(together)
     alone = [placement_group([bundle], bundle_label_selector=[{NODE_LABEL: nodes[index]}]) for index in sorted(nodes)]
     there = []

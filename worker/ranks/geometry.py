@@ -81,7 +81,7 @@ def read_shared_scene(
     homes = collectives.all_gather(home())
     reader = homes.index(home())
     sharing = homes.count(home())
-    _check_room(path, collectives, sharing, growth)
+    _check_memory(path, collectives, sharing, growth)
     own: SceneFile | None = None
     error: SgsstError | None = None
     shared: _Shared | None = None
@@ -155,7 +155,7 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
     return replace(shared.file, scene=replace(shared.file.scene, **tensors), retained=retained)
 
 
-def _check_room(path: Path, collectives: Collectives, sharing: int, growth: float) -> None:
+def _check_memory(path: Path, collectives: Collectives, sharing: int, growth: float) -> None:
     """Check that a scene, by the size in its header, fits into the free memory of each rank's machine and GPU.
 
     Args:
@@ -169,9 +169,9 @@ def _check_room(path: Path, collectives: Collectives, sharing: int, growth: floa
         problem = _lack(collectives.rank, sharing, *(int(size * growth) for size in _size_by_header(path, growth)))
     except SgsstError as error:
         problem = error
-    for found in collectives.all_gather(problem):
-        if found is not None:
-            raise found
+    for raised in collectives.all_gather(problem):
+        if raised is not None:
+            raise raised
 
 
 def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:

@@ -70,7 +70,7 @@ class Relay:
         self.safe_at = time.monotonic()
         self._prepared = False
         self._planned = -1  # surveyed views at the last notification
-        self._warned = self._previewed = self._told_stored = 0
+        self._warned = self._previewed = self._reported_files = 0
         self.stored: list[Any] = []
 
     @property
@@ -81,7 +81,7 @@ class Relay:
     def begin_attempt(self) -> None:
         """Reset the state of the current attempt for a new set of ranks."""
         self.first_step, self.last_step = None, self.saved or 0
-        self._warned = self._previewed = self._told_stored = 0
+        self._warned = self._previewed = self._reported_files = 0
         self._planned = -1
 
     def pass_on(self, status: RankStatus) -> None:
@@ -92,10 +92,10 @@ class Relay:
         for path in status.previews[self._previewed :]:
             self._listener.preview(path)
         self._previewed = len(status.previews)
-        for file in status.stored[self._told_stored :]:
+        for file in status.stored[self._reported_files :]:
             self.stored.append(file)
             self._listener.stored(file)
-        self._told_stored = len(status.stored)
+        self._reported_files = len(status.stored)
         self._pass_on_planning(status)
         self._pass_on_prepared(status)
         self._pass_on_progress(status)

@@ -128,20 +128,20 @@ def _from_json(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 def _object(name: str, members: dict[str, Any]) -> Any:
     """Return an instance of a dataclass with these members, without calling its constructor."""
-    found = _class(name)
-    if not is_dataclass(found) or members.keys() != {field.name for field in fields(found)}:
+    kind = _class(name)
+    if not is_dataclass(kind) or members.keys() != {field.name for field in fields(kind)}:
         raise ValueError(f"{name} is not a dataclass with the members {', '.join(members)}")
-    made = object.__new__(found)
+    instance = object.__new__(kind)
     for member, value in members.items():
-        object.__setattr__(made, member, value)  # works for frozen dataclasses, too
-    return made
+        object.__setattr__(instance, member, value)  # works for frozen dataclasses, too
+    return instance
 
 
 def _error(name: str) -> type[SgsstError]:
-    found = _class(name)
-    if not issubclass(found, SgsstError):
+    kind = _class(name)
+    if not issubclass(kind, SgsstError):
         raise ValueError(f"{name} is not an error of this program")
-    return found
+    return kind
 
 
 def _name_of(kind: type) -> str:
@@ -156,7 +156,7 @@ def _class(name: str) -> type:
     module, _, own = name.partition(":")
     if module.partition(".")[0] not in _PACKAGES:
         raise TypeError(f"{name} is not a class of {' or '.join(_PACKAGES)}")
-    found = getattr(import_module(module), own)
-    if not isinstance(found, type) or found.__module__ != module:
+    kind = getattr(import_module(module), own)
+    if not isinstance(kind, type) or kind.__module__ != module:
         raise TypeError(f"{name} is not a class")
-    return found
+    return kind

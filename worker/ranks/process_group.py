@@ -127,8 +127,8 @@ def _processor(device: torch.device) -> str:
     """Return an identifier of a GPU, the same for all of its MIG slices; "cpu" for a CPU."""
     if device.type == "cpu":
         return "cpu"
-    found: Any = torch.cuda.get_device_properties(device)  # the type stubs lack its place on the bus
-    return f"{socket.gethostname()} {found.pci_domain_id}:{found.pci_bus_id}:{found.pci_device_id}"
+    properties: Any = torch.cuda.get_device_properties(device)  # the type stubs lack its place on the bus
+    return f"{socket.gethostname()} {properties.pci_domain_id}:{properties.pci_bus_id}:{properties.pci_device_id}"
 
 
 def _backend(device: torch.device, sharing: int) -> str:
@@ -149,10 +149,10 @@ def _named(device: torch.device, backend: str) -> torch.device | None:
 
 def with_index(device: torch.device | str) -> torch.device:
     """Return the device, and add the current index to a GPU without one. `torch.cuda.set_device` and NCCL need it."""
-    found = torch.device(device)
-    if found.type == "cuda" and found.index is None:
+    indexed = torch.device(device)
+    if indexed.type == "cuda" and indexed.index is None:
         return torch.device("cuda", torch.cuda.current_device())
-    return found
+    return indexed
 
 
 class ProcessGroupCollectives:

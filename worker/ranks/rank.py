@@ -306,8 +306,8 @@ def _paths(request: StylizeRequest) -> list[Path]:
     """Return all paths of a request that are not None."""
     styles = [*request.styles, *(style for region in request.regions for style in region.styles)]
     masks = [region.selection.path for region in request.regions if region.selection]
-    found = [request.source.scene, request.source.cameras, *(style.path for style in styles), *masks]
-    return [path for path in [*found, request.images, request.out] if path is not None]
+    paths = [request.source.scene, request.source.cameras, *(style.path for style in styles), *masks]
+    return [path for path in [*paths, request.images, request.out] if path is not None]
 
 
 def set_thread_variables(threads: int) -> None:
@@ -324,12 +324,12 @@ def set_thread_variables(threads: int) -> None:
 
 def _failure(error: BaseException) -> Outcome:
     trace = "".join(traceback.format_exception(error))
-    told = error if isinstance(error, Exception) else RuntimeError(repr(error))
+    sent = error if isinstance(error, Exception) else RuntimeError(repr(error))
     try:
-        pickle.loads(pickle.dumps(told))
+        pickle.loads(pickle.dumps(sent))
     except Exception:  # the error cannot be pickled, so only its text is sent
-        told = RuntimeError(f"{type(error).__name__}: {error}")
-    return Outcome("failed", error=told, trace=trace, echo=_raised_in_exchange(error))
+        sent = RuntimeError(f"{type(error).__name__}: {error}")
+    return Outcome("failed", error=sent, trace=trace, echo=_raised_in_exchange(error))
 
 
 def _raised_in_exchange(error: BaseException) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 
 from sgsst_core.errors import ClusterAwayError, InfrastructureError
 from worker.processes import ProcessId, home, kill
-from worker.ranks.cluster import Cluster, NoRoomError, Reservation, give_back, reserve
+from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, give_back, reserve
 from worker.ranks.failure_policy import Failure, failure_of, first_line
 from worker.ranks.rank import Outcome, RankPlace, RankProcess, RankStatus, RankTask
 from worker.workplace import Workplace
@@ -106,7 +106,7 @@ def start_ranks(group: RankGroup, workers: int, scene: int, actor: type[RankProc
 
     try:
         group.reservation = reserve(workers, scene)
-    except NoRoomError as error:
+    except NoCapacityError as error:
         raise AttemptFailedError(Failure("loss", str(error), ClusterAwayError(f"{error}."))) from error
     kind = ray.remote(actor)
     reserved = zip(group.reservation.actor_options(), group.reservation.groups, strict=True)

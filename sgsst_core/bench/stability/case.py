@@ -243,9 +243,9 @@ class DecisionsOf(FeatureNetwork):
         forward = self.other.forward
 
         def heard(rgb: Tensor, *, cache: bool = True) -> Activations:
-            made = forward(rgb, cache=cache)
-            self._heard.append(list(made.outputs))
-            return made
+            activations = forward(rgb, cache=cache)
+            self._heard.append(list(activations.outputs))
+            return activations
 
         self.other.forward = heard  # type: ignore[method-assign]
         yield
@@ -254,8 +254,8 @@ class DecisionsOf(FeatureNetwork):
     def beside(self, evaluate: Callable[[FeatureNetwork], SosResult]) -> tuple[SosResult, SosResult]:
         """Return the results of a function by the other network, and by this one with the same decisions."""
         with self.listening():
-            found = evaluate(self.other)
-        return found, evaluate(self)
+            actual = evaluate(self.other)
+        return actual, evaluate(self)
 
     def rounding_of(self, layer: str) -> float:
         """Return the rounding error of the other network.
@@ -303,13 +303,13 @@ def compare_losses(
     def evaluated(network: FeatureNetwork) -> SosResult:
         return evaluate(SosLoss(network, content_weight=content_weight), image, Style.of(style), content, coverage)
 
-    found, expected = double.beside(evaluated)
+    actual, expected = double.beside(evaluated)
     loss = expected.loss
     if untiled:
         loss, _ = sos_reference(vgg16(), image, style, content, content_weight=content_weight, coverage=coverage)
     # The floor of 1 is far below any visible loss. It only prevents a division by zero for a perfect match.
-    error = max(abs(found.loss - loss) / max(abs(loss), 1.0), gradient_error(found, expected))
-    return CaseResult(error, bound, f"loss {found.loss:.3g}, {double.flips} ReLU and pool decisions flipped")
+    error = max(abs(actual.loss - loss) / max(abs(loss), 1.0), gradient_error(actual, expected))
+    return CaseResult(error, bound, f"loss {actual.loss:.3g}, {double.flips} ReLU and pool decisions flipped")
 
 
 def evaluate(loss: SosLoss, image: Tensor, style: Style, content: Tensor, coverage: Tensor | None) -> SosResult:
@@ -319,13 +319,13 @@ def evaluate(loss: SosLoss, image: Tensor, style: Style, content: Tensor, covera
     return loss.evaluate(image.to(dtype), targets, loss.targets.of_view(content.to(dtype), coverage))
 
 
-def gradient_error(found: SosResult, exact: SosResult) -> float:
+def gradient_error(actual: SosResult, exact: SosResult) -> float:
     """Return the relative error of a pixel gradient; infinity if the gradient is not finite."""
-    assert found.image_gradient is not None
+    assert actual.image_gradient is not None
     assert exact.image_gradient is not None
-    if not bool(torch.isfinite(found.image_gradient).all()):
+    if not bool(torch.isfinite(actual.image_gradient).all()):
         return math.inf
-    error = float((found.image_gradient.double() - exact.image_gradient).norm())
+    error = float((actual.image_gradient.double() - exact.image_gradient).norm())
     return error / max(float(exact.image_gradient.norm()), 1e-3)
 
 

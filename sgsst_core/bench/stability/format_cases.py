@@ -32,17 +32,17 @@ _CAMERAS = "cameras that are not finite, or do not face the object"
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    found = [
+    entries = [
         Case(f"{name}, as {format.name}", _GROUP, _AGAIN, partial(_compressed, make, format))
         for format in (COMPRESSED_PLY, SPZ, SOG, GLB)
         for name, make in _SCENES.items()
     ]
-    found += [
+    entries += [
         Case(f"{name}, as splat", _GROUP, "values that are not what the file holds", partial(_splat, make))
         for name, make in _SCENES.items()
     ]
     return [
-        *found,
+        *entries,
         *(
             Case(f"orbit: {name}", "files and orbits", _CAMERAS, partial(_orbit, make))
             for name, make in _OBJECTS.items()
@@ -87,19 +87,19 @@ def _compressed(make: Callable[[], Scene], format: SceneFormat, full: bool) -> C
     with tempfile.TemporaryDirectory() as folder:
         first, second = Path(folder) / "first", Path(folder) / "second"
         write_scene(first, scene, format)
-        found = read_scene(first).scene
-        write_scene(second, found, format)
+        reread = read_scene(first).scene
+        write_scene(second, reread, format)
         again = read_scene(second).scene
-    if len(found) != len(scene) or not all(map(_finite, (found, again))):
+    if len(reread) != len(scene) or not all(map(_finite, (reread, again))):
         return CaseResult(math.inf, 0.0, "Gaussians are missing, or hold values that are not finite")
-    steps = {"means": _position_step(found, format), "scales": 16 / 2047 if format is COMPRESSED_PLY else 1 / 16}
+    steps = {"means": _position_step(reread, format), "scales": 16 / 2047 if format is COMPRESSED_PLY else 1 / 16}
     steps |= {"sh_dc": 0.03, "opacities": math.inf, "quats": 0.02, "sh_rest": 1 / 16}
     error = 0.0
     for name, step in steps.items():
-        one, other = (_sorted(held(getattr(each, name)), each) for each in (found, again))
+        one, other = (_sorted(held(getattr(each, name)), each) for each in (reread, again))
         if math.isfinite(step) and one.numel():
             error = max(error, float((one.abs() - other.abs()).abs().max()) / step)
-    return CaseResult(error, 2.0, f"{len(found)} Gaussians; positions to {steps['means']:.2g}")
+    return CaseResult(error, 2.0, f"{len(reread)} Gaussians; positions to {steps['means']:.2g}")
 
 
 def _sorted(values: torch.Tensor, scene: Scene) -> torch.Tensor:
@@ -140,16 +140,16 @@ def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:
         path = Path(folder) / "scene.splat"
         path.write_bytes(b"".join(rows))
         try:
-            found = read_scene(path).scene
+            reread = read_scene(path).scene
         except InvalidInputError as error:
             return CaseResult(math.inf, 0.0, f"was refused: {error}")
-    shown = COLOR_OFFSET + SH_C0 * found.sh_dc.double()
+    shown = COLOR_OFFSET + SH_C0 * reread.sh_dc.double()
     wrong = float((shown - colors).abs().max()) * 255
-    wrong = max(wrong, float((torch.sigmoid(found.opacities.double())[:, None] - opacity).abs().max()) * 255)
-    same = torch.equal(found.means, scene.means) and bool(
-        torch.allclose(found.scales.double(), torch.from_numpy(sizes).double().log(), rtol=1e-6, atol=1e-6)
+    wrong = max(wrong, float((torch.sigmoid(reread.opacities.double())[:, None] - opacity).abs().max()) * 255)
+    same = torch.equal(reread.means, scene.means) and bool(
+        torch.allclose(reread.scales.double(), torch.from_numpy(sizes).double().log(), rtol=1e-6, atol=1e-6)
     )
-    return CaseResult(wrong if same and _finite(found) else math.inf, 0.8, "colors and opacities, in 255ths")
+    return CaseResult(wrong if same and _finite(reread) else math.inf, 0.8, "colors and opacities, in 255ths")
 
 
 def _cloud(x: float, y: float, z: float, count: int = 200) -> Scene:
@@ -175,13 +175,13 @@ def _orbit(make: Callable[[], Scene], full: bool) -> CaseResult:
     """Check that all cameras are finite and face the object, or that a clear error is raised."""
     scene = make()
     try:
-        found = make_orbit(scene, OrbitRequest(near=1e-9))
+        orbit = make_orbit(scene, OrbitRequest(near=1e-9))
     except InvalidInputError as error:
         return CaseResult(0.0, 0.0, f"refused: {error}")
     middle, wrong = scene.means.double().mean(0), 0
-    for camera in found.cameras:
+    for camera in orbit.cameras:
         pose = camera.world_to_camera
         finite = bool(pose.isfinite().all()) and math.isfinite(camera.fx) and camera.fx > 0
         depth = float((pose[:3, :3] @ middle + pose[:3, 3])[2]) if finite else -1.0
         wrong += not (finite and depth > 0 and min(camera.width, camera.height) > 0)
-    return CaseResult(float(wrong), 0.0, f"{len(found.cameras)} views, {found.radius:.3g} away")
+    return CaseResult(float(wrong), 0.0, f"{len(orbit.cameras)} views, {orbit.radius:.3g} away")

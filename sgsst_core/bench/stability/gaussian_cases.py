@@ -37,12 +37,12 @@ _PROPERTIES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    found = [
+    entries = [
         Case(f"{value} in {name}, in the file", "Gaussians", _IMAGE, partial(_invalid_in_file, name, value))
         for name in _PROPERTIES
         for value in ("nan", "inf", "-inf")
     ]
-    found += [
+    entries += [
         Case(f"{value} in {name}, in memory", "Gaussians", _IMAGE, partial(_invalid_in_memory, name, value))
         for name, value in [
             ("means", "nan"),
@@ -52,9 +52,9 @@ def cases() -> list[Case]:
             ("opacities", "nan"),
         ]
     ]
-    found += [Case(name, "Gaussians", _IMAGE, partial(_rendered, make)) for name, make in _SCENES.items()]
+    entries += [Case(name, "Gaussians", _IMAGE, partial(_rendered, make)) for name, make in _SCENES.items()]
     return [
-        *found,
+        *entries,
         Case("needles, 1e6 times longer than wide, at every angle", "Gaussians", _IMAGE, _needles),
         Case("near plane, one ulp before, on and behind it", "Gaussians", _IMAGE, _near_plane),
         Case("equal depths blend in the order of the file", "Gaussians", "rows out of order", _equal_depths),
@@ -175,13 +175,13 @@ def _invalid_in_file(name: str, value: str, full: bool) -> CaseResult:
                 return CaseResult(math.inf, 0.0, "the file was not refused")
             return replace(compare_rasterizers(file.scene, camera()), note="read as almost 0 or 1")
         except SceneError:
-            found = read_scene(path, drop_invalid=True).scene
+            read = read_scene(path, drop_invalid=True).scene
     rows = torch.zeros(60, dtype=torch.bool)
     rows[7] = True
     expected, _ = without(scene, rows)
-    if not torch.equal(found.means, expected.means):
+    if not torch.equal(read.means, expected.means):
         return CaseResult(math.inf, 0.0, "another Gaussian was left out")
-    return replace(compare_rasterizers(found, camera()), note="refused; --drop-invalid leaves it out")
+    return replace(compare_rasterizers(read, camera()), note="refused; --drop-invalid leaves it out")
 
 
 def _invalid_in_memory(name: str, value: str, full: bool) -> CaseResult:
@@ -216,13 +216,13 @@ def _needles(full: bool) -> CaseResult:
 
 def _float32_determinant_is_lost(needle: Scene) -> bool:
     """Return whether the determinant p r - q^2 of `needle`, computed in float32, has a relative error above 0.1."""
-    found = project(needle, camera()).values
-    if not len(found):
+    actual = project(needle, camera()).values
+    if not len(actual):
         return False
     # r, det and q follow from the stored projection: w_scale^2 = k / r, u_scale^2 = k r / det.
     k = 0.5 * math.log2(math.e)
-    r = k / found[0, 4] ** 2
-    det, q = k * r / found[0, 3] ** 2, found[0, 2] * r
+    r = k / actual[0, 4] ** 2
+    det, q = k * r / actual[0, 3] ** 2, actual[0, 2] * r
     p = (det + q * q) / r
     single = np.float32(p) * np.float32(r) - np.float32(q) * np.float32(q)
     return not abs(float(single) - det) <= 0.1 * det
@@ -265,8 +265,8 @@ def _moved_world(full: bool) -> CaseResult:
     moved = replace(scene, means=scene.means + offset.float())
     colors = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1))
     image = make_rasterizer("reference", scene).render(colors, view)
-    found = make_rasterizer("cpu", moved).render(colors, replace(view, world_to_camera=pose)).double()
-    error = float((found - image).abs().max()) / 2
+    rendered = make_rasterizer("cpu", moved).render(colors, replace(view, world_to_camera=pose)).double()
+    error = float((rendered - image).abs().max()) / 2
     return CaseResult(error, 1e-4, "float32 positions step by 0.06 there; nothing is lost beyond that")
 
 
@@ -280,12 +280,12 @@ def _large_harmonics(full: bool) -> CaseResult:
     view = camera()
     rest = rest_colors(scene.sh_rest, scene.means, view)
     dc = (torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) - rest) / SH_C0
-    found = view_colors(dc, rest).double()
+    actual = view_colors(dc, rest).double()
     exact = rest_colors(held(scene.sh_rest).double(), scene.means.double(), view)
     expected = (0.5 + SH_C0 * dc.double() + exact).clamp_min(0)
-    error = float((found - expected).abs().max() / exact.abs().max())
+    error = float((actual - expected).abs().max() / exact.abs().max())
     image = compare_rasterizers(scene, view, colors=view_colors(scene.sh_dc, rest))
-    absolute = float((found - expected).abs().max())
+    absolute = float((actual - expected).abs().max())
     return CaseResult(max(error, 0.0 if image.passed else math.inf), 1e-6, f"colors are off by up to {absolute:.1e}")
 
 

@@ -24,12 +24,14 @@ _HEIGHT, _WIDTH = 32, 40
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    found = [
+    entries = [
         Case(f"style: {name}", "style and content", _LOSS, partial(_style, make)) for name, make in _IMAGES.items()
     ]
-    found += [Case(f"view: {name}", "style and content", _LOSS, partial(_view, make)) for name, make in _IMAGES.items()]
+    entries += [
+        Case(f"view: {name}", "style and content", _LOSS, partial(_view, make)) for name, make in _IMAGES.items()
+    ]
     return [
-        *found,
+        *entries,
         Case("style and view: the same constant", "style and content", _LOSS, _equal_constants),
         Case("view equal to its content and its style", "style and content", _LOSS, _nothing_to_do),
         Case("style: 8 x 8", "style and content", _LOSS, partial(_small_style, 8)),
@@ -134,11 +136,11 @@ def _dead(where: str, full: bool) -> CaseResult:
             features[..., 3:6] = 123.4
     target = LayerTarget.of(layer_statistics(style))
     _, gradient = style_loss(layer_statistics(view), target)
-    found = gradient.apply(view)
+    actual = gradient.apply(view)
     exact = _autograd(view, LayerTarget.of(layer_statistics_reference(style)))
     published = (layer_statistics(view).std() - target.std) / layer_statistics(view).std()
     broken = int((~torch.isfinite(published)).sum())
-    error = _relative(found, exact)
+    error = _relative(actual, exact)
     return CaseResult(error, LOSS_BOUND, f"the published factor is not finite in {broken} of 12 channels")
 
 
@@ -177,7 +179,7 @@ def _autograd(features: Tensor, target: LayerTarget) -> Tensor:
     return gradient
 
 
-def _relative(found: Tensor, exact: Tensor) -> float:
-    if not bool(torch.isfinite(found).all()):
+def _relative(actual: Tensor, exact: Tensor) -> float:
+    if not bool(torch.isfinite(actual).all()):
         return math.inf
-    return float((found.double() - exact).norm() / exact.norm())
+    return float((actual.double() - exact).norm() / exact.norm())

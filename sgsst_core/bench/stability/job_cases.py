@@ -34,12 +34,12 @@ _MEASURE = "loss and gradient at the end, relative to float64; finite, bounded, 
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    found = [Case(name, "jobs", _MEASURE, partial(_strained, situation)) for name, situation in _SITUATIONS.items()]
-    found += [
+    entries = [Case(name, "jobs", _MEASURE, partial(_strained, situation)) for name, situation in _SITUATIONS.items()]
+    entries += [
         Case(name, "jobs", "jobs that were not refused", partial(_refused, situation))
         for name, situation in _REFUSED.items()
     ]
-    return [*found, Case("chroma of colors from 1e-6 to 1e3", "jobs", "change of chroma, relative", _chroma)]
+    return [*entries, Case("chroma of colors from 1e-6 to 1e3", "jobs", "change of chroma, relative", _chroma)]
 
 
 def _strained(situation: Callable[[], Situation], full: bool) -> CaseResult:
@@ -232,10 +232,10 @@ def _chroma(full: bool) -> CaseResult:
     job = make(Situation(scene, texture(30, 26, 7), {"preserve_colors": "luminance", "steps_sos": 20 if full else 4}))
     while job.step < job.job.total_steps:
         job.run_step()
-    found = job.stylized().double()
-    change = found - scene.sh_dc.double()
-    size = torch.maximum(found.abs(), scene.sh_dc.double().abs()).amax(1, keepdim=True)
+    stylized = job.stylized().double()
+    change = stylized - scene.sh_dc.double()
+    size = torch.maximum(stylized.abs(), scene.sh_dc.double().abs()).amax(1, keepdim=True)
     error = float(((change - change.mean(1, keepdim=True)).abs() / size).max())
-    if not bool(torch.isfinite(found).all()):
+    if not bool(torch.isfinite(stylized).all()):
         error = math.inf
     return CaseResult(error, 2**-23, f"luminance moved by up to {float(luminance(change).abs().max()):.2g}")

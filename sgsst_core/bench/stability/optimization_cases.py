@@ -31,7 +31,7 @@ HARDLY_SEEN = 1.0 / 255.0
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    found: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
+    entries: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
         ("total weights from 1e-6 to 1e2 in one scene", _END, _weights),
         ("Adam on gradients from 1e-12 to 1e3", "values against float64", _adam),
         ("learning rate 100 times too large", _END, _large_steps),
@@ -42,7 +42,7 @@ def cases() -> list[Case]:
         ("100,000 steps", "rise of the loss above its lowest", _many_steps),
         ("stopped and resumed in the middle", "values against an uninterrupted run", _resumed),
     ]
-    return [Case(name, "stiff optimization", measure, measured) for name, measure, measured in found]
+    return [Case(name, "stiff optimization", measure, measured) for name, measure, measured in entries]
 
 
 def _camera() -> Camera:

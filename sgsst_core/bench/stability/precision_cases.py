@@ -40,7 +40,7 @@ _SUMS_BOUND = 2e-6
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    found: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
+    entries: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
         ("Gram matrix of 17 million pixels", "Gram, mean, sigma, relative to float64", _long_sum),
         ("features that overflow float16", "settings that were not refused", _float16),
         ("bfloat16 features", "pixel gradient, relative to float32", partial(_bfloat16, 1.0)),
@@ -50,7 +50,7 @@ def cases() -> list[Case]:
         ("statistics of tiles in any order", "loss and feature gradient, relative", _order_of_tiles),
         ("whole loss of 1, 2, 7 and 64 tiles", "loss, relative to float64", _tiles),
     ]
-    return [Case(name, "precision", measure, measured) for name, measure, measured in found]
+    return [Case(name, "precision", measure, measured) for name, measure, measured in entries]
 
 
 def _long_sum(full: bool) -> CaseResult:
@@ -60,15 +60,15 @@ def _long_sum(full: bool) -> CaseResult:
     """
     generator = torch.Generator().manual_seed(0)
     channels = torch.linspace(1, 300, 64)
-    found, exact = LayerStatistics.zero(64), LayerStatistics.zero(64)
+    actual, exact = LayerStatistics.zero(64), LayerStatistics.zero(64)
     one_by_one = np.float32(0)
     for _ in range(67 if full else 3):
         features = channels * (1 + torch.randn((512, 512, 64), generator=generator)).relu_()
-        found = merge(found, layer_statistics(features))
+        actual = merge(actual, layer_statistics(features))
         exact = merge(exact, layer_statistics_reference(features))
         squares = features[..., -1].square().numpy().reshape(-1)
         one_by_one = np.cumsum(np.concatenate([[one_by_one], squares]), dtype=np.float32)[-1]
-    pairs = [(found.gram(), exact.gram()), (found.std(), exact.std()), (found.mean, exact.mean)]
+    pairs = [(actual.gram(), exact.gram()), (actual.std(), exact.std()), (actual.mean, exact.mean)]
     error = max(float(((own - wanted).abs() / wanted).max()) for own, wanted in pairs)
     off = abs(float(one_by_one) / float(exact.count * exact.gram()[-1, -1]) - 1)
     return CaseResult(
@@ -103,8 +103,8 @@ def _bfloat16(brightest: float, full: bool) -> CaseResult:
         ).image_gradient
         assert gradient is not None
         gradients.append(gradient)
-    exact, found = gradients
-    difference = Difference.of(found, exact)
+    exact, actual = gradients
+    difference = Difference.of(actual, exact)
     note = f"cosine {difference.cosine:.3f}: for `preview`, and measured in every plan and report that uses it"
     return CaseResult(difference.relative_error, 0.5, note)
 
@@ -119,10 +119,10 @@ def _half_weights(full: bool) -> CaseResult:
     colors = 2 * torch.rand(1500, 3, generator=torch.Generator().manual_seed(1))
     reference = ReferenceRasterizer(scene)
     image, band = reference.render(colors, view), reference.near_cutoff(view, CLOSE_TO_CUTOFF)
-    found = CachedRasterizer(scene, precision="half").render(colors, view).double()
-    off = ((found - image).abs() / image.clamp_min(1e-3))[~band]
+    actual = CachedRasterizer(scene, precision="half").render(colors, view).double()
+    off = ((actual - image).abs() / image.clamp_min(1e-3))[~band]
     return CaseResult(
-        float(off.max()) if bool(torch.isfinite(found).all()) else math.inf, 2**-11 + 1e-5, "bound: 2^-11"
+        float(off.max()) if bool(torch.isfinite(actual).all()) else math.inf, 2**-11 + 1e-5, "bound: 2^-11"
     )
 
 
@@ -188,9 +188,9 @@ def _tiles(full: bool) -> CaseResult:
     exact = _loss_of(size, None, torch.float64)[0].loss
     losses, gradients = [], []
     for tiles, tile_size in counts.items():
-        result, found = _loss_of(size, tile_size, torch.float32)
-        if found != tiles:
-            return CaseResult(math.inf, 0.0, f"{found} tiles where {tiles} were meant")
+        result, actual = _loss_of(size, tile_size, torch.float32)
+        if actual != tiles:
+            return CaseResult(math.inf, 0.0, f"{actual} tiles where {tiles} were meant")
         assert result.image_gradient is not None
         losses.append(result.loss)
         gradients.append(result.image_gradient)

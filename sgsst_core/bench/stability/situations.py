@@ -172,10 +172,10 @@ def strain(situation: Situation) -> CaseResult:
 
 def _moved(job: Stylizer, start: Tensor) -> float:
     """Return the largest change of a coefficient, ignoring the clamping of initial colors to their bounds."""
-    found = job.sh_dc.detach()
+    sh_dc = job.sh_dc.detach()
     chroma_of = start if job.job.settings.preserve_colors == "luminance" else None
     within = constrained(start, chroma_of, bounded=job.job.settings.bounded)
-    return float(torch.minimum((found - start).abs(), (found - within).abs()).max())
+    return float(torch.minimum((sh_dc - start).abs(), (sh_dc - within).abs()).max())
 
 
 def reference_error(job: Stylizer) -> tuple[float, float, int]:
@@ -197,16 +197,16 @@ def reference_error(job: Stylizer) -> tuple[float, float, int]:
     coverage = job.job.view_targets.coverage(index)[0] if job.job.view_targets.weighted else None
     double = DecisionsOf(job.job.weights, job.job.network)
     given, weight = (image, content, coverage), job.job.settings.content_weight
-    found, exact = _evaluate_both(job, double, *given, weight)
+    actual, exact = _evaluate_both(job, double, *given, weight)
     uncertain = _rounding_of_content(job, exact, content)
-    if uncertain > _MOST_UNCERTAIN and _content_is_rounding(job, found, exact, content):
+    if uncertain > _MOST_UNCERTAIN and _content_is_rounding(job, actual, exact, content):
         uncertain, weight = 0.0, 0.0
-        found, exact = _evaluate_both(job, double, *given, weight)
-    gradient = gradient_error(found, exact)
+        actual, exact = _evaluate_both(job, double, *given, weight)
+    gradient = gradient_error(actual, exact)
     if not math.isfinite(gradient):
         return math.inf, REFERENCE_BOUND, double.flips
     rounding = nearest_weight(job.job.loss.style_loss, job.job.loss.network.unit) * _ROUNDING_OF_COSINES
-    error = max(abs(found.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
+    error = max(abs(actual.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
     if job.job.loss.style_loss == "sos":
         error = max(error, gradient)
         uncertain = max(uncertain, _rounding_of_features(job, exact, given, weight))
@@ -222,8 +222,8 @@ def _rounding_of_features(
     hardly larger than the rounding of the features.
     """
     rounded = _Rounded(job.job.weights, job.job.network)
-    _, found = _evaluate_both(job, rounded, *given, content_weight)
-    return _SAFETY * gradient_error(found, exact)
+    _, actual = _evaluate_both(job, rounded, *given, content_weight)
+    return _SAFETY * gradient_error(actual, exact)
 
 
 class _Rounded(DecisionsOf):
@@ -259,13 +259,13 @@ def _rounding_of_content(job: Stylizer, exact: SosResult, content: Tensor) -> fl
     return max((2 * rounding * math.sqrt(weight / term) for term in terms), default=0.0)
 
 
-def _content_is_rounding(job: Stylizer, found: SosResult, exact: SosResult, content: Tensor) -> bool:
+def _content_is_rounding(job: Stylizer, actual: SosResult, exact: SosResult, content: Tensor) -> bool:
     """Return whether rounding errors of the features explain the content term.
 
     If the feature differences d have an error of delta, the term is lambda mean((d + delta)^2).
     """
     most = 2 * job.job.settings.content_weight * _feature_rounding(job, content) ** 2
-    return all(terms["content"] <= 2 * exact.terms[scale]["content"] + most for scale, terms in found.terms.items())
+    return all(terms["content"] <= 2 * exact.terms[scale]["content"] + most for scale, terms in actual.terms.items())
 
 
 def _evaluate_both(

@@ -36,12 +36,12 @@ _SMALL_MEMORY = 300 << 20
 def cases() -> list[Case]:
     """Return all cases of this group."""
     sizes = [(1, 1), (15, 17), (16, 16), (17, 16), (31, 33), (1, 333), (333, 1), (4096, 16)]
-    found = [Case(f"{w} x {h} pixels, rendered", "views", _IMAGE, partial(_size, w, h)) for w, h in sizes]
+    entries = [Case(f"{w} x {h} pixels, rendered", "views", _IMAGE, partial(_size, w, h)) for w, h in sizes]
     sizes = [(1, 1), (15, 17), (16, 16), (3, 200), (33, 47), (4096, 16)]
-    found += [Case(f"{w} x {h} pixels, stylized", "views", _LOSS, partial(_stylized_size, w, h)) for w, h in sizes]
-    found += [Case(name, "views", _IMAGE, partial(_rendered, make)) for name, make in _VIEWS.items()]
+    entries += [Case(f"{w} x {h} pixels, stylized", "views", _LOSS, partial(_stylized_size, w, h)) for w, h in sizes]
+    entries += [Case(name, "views", _IMAGE, partial(_rendered, make)) for name, make in _VIEWS.items()]
     return [
-        *found,
+        *entries,
         Case("cameras that see nothing", "views", "views that were not left out", _blind),
         Case("more than 2^31 intersections", "views", "bytes taken before the error", _too_many_intersections),
         Case("intersections beyond the free memory", "views", "bytes taken before the error", _too_much_memory),
@@ -111,11 +111,11 @@ _VIEWS: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 def _blind(full: bool) -> CaseResult:
     """Check that views that see nothing are skipped, and that an error is raised if all views are skipped."""
     scene = repeated(5)
-    behind = replace(camera(), name="blind", world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1]).double()))
+    rear_camera = replace(camera(), name="blind", world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1]).double()))
     rasterizer = make_rasterizer("cpu", scene)
-    wrong = len(set(survey_views(scene, [behind, camera()], rasterizer).covered) ^ {1})
+    wrong = len(set(survey_views(scene, [rear_camera, camera()], rasterizer).covered) ^ {1})
     try:
-        survey_views(scene, [behind], rasterizer)
+        survey_views(scene, [rear_camera], rasterizer)
         wrong += 1
     except CameraError:
         pass

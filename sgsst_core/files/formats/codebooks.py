@@ -93,10 +93,10 @@ def palette(rows: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], 
         if not len(members):
             continue
         own = rows[members]
-        found = _lloyd(own, _start(own, share), _FINE_ITERATIONS)
-        labels[members] = first + _nearest_rows(own, found)[0]
-        centers.append(found)
-        first += len(found)
+        own_centers = _lloyd(own, _start(own, share), _FINE_ITERATIONS)
+        labels[members] = first + _nearest_rows(own, own_centers)[0]
+        centers.append(own_centers)
+        first += len(own_centers)
     return np.concatenate(centers), labels
 
 
@@ -142,7 +142,7 @@ def _nearest_rows(
     for start in range(0, len(rows), _BLOCK_ROWS):
         block = rows[start : start + _BLOCK_ROWS]
         scores = lengths - 2 * (block @ centers.T)
-        found = scores.argmin(axis=1)
-        labels[start : start + len(block)] = found
-        distances[start : start + len(block)] = ((block - centers[found]) ** 2).sum(axis=1)
+        nearest = scores.argmin(axis=1)
+        labels[start : start + len(block)] = nearest
+        distances[start : start + len(block)] = ((block - centers[nearest]) ** 2).sum(axis=1)
     return labels, distances

@@ -157,19 +157,19 @@ def _chunks(start: FileStart) -> tuple[bytes, int, int]:
 def _splats(path: Path, document: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     """Return the only primitive of Gaussians, and the index of its mesh."""
     meshes = document.get("meshes", [])
-    found = [
+    splats = [
         (index, primitive)
         for index, mesh in enumerate(meshes)
         for primitive in mesh["primitives"]
         if _EXTENSION in primitive.get("extensions", {})
     ]
-    if not found:
+    if not splats:
         raise SceneError(
             f"{path}: holds {len(meshes)} meshes but no Gaussians ({_EXTENSION}). Train Gaussians on the object first."
         )
-    if len(found) > 1:
-        raise SceneError(f"{path}: holds {len(found)} sets of Gaussians; one can be read. Merge them first.")
-    return found[0]
+    if len(splats) > 1:
+        raise SceneError(f"{path}: holds {len(splats)} sets of Gaussians; one can be read. Merge them first.")
+    return splats[0]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # the transformation is checked
@@ -267,16 +267,16 @@ def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene. Opacities of 0 and 1 and standard deviations of 0 become infinite."""
     assert isinstance(header, GlbHeader)
-    found = header.accessors
+    accessors = header.accessors
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # invalid values are reported later
         for name in ("means", "sh_dc"):
-            for block, values in _values(file, found[name], header.count):
+            for block, values in _values(file, accessors[name], header.count):
                 into[name][block] = values
-        for block, values in _values(file, found["quats"], header.count):
+        for block, values in _values(file, accessors["quats"], header.count):
             into["quats"][block] = np.roll(values, 1, axis=1)
-        for block, values in _values(file, found["scales"], header.count):
+        for block, values in _values(file, accessors["scales"], header.count):
             into["scales"][block] = np.log(values)
-        for block, values in _values(file, found["opacities"], header.count):
+        for block, values in _values(file, accessors["opacities"], header.count):
             into["opacities"][block] = (np.log(values) - np.log1p(-values))[:, 0]
         for index, accessor in enumerate(header.harmonics):
             for block, values in _values(file, accessor, header.count):
@@ -333,12 +333,12 @@ def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
         "opacities": opacities[:, None],
         "sh_dc": arrays["sh_dc"],
     }
-    found: list[tuple[str, NDArray[Any]]] = [
+    columns: list[tuple[str, NDArray[Any]]] = [
         (_ATTRIBUTES[name][0], each.astype("<f4")) for name, each in values.items()
     ]
     harmonics = arrays["sh_rest"].shape[1]
-    found += [(_HARMONICS[index], arrays["sh_rest"][:, index].astype("<f4")) for index in range(harmonics)]
-    return [*found, ("COLOR_0", np.rint(255 * colors).astype(np.uint8))]
+    columns += [(_HARMONICS[index], arrays["sh_rest"][:, index].astype("<f4")) for index in range(harmonics)]
+    return [*columns, ("COLOR_0", np.rint(255 * colors).astype(np.uint8))]
 
 
 def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int, extras: dict[str, Any]) -> dict[str, Any]:

@@ -104,7 +104,7 @@ def _read_header(start: FileStart) -> KsplatHeader:
             table = file.read(_SECTION_BYTES * sections)
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
-    found, position = [], table_end
+    read, position = [], table_end
     for index in range(sections):
         section, position = _section(table[index * _SECTION_BYTES :][:_SECTION_BYTES], level, position)
         if section is None or position > start.size:
@@ -112,14 +112,14 @@ def _read_header(start: FileStart) -> KsplatHeader:
                 f"{path}: section {index} of the .ksplat file is wrong, or ends after its {start.size} bytes: the file "
                 "is truncated or its header is wrong. Copy or export it again."
             )
-        found.append(section)
-    if sum(section.count for section in found) != count:
+        read.append(section)
+    if sum(section.count for section in read) != count:
         raise SceneError(
             f"{path}: the .ksplat header declares {count} Gaussians, but its sections hold "
-            f"{sum(section.count for section in found)}: it was not written completely. Export it again."
+            f"{sum(section.count for section in read)}: it was not written completely. Export it again."
         )
-    coefficients = COEFFICIENTS[max(section.degree for section in found)]
-    return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), found)
+    coefficients = COEFFICIENTS[max(section.degree for section in read)]
+    return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read)
 
 
 def _section(entry: bytes, level: int, start: int) -> tuple[KsplatSection | None, int]:

@@ -68,21 +68,21 @@ def _read_header(start: FileStart) -> PlySceneHeader:
 
 def _notes(above: bool, sources: dict[str, str]) -> tuple[str, ...]:
     """Return notes on a PLY with SH bands above degree 3, or of a variant."""
-    found = ["SH bands above degree 3 are not drawn; only a stylized PLY keeps them"] if above else []
+    notes = ["SH bands above degree 3 are not drawn; only a stylized PLY keeps them"] if above else []
     if sources:
-        found.append(f"{', '.join(dict.fromkeys(sources.values()))} become the usual properties of a stylized PLY")
-    return tuple(found)
+        notes.append(f"{', '.join(dict.fromkeys(sources.values()))} become the usual properties of a stylized PLY")
+    return tuple(notes)
 
 
 def _sources(kinds: dict[str, str]) -> dict[str, str]:
     """Return the properties of a variant, by the name of the usual property that they replace."""
-    found: dict[str, str] = {}
+    sources: dict[str, str] = {}
     if all(kinds.get(name) == "u1" for name in RGB) and not any(name in kinds for name in PROPERTIES["sh_dc"]):
-        found |= dict(zip(PROPERTIES["sh_dc"], RGB, strict=True))
+        sources |= dict(zip(PROPERTIES["sh_dc"], RGB, strict=True))
     scales = [name for name in ("scale", *PROPERTIES["scales"]) if name in kinds]
     if scales in (["scale"], ["scale_0"]):
-        found |= dict.fromkeys(PROPERTIES["scales"], scales[0])
-    return found
+        sources |= dict.fromkeys(PROPERTIES["scales"], scales[0])
+    return sources
 
 
 def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str]]:

@@ -109,8 +109,8 @@ def extras_tag(extras: object, where: str) -> RenderTag:
         extras: Value that should be a JSON object.
         where: Name of the document, for texts.
     """
-    found = extras if isinstance(extras, dict) else {}
-    model, eps2d = found.get("model", "default"), found.get("eps2d")
+    members = extras if isinstance(extras, dict) else {}
+    model, eps2d = members.get("model", "default"), members.get("eps2d")
     eps2d = _usable_eps2d(eps2d) if type(eps2d) in (int, float) else None
     if model == "default" and eps2d is None:
         return UNTAGGED

@@ -208,9 +208,9 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
     if version not in (1, 2):
         raise SceneError(f"{path}: is SOG of version {str(version)[:20]}, which cannot be read. {advice('scene.sog')}")
     names = {name: meta[name]["files"] for name in _IMAGES if name in meta or name != "shN"}
-    for name, found in names.items():
-        if type(found) is not list or len(found) != _IMAGES[name] or not all(_NAME.fullmatch(each) for each in found):
-            raise ValueError(f"files of {name}: {found}")
+    for name, own in names.items():
+        if type(own) is not list or len(own) != _IMAGES[name] or not all(_NAME.fullmatch(each) for each in own):
+            raise ValueError(f"files of {name}: {own}")
     count = meta["count"] if version == 2 else meta["means"]["shape"][0]
     if type(count) is not int or count < 1:
         raise ValueError(f"count: {count}")

@@ -227,13 +227,13 @@ def _tag(flags: int, *, believed: bool) -> RenderTag:
 
 def _extension_records(data: bytes) -> list[tuple[int, bytes]]:
     """Return type and content of whole extension records: type and length in bytes (uint32), then the content."""
-    found, position = [], 0
+    records, position = [], 0
     while position + 8 <= len(data):
         kind, length = struct.unpack_from("<II", data, position)
         position += 8 + length
         if position <= len(data):
-            found.append((kind, data[position - length : position]))
-    return found
+            records.append((kind, data[position - length : position]))
+    return records
 
 
 def _stated_axes(path: Path, data: bytes) -> Axes | None:
@@ -344,25 +344,25 @@ def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int, records:
 
     def take(count: int) -> bytes:
         nonlocal position
-        found = bytearray()
-        while len(found) < count and not inflate.eof:
+        content = bytearray()
+        while len(content) < count and not inflate.eof:
             data = inflate.unconsumed_tail
             if not data:
                 data = _read_bytes(file, position, min(_READ_BYTES, size - position))
                 position += len(data)
             try:
-                found += inflate.decompress(data, count - len(found))
+                content += inflate.decompress(data, count - len(content))
             except zlib.error as error:
                 raise _damaged(path, error) from error
-            if position == size and not inflate.unconsumed_tail and not inflate.eof and len(found) < count:
+            if position == size and not inflate.unconsumed_tail and not inflate.eof and len(content) < count:
                 break
-        return bytes(found)
+        return bytes(content)
 
     def read_exactly(count: int) -> bytes:
-        found = take(count)
-        if len(found) < count:
+        content = take(count)
+        if len(content) < count:
             raise _ends_early(path)
-        return found
+        return content
 
     take(16)
     for _ in range(sections):
@@ -382,12 +382,12 @@ def _zstd_streams(path: Path, file: OpenScene, streams: tuple[SpzSection, ...]) 
 
             def take(count: int, reader: Any = reader) -> bytes:
                 try:
-                    found: bytes = reader.read(count)
+                    content: bytes = reader.read(count)
                 except zstandard.ZstdError as error:
                     raise _damaged(path, error) from error
-                if len(found) < count:
+                if len(content) < count:
                     raise _ends_early(path)
-                return found
+                return content
 
             yield take
             try:

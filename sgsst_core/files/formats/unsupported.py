@@ -47,13 +47,13 @@ def refuse_unsupported(start: FileStart) -> None:
 
 def _is_obj(head: bytes) -> bool:
     """Return whether the first lines are those of an OBJ file, with at least one vertex or object."""
-    position, found = 0, False
+    position, has_vertex = 0, False
     for _ in range(_OBJ_LINES):
         line = _OBJ_LINE.match(head, position)
         if line is None:
             return False
-        position, found = line.end(), found or line[3] is not None
-    return found
+        position, has_vertex = line.end(), has_vertex or line[3] is not None
+    return has_vertex
 
 
 def refuse_folder(folder: Path) -> NoReturn:

@@ -116,11 +116,11 @@ def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.
     assert (after["f_dc_0"][~kept] != before["f_dc_0"][~kept]).all()
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     found = {each["name"]: each for each in report["regions"]}
-    assert found["right"] | {"gaussians": 0, "share": 0} == {
+    assert found["right"] | {"gaussians": 0, "fraction": 0} == {
         "name": "right",
         "select": "half-space=1,0,0,0.5",
         "gaussians": 0,
-        "share": 0,
+        "fraction": 0,
         "style": "other.png",
         "weight": 2.0,
         "freeze": False,
@@ -128,7 +128,7 @@ def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.
     }
     assert found["left"]["gaussians"] == kept.sum()
     assert not found["far"]["stylized"]
-    assert sum(each["share"] for each in report["regions"]) == pytest.approx(1)
+    assert sum(each["fraction"] for each in report["regions"]) == pytest.approx(1)
     plan = [
         "plan",
         str(files.ply),
@@ -308,7 +308,7 @@ def test_orbit_needs_no_camera_file(files: Files) -> None:
     at = command.index("--cameras")
     assert main(command[:at] + command[at + 2 :]) == 0
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    assert report["cameras"]["form"] == "orbit"
+    assert report["cameras"]["source"] == "orbit"
     assert [decision["item"] for decision in report["plan"]["decisions"][:3]] == ["up", "cameras", "frames"]
     with Image.open(files.out.with_name("stylized.views.jpg")) as views:
         assert views.format == "JPEG"
@@ -363,7 +363,7 @@ def test_target_loss_stops_run_and_report_has_loss_over_time(files: Files, capsy
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     assert report["stopped"] == "target-loss"
     assert 3 <= len(report["history"]) < 60
-    assert report["bought"]["relative"] <= 0.8
+    assert report["loss_over_time"]["relative"] <= 0.8
     assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
 
 

@@ -125,8 +125,8 @@ def test_landlock_alone_blocks_files_and_signals(
         pytest.param("{}", marks=pytest.mark.slow),
         pytest.param('{"error": {}}', marks=pytest.mark.slow),
         pytest.param('{"error": {"code": 1, "message": [], "input": {}}}', marks=pytest.mark.slow),
-        '{"found": 7}',
-        '{"found": {}}\n{"found": {"gaussians": 7}}',
+        '{"findings": 7}',
+        '{"findings": {}}\n{"findings": {"gaussians": 7}}',
     ],
 )
 def test_forged_response_affects_only_its_own_request(
@@ -138,7 +138,7 @@ def test_forged_response_affects_only_its_own_request(
     write = f"os.write(descriptor, {answer.encode()!r} + bytes([10]))"
     code = f"import os\nfor descriptor in range(16):\n    try: {write}\n    except OSError: pass\nos._exit(0)\n"
     scene.write_text(f"# attack\n{code}")
-    if answer.startswith('{"found": {}}'):  # it may falsify the answer about its own files
+    if answer.startswith('{"findings": {}}'):  # it may falsify the answer about its own files
         assert inspect(tmp_path, {**files, "scene": scene}) == {}
     else:
         with pytest.raises(RefusedInputError, match="breaks their reader"):

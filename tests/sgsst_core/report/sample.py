@@ -35,7 +35,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
         "style": {"path": "styles/wave.jpg", "width": 800, "height": 600},
         "cameras": {
             "path": None,
-            "form": "orbit",
+            "source": "orbit",
             "content": "unstylized renders",
             "count": 5,
             "sizes": [[640, 480], [1280, 720]],
@@ -65,7 +65,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
                 for step, e in ((3, 0.21), (9, 0.24))
             ],
         },
-        "bought": {
+        "loss_over_time": {
             "relative": 0.0987,
             "reached": [{"relative": 0.5, "seconds": 1.5, "step": 7}, {"relative": 0.25, "seconds": 2.5, "step": 9}],
             "last_tenth": {"seconds": 0.4, "from": 0.101, "to": 0.0987},

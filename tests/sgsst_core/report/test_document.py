@@ -16,7 +16,7 @@ from sgsst_core.files.json_files import write_json
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.report.contact_sheet import write_contact_sheet
-from sgsst_core.report.document import REPORT_VERSION, Sources, bought, build_report
+from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
 from sgsst_core.report.history import history_of, running_mean
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, round_evaluation, round_loss
@@ -115,7 +115,7 @@ def test_report_has_measurements_and_their_fraction_of_time(
     plan = replace(stylizer.job.plan, prediction=Prediction(1, 1, 1, job=450, measuring=50))
     monkeypatch.setattr(stylizer, "job", replace(stylizer.job, plan=plan))
     assert build_report(stylizer, sources, "finished", before, after)["measuring"] == {
-        "share": 0.1,
+        "fraction": 0.1,
         "allowed": 40.0,
         "seconds": 30.0,
         "of_steps": 0.15,
@@ -161,7 +161,7 @@ def test_loss_after_is_the_mean_of_the_last_round_everywhere(
     assert history.round_length == length
     relative = wanted / mean_loss(before)
     assert report["loss"]["relative"] == pytest.approx(relative)
-    assert report["bought"]["relative"] == pytest.approx(relative)
+    assert report["loss_over_time"]["relative"] == pytest.approx(relative)
     assert running_mean(history.relative[0], length)[-1] == pytest.approx(relative)
     coarse = [StepRecord(1, "coarse", 0, 0.1, 4.0, {1: LossTerms(gram=4.0)}, {}, 0)]
     steps = [StepRecord(n, "sos", 0, 0.1, loss, {0: LossTerms(gram=loss)}, {}, 0) for n, loss in ((2, 1.0), (3, 4.0))]
@@ -179,7 +179,7 @@ def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evalua
     ]
     stylizer.seconds, stylizer.job.views.covered = 70.0, [0, 1]
     try:
-        found = bought(stylizer, {0: LossTerms(gram=8.0)})
+        found = loss_over_time(stylizer, {0: LossTerms(gram=8.0)})
     finally:
         stylizer.history, stylizer.seconds, stylizer.job.views.covered = kept, seconds, covered
     assert found is not None
@@ -192,7 +192,7 @@ def test_loss_over_time_needs_steps(finished: tuple[Stylizer, Evaluation, Evalua
     stylizer = finished[0]
     kept, stylizer.history = stylizer.history, []
     try:
-        assert bought(stylizer, {0: LossTerms(gram=8.0)}) is None
+        assert loss_over_time(stylizer, {0: LossTerms(gram=8.0)}) is None
     finally:
         stylizer.history = kept
 

@@ -387,7 +387,7 @@ def test_collapsed_section_has_all_other_fields() -> None:
 
 def test_reports_without_optional_parts_are_shown() -> None:
     report = sample_report()
-    report.update(novel_views=None, approximations=None, bought=None, findings=[], seconds_by_part={})
+    report.update(novel_views=None, approximations=None, loss_over_time=None, findings=[], seconds_by_part={})
     report["plan"] = {"decisions": [], "prediction": None, "measured": {"seconds": None, "peak_bytes": 1}}
     for record in report["history"]:
         del record["memory_bytes"], record["parts"]
@@ -406,7 +406,7 @@ def test_novel_views_without_values_are_shown() -> None:
         }
         moment["gram_relative"] = math.nan
     report["approximations"]["moments"] = []
-    report["bought"].update(reached=[], last_tenth=None)
+    report["loss_over_time"].update(reached=[], last_tenth=None)
     page = parsed(report)
     assert "consistency" not in [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
     assert "They were not compared with the exact gradient." in page.text

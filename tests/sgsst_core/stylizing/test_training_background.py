@@ -18,7 +18,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_ch
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.training_background import Color, drawn_color, put_behind
+from sgsst_core.stylizing.training_background import Color, drawn_color, replace_background
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
 
@@ -75,9 +75,9 @@ def test_replaced_background_matches_a_render_with_it(scale: int) -> None:
     colors = torch.rand(len(scene), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     over, expected = (ReferenceRasterizer(scene, background=color).render(colors, camera) for color in (present, COLOR))
     coverage = ReferenceRasterizer(scene).coverage(camera)
-    found = put_behind(downscale(over, scale), downscale(coverage, scale), COLOR, present)
+    found = replace_background(downscale(over, scale), downscale(coverage, scale), COLOR, present)
     torch.testing.assert_close(found, downscale(expected, scale), rtol=0, atol=1e-12)
-    assert put_behind(over.float(), coverage.float(), COLOR, present).dtype == torch.float32
+    assert replace_background(over.float(), coverage.float(), COLOR, present).dtype == torch.float32
 
 
 def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Color | None) -> tuple[Any, Any]:

@@ -286,4 +286,4 @@ def test_ctrl_c_saves_and_printed_command_resumes(tmp_path: Path) -> None:
     assert process.returncode == 0, error
     assert "Reached --max-seconds" in shown
     report = json.loads(request.out.with_name("s.report.json").read_text())
-    assert report["workers"]["asked"] == report["workers"]["used"] == 2
+    assert report["workers"]["requested"] == report["workers"]["used"] == 2

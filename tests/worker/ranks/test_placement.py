@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from worker.ranks.cluster import Cluster, NoRoomError, _bundle, reserve
+from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, reserve
 from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 
 GB = 1_000_000_000
@@ -64,7 +64,7 @@ def test_ray_grants_no_gpus_without_free_memory() -> None:
             fewer = reserve(2, 2 * GB)
             assert (len(fewer.groups), fewer.gpus) == (1, 1)
             fewer.release()
-        with taken(4 * GB), pytest.raises(NoRoomError, match=r"needs a core, a GPU and 7\.0 GB of memory"):
+        with taken(4 * GB), pytest.raises(NoCapacityError, match=r"needs a core, a GPU and 7\.0 GB of memory"):
             reserve(2, 2 * GB)
         again = reserve(2, 2 * GB)
         assert len(again.groups) == 2, "what was waited for in vain is not asked for any more"
