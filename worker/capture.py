@@ -100,7 +100,7 @@ def read_capture(source: SceneRequest, scene: Scene, images: Path | None = None)
     """
     orbit = None
     if source.cameras is None:
-        orbit = make_orbit(scene, _orbit_request(source))
+        orbit = make_orbit(scene, orbit_request(source))
         cameras = list(orbit.cameras)
     else:
         cameras = read_cameras(source.cameras, images)
@@ -149,7 +149,7 @@ def about_rendering(file: SceneFile) -> list[Decision]:
     return [*lines, *(Decision("rendering", f"warning: drawn {drawn}", reason) for drawn, reason in tag.warnings)]
 
 
-def _orbit_request(source: SceneRequest) -> OrbitRequest:
+def orbit_request(source: SceneRequest) -> OrbitRequest:
     """Convert the orbit options of a request."""
     up = None
     if source.up != "auto":

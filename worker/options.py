@@ -139,6 +139,32 @@ class StylizeOptions(_Chosen):
         return make_settings(self.preset, **self.given_settings())
 
 
+class VideoOptions(BaseModel):
+    """Options of a video of a scene."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    path: Literal["auto", "cameras", "orbit"] = Field(
+        "auto",
+        description="Path of the camera: smoothly through all cameras, or once around the scene; auto: cameras if "
+        "there are camera files, else orbit.",
+    )
+    fps: Annotated[int, Option(unit="frames per second", metavar="N")] = Field(
+        30, ge=1, le=120, description="Frames per second."
+    )
+    seconds: Annotated[float, Option(unit="seconds", metavar="S")] = Field(
+        8.0, gt=0, le=600, allow_inf_nan=False, description="Length of the video."
+    )
+    transition: Literal["wipe", "fade"] = Field(
+        "wipe", description="Transition from the unstylized scene: a moving line or a cross-fade."
+    )
+
+    @property
+    def frames(self) -> int:
+        """Return the number of frames, at least 1."""
+        return max(1, round(self.seconds * self.fps))
+
+
 class RunOptions(BaseModel):
     """Options of `sgsst stylize` that the API does not accept: a service's operator sets them for all jobs."""
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,12 +15,19 @@ from rich.table import Column, Table
 from api.cli.arguments import CamerasOption, JobInputs, SceneArgument
 from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
+from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
-from sgsst_core.stylizing.progress_bar import job_bar, live_bar
-from worker.options import StylizeOptions, ViewOptions
+from sgsst_core.stylizing.progress_bar import clock, job_bar, live_bar
+from worker.options import StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
     from sgsst_core.planning.plan import Plan
+    from sgsst_core.settings import Color
+    from worker.request import SceneRequest
+    from worker.video import VideoRequest
+
+#: Number of frames after which the time of a video is estimated.
+_TIMED_FRAMES = 6
 
 
 @with_options(StylizeOptions, without=("workers",))
@@ -83,26 +93,82 @@ def check(
 
 
 @with_options(ViewOptions)
+@with_options(VideoOptions, "video_options")
 @with_options(StylizeOptions, "chosen", only=("background",))
 def render(
     scene: SceneArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the PNG images.", show_default=False)],
+    out: Annotated[Path | None, typer.Option(help="Folder for a PNG image of each view.")] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(
+            help="Video to write instead: a .mp4 file (H.264), a .webm file (VP9), a folder or a pattern such as "
+            "frame_%04d.png for PNG images."
+        ),
+    ] = None,
     cameras: CamerasOption = None,
+    compare: Annotated[
+        Path | None, typer.Option(help="Unstylized scene: the video starts with it and ends with SCENE.")
+    ] = None,
+    transparent: Annotated[
+        bool, typer.Option("--transparent", help="Write an alpha channel, to a .webm file or PNG images of a video.")
+    ] = False,
     *,
     options: ViewOptions,
+    video_options: VideoOptions,
     chosen: StylizeOptions,
 ) -> None:
-    """Render all views of a scene."""
-    from api.cli.scene_tools import render_views
+    """Render all views of a scene as images, or a video along a camera path."""
     from worker.request import SceneRequest
 
-    source = SceneRequest.of(scene, cameras, options)
-    background = chosen.settings().background
+    source, background = SceneRequest.of(scene, cameras, options), chosen.settings().background
+    given = [*video_options.model_fields_set, *(["compare"] if compare else []), *(["transparent"] * transparent)]
+    if (out is None) == (video is None):
+        raise SettingsError("Give --out FOLDER for images of the views, or --video FILE for a video, but not both.")
+    if video is not None:
+        from worker.video import VideoRequest
+
+        _render_video(VideoRequest(source, video, video_options, background, compare, transparent))
+    elif given:
+        raise SettingsError(f"--{given[0]} requires --video. Add it, or omit --{given[0]}.")
+    elif out is not None:
+        _render_views(source, background, out)
+
+
+def _render_views(source: SceneRequest, background: Color, out: Path) -> None:
+    from api.cli.scene_tools import render_views
+
+    with _frame_bar() as progress:
+        paths = render_views(source, background, out, progress)
+    out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
+
+
+def _render_video(request: VideoRequest) -> None:
+    from worker.video import check_video_request, render_video
+
+    check_video_request(request)
+    with _frame_bar() as progress:
+        first: float | None = None
+
+        def show(done: int, total: int) -> None:
+            nonlocal first
+            progress(done, total)
+            first = first or time.monotonic()  # the first frame also compiles kernels
+            if done == min(_TIMED_FRAMES, total) and done > 1:
+                seconds = (time.monotonic() - first) / (done - 1) * total
+                error_console.print(f"Rendering {total} frames, which takes about {clock(seconds)}.")
+
+        cameras = render_video(request, show)
+    frames, fps, size = len(cameras), request.options.fps, f"{cameras[0].width}x{cameras[0].height}"
+    out_console.print(f"{frames} frames of {size}, {frames / fps:.3g} s at {fps} per second, in {request.out}")
+
+
+@contextmanager
+def _frame_bar() -> Iterator[Callable[[int, int], None]]:
+    """Show the progress of rendering; yield a function that receives the numbers of completed and of all images."""
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with live_bar(error_console, *columns) as bar:
         task = bar.add_task("", total=None)
-        paths = render_views(source, background, out, lambda done, total: bar.update(task, completed=done, total=total))
-    out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 @with_options(ViewOptions, only=("near", "drop_invalid", "spz_axes", "render_mode", "eps2d"))

@@ -113,6 +113,48 @@ def orbit(
     return cameras
 
 
+def turntable(
+    subject: Subject,
+    count: int,
+    *,
+    up: Sequence[float],
+    elevation: float = ELEVATION,
+    radius: float | None = None,
+    side: int = RESOLUTION,
+    near: float = 0.2,
+) -> list[Camera]:
+    """Return the cameras of a video once around a subject: a ring of one frame size, focal length and target.
+
+    The frame fits the subject from every camera, in the aspect ratio of `orbit`.
+
+    Args:
+        subject: Subject of a scene.
+        count: Number of cameras, all different: the video continues with the first one.
+        up: World direction of up.
+        elevation: Elevation in degrees above the scene's horizon, between -90 and 90.
+        radius: Distance of the cameras from the center in world units; None for that of `orbit`.
+        side: Length in pixels of the longer side.
+        near: Near plane of the rasterizer in world units.
+
+    Raises:
+        SettingsError: If a value is out of range; see `orbit`.
+    """
+    axis = _checked(count, up, (elevation,), radius, (side, side))
+    directions, middle = ring_directions(subject, count, axis, (elevation,)), middle_of(subject, axis)
+    if radius is None:
+        radius = _distance(subject.hull - middle, directions, axis, near)
+    halves = [_half_extents(subject, middle + radius * direction, middle, axis, near) for direction in directions]
+    half = (max(x for x, _ in halves), max(y for _, y in halves))
+    shape = _shape(half)
+    x, y = _widened(half, shape)
+    width, height = (max(1, round(side * min(1.0, ratio))) for ratio in (shape, 1 / shape))
+    focal = min(width / (2 * x), height / (2 * y))
+    return [
+        look_at(f"turn_{index:05d}", middle + radius * direction, middle, axis, width=width, height=height, focal=focal)
+        for index, direction in enumerate(directions)
+    ]
+
+
 def cameras_per_ring(count: int, elevations: Sequence[float]) -> list[int]:
     """Distribute `count` cameras over the rings by circumference, at least one per ring if there are enough cameras."""
     lengths = [math.cos(math.radians(elevation)) for elevation in elevations]
@@ -234,6 +276,18 @@ def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: f
     # distance.
     least = 1e-3 * subject.size / float(offset.norm()) + 1e-6
     return _Frame(position, target, (_MARGIN * max(half[0], least), _MARGIN * max(half[1], least)))
+
+
+def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> tuple[float, float]:
+    """Return half the width and height at depth 1 that show a subject from a position toward a target."""
+    pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
+    local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
+    visible = local[local[:, 2] > near]
+    least = 1e-3 * subject.size / float((target - position).norm()) + 1e-6  # a single point has no extent
+    if not len(visible):
+        return least, least
+    x, y = (visible[:, :2] / visible[:, 2:]).abs().amax(0).clamp_max(_WIDEST).tolist()
+    return _MARGIN * max(x, least), _MARGIN * max(y, least)
 
 
 def _shape(half: tuple[float, float]) -> float:

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from sgsst_core.planning.survey import sees_something
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth, view_pairs
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.base import CameraKey, camera_key
 from sgsst_core.scene.camera import Camera, between, resized
+from sgsst_core.scene.camera_path import nearest_walk, similarly_rotated
 from sgsst_core.scene.gaussians import Scene, sampled
 
 #: Distance, relative to the median distance of consecutive cameras, beyond which two cameras are not neighbors. The
 #: capture was probably interrupted between them.
 JUMP = 4.0
-#: Rotation between two cameras beyond which they are not neighbors: about the field of view of a photo. A view halfway
-#: between such cameras may show nothing that either of them sees.
-LARGEST_ROTATION = math.radians(60)
 #: Maximum factor by which the median depth and the coverage of a novel view may lie outside the range of its neighbors'
 #: values. They exceed it inside an object or behind a wall. On the chord between two cameras of a 60-degree arc, they
 #: change by at most a third.
@@ -32,8 +28,6 @@ _OUTLOOK_SIDE = 160
 #: Maximum number of Gaussians in these renders. Larger scenes are sampled, and sampled Gaussians are enlarged to cover
 #: the same area.
 _OUTLOOK_GAUSSIANS = 250_000
-#: Tolerance for the rounding of rotations in camera files.
-_COSINE_ROUNDING = 1e-6
 
 
 def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
@@ -47,7 +41,7 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
         return []
     centers = torch.stack([camera.center for camera in cameras])
     rotations = torch.stack([camera.world_to_camera[:3, :3].double() for camera in cameras])
-    walk = _walk(centers, rotations)
+    walk = nearest_walk(centers, rotations)
     steps = (centers[walk[1:]] - centers[walk[:-1]]).norm(dim=1)
     reach = JUMP * float(steps[steps > 0].median()) if bool((steps > 0).any()) else 0.0
 
@@ -56,39 +50,12 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
             (cameras[i], cameras[j])
             for i, j in itertools.pairwise(order)
             if float((centers[i] - centers[j]).norm()) <= reach
-            and bool(_similarly_rotated(rotations[i], rotations[j]))
+            and bool(similarly_rotated(rotations[i], rotations[j]))
             and not torch.allclose(cameras[i].world_to_camera, cameras[j].world_to_camera)
         ]
 
     in_order = pairs(range(len(cameras)))
     return in_order if 2 * len(in_order) >= len(cameras) - 1 else max(in_order, pairs(walk), key=len)
-
-
-def _walk(centers: Tensor, rotations: Tensor) -> list[int]:
-    """Return the indices of the cameras along a greedy walk to the nearest remaining camera.
-
-    Cameras with a similar rotation take precedence.
-
-    Args:
-        centers: Camera centers [n, 3].
-        rotations: Camera rotations [n, 3, 3].
-    """
-    left = torch.ones(len(centers), dtype=torch.bool)
-    left[0] = False
-    order = [0]
-    while bool(left.any()):
-        here = order[-1]
-        similar = left & _similarly_rotated(rotations, rotations[here])
-        candidates = (similar if bool(similar.any()) else left).nonzero()[:, 0]
-        order.append(int(candidates[(centers[candidates] - centers[here]).norm(dim=1).argmin()]))
-        left[order[-1]] = False
-    return order
-
-
-def _similarly_rotated(rotations: Tensor, rotation: Tensor) -> Tensor:
-    """Return whether rotations [..., 3, 3] differ from a given one by at most `LARGEST_ROTATION`, as [...] bool."""
-    cosine = ((rotations * rotation).sum(dim=(-2, -1)) - 1) / 2  # trace(A B^T) = 1 + 2 cos(angle)
-    return cosine >= math.cos(LARGEST_ROTATION) - _COSINE_ROUNDING
 
 
 @dataclass(frozen=True)

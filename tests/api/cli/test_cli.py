@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -880,6 +881,121 @@ def test_render_writes_one_image_per_view_in_camera_order(
     picture = np.asarray(Image.open(out / "0000_a_left.png"))
     assert picture.shape == (75, 100, 3)
     assert picture[0, 0].tolist() == [10, 20, 30]
+
+
+@pytest.mark.parametrize("path", ["cameras", "orbit"])
+def test_render_writes_a_video_whose_frames_are_the_renders(
+    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str], path: str
+) -> None:
+    video, images = tmp_path / "video.mp4", tmp_path / "frames" / "%03d.png"
+    command = ["render", str(files.ply), "--cameras", str(files.cameras), "--path", path, "--resolution", "65"]
+    command += ["--fps", "10", "--seconds", "0.8", "--background", "10,20,30"]
+    assert main([*command, "--video", str(images)]) == 0
+    assert main([*command, "--video", str(video)]) == 0
+    shown = capsys.readouterr()
+    assert re.search(r"8 frames of (64x|54x64)", shown.out)
+    assert "0.8 s at 10 per second" in shown.out
+    assert "Rendering 8 frames, which takes about 0:" in shown.err
+    with av.open(str(video)) as container:
+        decoded = list(container.decode(video=0))
+    assert len(decoded) == len(list(images.parent.iterdir())) == 8
+    rendered = [np.asarray(Image.open(path)).astype(float) for path in sorted(images.parent.iterdir())]
+    for index, frame in enumerate(decoded):
+        found = frame.reformat(format="rgb24", src_colorspace="ITU709", dst_color_range="JPEG").to_ndarray()
+        errors = [np.abs(found - image[: frame.height, : frame.width]).mean() for image in rendered]
+        assert abs(int(np.argmin(errors)) - index) <= 1
+        assert errors[index] < 10  # H.264 halves the resolution of colors, which matters at this size
+
+
+def test_video_passes_through_the_views_that_render_writes(files: Files, tmp_path: Path) -> None:
+    """The path's ends are the first and the last camera, pixel for pixel."""
+    command = ["render", str(files.ply), "--cameras", str(files.cameras)]
+    assert main([*command, "--out", str(tmp_path / "views")]) == 0
+    assert main([*command, "--video", str(tmp_path / "video"), "--seconds", "0.1"]) == 0
+    views, frames = (sorted((tmp_path / name).iterdir()) for name in ("views", "video"))
+    for view, frame in ((views[0], frames[0]), (views[-1], frames[-1])):
+        difference = np.asarray(Image.open(view)).astype(int) - np.asarray(Image.open(frame))
+        assert np.abs(difference).max() <= 1
+
+
+@pytest.mark.parametrize("transition", ["wipe", "fade"])
+def test_comparison_starts_with_the_unstylized_scene(files: Files, tmp_path: Path, transition: str) -> None:
+    scene = read_scene(files.ply).scene
+    red = tmp_path / "red.ply"
+    write_scene(
+        red, replace(scene, sh_dc=torch.zeros_like(scene.sh_dc) + torch.tensor([1.5, -1.5, -1.5])), by_name("ply")
+    )
+    shown = {}
+    for name, extra in {
+        "before": [],
+        "after": [],
+        "video": ["--compare", str(files.ply), "--transition", transition],
+    }.items():
+        command = ["render", str(files.ply if name == "before" else red), "--cameras", str(files.cameras), *extra]
+        assert main([*command, "--video", str(tmp_path / name), "--fps", "9", "--seconds", "1"]) == 0
+        shown[name] = [np.asarray(Image.open(path)).astype(float) for path in sorted((tmp_path / name).iterdir())]
+    assert np.array_equal(shown["video"][0], shown["before"][0])
+    assert np.array_equal(shown["video"][-1], shown["after"][-1])
+    middle, before, after = (shown[name][4] for name in ("video", "before", "after"))
+    if transition == "wipe":
+        assert np.array_equal(middle[:, :32], after[:, :32])
+        assert np.array_equal(middle[:, 32:], before[:, 32:])
+    else:
+        assert np.abs(middle - (before + after) / 2).max() <= 1
+
+
+def test_transparent_video_has_straight_alpha(files: Files, tmp_path: Path) -> None:
+    """Composited over a background, it is the video over this background."""
+    write_files(files.ply.parent, ball(), cameras(3))
+    command = ["render", str(files.ply), "--cameras", str(files.cameras), "--fps", "2", "--seconds", "1"]
+    assert main([*command, "--transparent", "--video", str(tmp_path / "clear")]) == 0
+    assert main([*command, "--background", "white", "--video", str(tmp_path / "white")]) == 0
+    clear, white = (
+        np.asarray(Image.open(tmp_path / name / "frame_0000.png")).astype(float) for name in ("clear", "white")
+    )
+    alpha = clear[:, :, 3:] / 255
+    assert alpha.min() == 0
+    assert alpha.max() > 0.9
+    assert np.abs(alpha * clear[:, :, :3] + (1 - alpha) * 255 - white).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--out", "views", "--video", "video.mp4"], "not both"),
+        ([], "--out FOLDER"),
+        (["--video", "video.avi"], "is no video"),
+        (["--video", "video.mp4", "--transparent"], "no alpha channel"),
+        (["--out", "views", "--fps", "10"], "--fps requires --video"),
+        (["--out", "views", "--compare", "scene.ply"], "--compare requires --video"),
+        (["--video", "video.mp4", "--orbit", "4"], "a view per frame"),
+        (["--video", "video.mp4", "--path", "cameras"], "There are no cameras"),
+        (["--video", "video.mp4", "--seconds", "0"], "--seconds"),
+        (["--video", "video.mp4", "--compare", "missing.ply"], "missing.ply"),
+        (["--video", "video.mp4", "--resolution", "16000"], "at most 8192"),
+    ],
+)
+def test_video_options_that_contradict_each_other_are_refused(
+    files: Files, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, options: list[str], message: str
+) -> None:
+    monkeypatch.chdir(files.ply.parent)
+    before = sorted(Path().iterdir())
+    assert main(["render", "scene.ply", *options]) == 2
+    assert message in capsys.readouterr().err
+    assert sorted(Path().iterdir()) == before
+
+
+@pytest.mark.slow
+def test_interrupted_video_leaves_nothing(files: Files, tmp_path: Path) -> None:
+    video = tmp_path / "video.mp4"
+    command = [sys.executable, "-m", "api.cli", "render", str(files.ply), "--video", str(video), "--seconds", "600"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert "Rendering 18000 frames" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    assert not list(tmp_path.glob("*video*"))
+    assert not list(tmp_path.glob(".sgsst*"))
 
 
 def test_render_rejects_same_inputs_as_stylize(

@@ -1,0 +1,180 @@
+"""Videos of a scene: the cameras of a requested path, and reading and rendering of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from sgsst_core.errors import CameraError, SettingsError
+from sgsst_core.files.images import Color
+from sgsst_core.files.scene_file import read_scene
+from sgsst_core.files.video import check_video_path, is_encoded
+from sgsst_core.orbit.cameras import ELEVATION, turntable
+from sgsst_core.orbit.subject import find_subject
+from sgsst_core.orbit.up import find_up
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.report.video import Layer, write_video
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
+from sgsst_core.scene.gaussians import Scene
+from worker.capture import choose_axes, orbit_request, read_capture
+from worker.inputs import check_something_in_view
+from worker.options import VideoOptions
+from worker.request import SceneRequest, check_choice, check_folder, check_is_not_scene
+
+#: Default longer side of a video in pixels; cameras of smaller images keep theirs.
+DEFAULT_SIDE = 1280
+
+
+@dataclass(frozen=True)
+class VideoRequest:
+    """Request for a video of a scene.
+
+    Attributes:
+        source: Scene and cameras; its resolution is the longer side of the video.
+        out: Video, or images, to write; see `sgsst_core.files.video`.
+        options: Options of the video.
+        background: Background color, in 0..1.
+        unstylized: Scene file at the start of a transition; None for no transition.
+        transparent: Whether to write an alpha channel instead of the background.
+        images: Folder of photos, for cameras whose file states no sizes.
+    """
+
+    source: SceneRequest
+    out: Path
+    options: VideoOptions
+    background: Color
+    unstylized: Path | None = None
+    transparent: bool = False
+    images: Path | None = None
+
+    @property
+    def along_cameras(self) -> bool:
+        """Return whether the path leads through cameras rather than around the scene."""
+        return self.options.path == "cameras" or (self.options.path == "auto" and self.source.cameras is not None)
+
+
+def check_video_request(request: VideoRequest) -> None:
+    """Check a request as far as possible without reading the scene.
+
+    Raises:
+        InvalidInputError: If options contradict each other, or the video cannot be written.
+        ModuleNotFoundError: If the extra `video` is required but not installed.
+    """
+    source, out = request.source, request.out
+    check_video_path(out, alpha=request.transparent)
+    if request.along_cameras:
+        check_choice(source)
+    elif source.orbit is not None:
+        raise SettingsError(
+            "--orbit creates single views, but a turntable has a view per frame. Omit it, or add --path cameras for a "
+            "path through these views."
+        )
+    for scene in (source.scene, request.unstylized):
+        if scene is not None:
+            check_is_not_scene(out, scene)
+    check_folder(out.parent if out.suffix else out)
+
+
+def render_video(
+    request: VideoRequest, progress: Callable[[int, int], None] = lambda done, total: None
+) -> list[Camera]:
+    """Render a requested video on the CPU, and return its cameras. All inputs are checked first.
+
+    Args:
+        request: Request that `check_video_request` accepts.
+        progress: Callback that receives the numbers of completed and of all frames.
+
+    Raises:
+        InvalidInputError: If an input cannot be used, or the video cannot be written.
+    """
+    source = request.source
+    scene = _read(source)
+    before = None
+    if request.unstylized is not None:
+        before = _read(source.model_copy(update={"scene": request.unstylized}))
+    through = None
+    if request.along_cameras:
+        through = read_capture(source, scene, request.images).checked(scene, source.near).cameras
+    cameras = video_cameras(scene, source, through, request.options, source.resolution, even=is_encoded(request.out))
+    check_something_in_view(scene, cameras, source.near)
+    background = (0.0, 0.0, 0.0) if request.transparent else request.background
+
+    def layer(shown: Scene) -> Layer:
+        # the intersections of the current frame alone are cached
+        return Layer(shown, make_rasterizer("cpu", shown, background=background, near=source.near, memory=0))
+
+    after = layer(scene)
+    unstylized = None
+    if before is not None:
+        unstylized = Layer(before, after.rasterizer) if _same_geometry(before, scene) else layer(before)
+    request.out.parent.mkdir(parents=True, exist_ok=True)
+    write_video(
+        request.out,
+        after,
+        cameras,
+        fps=request.options.fps,
+        unstylized=unstylized,
+        transition=request.options.transition,
+        alpha=request.transparent,
+        progress=progress,
+    )
+    return cameras
+
+
+def video_cameras(
+    scene: Scene,
+    source: SceneRequest,
+    through: Sequence[Camera] | None,
+    options: VideoOptions,
+    side: int | None,
+    *,
+    even: bool,
+) -> list[Camera]:
+    """Return the cameras of a video, one per frame.
+
+    Args:
+        scene: Scene that a turntable surrounds.
+        source: Up direction, elevation, radius and near plane of a turntable.
+        through: Cameras that the path leads through; None for a turntable.
+        options: Options of the video.
+        side: Longer side in pixels; None for the cameras' own, but at most `DEFAULT_SIDE`.
+        even: Whether sides must be even.
+
+    Raises:
+        SettingsError: If there are no cameras, or an option of the turntable is out of range.
+    """
+    if through is not None:
+        if not through:
+            raise CameraError("A camera path needs at least one camera. Give some, or use the path orbit.")
+        path = CameraPath(in_path_order(through)).evenly(options.frames)
+        side = side or min(DEFAULT_SIDE, max(path[0].width, path[0].height))
+        return [framed(camera, side, even=even) for camera in path]
+    request, subject = orbit_request(source), find_subject(scene)
+    cameras = turntable(
+        subject,
+        options.frames,
+        up=request.up or find_up(subject).direction.tolist(),
+        elevation=ELEVATION if request.elevation is None else request.elevation,
+        radius=request.radius,
+        side=side or DEFAULT_SIDE,
+        near=request.near,
+    )
+    return [framed(camera, None, even=even) for camera in cameras]
+
+
+def _read(source: SceneRequest) -> Scene:
+    """Read a scene with the axes that its cameras suggest, and the requested render mode."""
+    axes, _ = choose_axes(source)
+    file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+    return file.rendered(source.render_mode, source.eps2d).scene
+
+
+def _same_geometry(first: Scene, second: Scene) -> bool:
+    """Return whether two scenes only differ in their colors."""
+    return first.rendering == second.rendering and all(
+        torch.equal(getattr(first, name), getattr(second, name)) for name in ("means", "quats", "scales", "opacities")
+    )
