@@ -44,7 +44,7 @@ class JobParameters(StylizeOptions):
         None,
         max_length=MOST_REGIONS + 1,
         description="Regions of the scene, each with its own style or frozen. Where regions overlap, the later one "
-        "wins. Only `sgsst stylize` accepts masks.",
+        "wins.",
     )
 
     @property
@@ -52,16 +52,14 @@ class JobParameters(StylizeOptions):
         """Return the requested regions.
 
         Raises:
-            SettingsError: If the regions are inconsistent, or one is selected by a mask.
+            SettingsError: If the regions are inconsistent.
         """
-        requests = region_requests(self.regions or (), exists=lambda path: False)
-        for region in requests:
-            if region.selection is not None and region.selection.path is not None:
-                raise SettingsError(
-                    f"Region {region.name!r} is selected by {region.selection.kind}=, which the service does not "
-                    "accept: only sgsst stylize accepts masks. Use a box, sphere, half-space or property."
-                )
-        return requests
+        return region_requests(self.regions or (), exists=lambda path: False)
+
+    @property
+    def selects_by_images(self) -> bool:
+        """Whether a region is selected by masks of views, for which these views are rendered."""
+        return any(region.selection and region.selection.kind == "masks" for region in self.region_requests)
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:

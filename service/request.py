@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from service.files.staging import RESULT, Staged, clean_name, region_styles
+from service.files.staging import RESULT, Staged, clean_name, region_mask, region_styles
 from service.parameters import JobParameters
 from worker.region_requests import RegionRequest
 from worker.request import SceneRequest, StylizeRequest
@@ -26,15 +26,17 @@ def _styles(staged: Staged, parameters: JobParameters) -> tuple[StyleFile, ...]:
 
 
 def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, ...]:
-    """Return the regions with the paths of their staged styles."""
+    """Return the regions with the paths of their staged styles and masks."""
     paths = {path.name: path for path in staged.styles}
 
     def staged_file(file: StyleFile) -> StyleFile:
         return replace(file, path=paths[clean_name("style", str(file.path), 0)])
 
-    return tuple(
-        replace(region, styles=tuple(map(staged_file, region.styles))) for region in parameters.region_requests
-    )
+    def staged_region(region: RegionRequest) -> RegionRequest:
+        selection = region.selection and replace(region.selection, path=region_mask(region))
+        return replace(region, selection=selection, styles=tuple(map(staged_file, region.styles)))
+
+    return tuple(map(staged_region, parameters.region_requests))
 
 
 def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest:

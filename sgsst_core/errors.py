@@ -38,6 +38,12 @@ class ImageError(InvalidInputError):
     code = "invalid-image"
 
 
+class MaskError(InvalidInputError):
+    """Unusable mask of a scene's Gaussians: unreadable, of another length, or with other values than flags."""
+
+    code = "invalid-mask"
+
+
 class SettingsError(InvalidInputError):
     """Setting that is out of range or contradicts another one."""
 

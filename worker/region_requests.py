@@ -6,7 +6,7 @@ SPEC is the selection of a region, one of
     sphere=X,Y,Z,R             no farther than R from a point
     half-space=A,B,C,D         where A x + B y + C z >= D
     property=NAME>VALUE        by a property of the PLY; also >=, <, <=, =, !=
-    mask=FILE.npy              one flag per Gaussian, in the file's order
+    mask=FILE                  one flag per Gaussian, in the file's order: packed bits (.bin) or .npy
     masks=FOLDER               mask images of some views, white inside the region
 """
 
@@ -90,7 +90,9 @@ class RegionOptions(BaseModel):
     select: Annotated[str, Field(max_length=1000)] | None = Field(
         None,
         description="Selection of its Gaussians; omitted for the rest: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, "
-        "half-space=A,B,C,D (where A x + B y + C z >= D) or property=NAME>VALUE (also >=, <, <=, =, !=).",
+        "half-space=A,B,C,D (where A x + B y + C z >= D), property=NAME>VALUE (also >=, <, <=, =, !=), mask=NAME (an "
+        "uploaded `mask` file with a flag per Gaussian) or masks=FOLDER (the uploaded `mask` images in that folder: "
+        "masks of views, white inside).",
         examples=["half-space=0,1,0,0.5"],
     )
     style: (

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import tokenize
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from sgsst_core.errors import ImageError, SceneError
+from sgsst_core.errors import ImageError
+from sgsst_core.files.gaussian_masks import read_mask
 from sgsst_core.files.photos import Photo, find_masks, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_property
 from sgsst_core.rasterizer import make_rasterizer
@@ -85,29 +84,6 @@ def select(selection: Selection, file: SceneFile, cameras: Sequence[Camera], nea
         case "masks":
             assert path is not None
             return shown_by_masks(path, file, cameras, near)
-
-
-def read_mask(path: Path, file: SceneFile) -> Tensor:
-    """Read a mask with one flag per row of the scene's file, and return the flags of the scene's Gaussians, [N] bool.
-
-    Raises:
-        SceneError: If the file is not .npy, has another shape, or has values other than 0 and 1.
-    """
-    rows = len(file.scene) if file.retained is None else len(file.retained)
-    try:
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, tokenize.TokenError) as error:  # TokenError: unclosed bracket
-        raise SceneError(f"{path}: cannot be read as .npy: {error}. Write it with numpy.save.") from error
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
-        raise SceneError(f"{path}: does not hold an array of flags or numbers. Write it with numpy.save.")
-    if values.shape != (rows,):
-        raise SceneError(
-            f"{path}: has the shape {values.shape}, but {file.path} has {rows:,} Gaussians. It must be ({rows},)."
-        )
-    flags = values == 1
-    if not bool((flags | (values == 0)).all()):
-        raise SceneError(f"{path}: has values other than 0 and 1. Give a flag for each Gaussian.")
-    return torch.from_numpy(np.array(flags if file.retained is None else flags[file.retained]))
 
 
 def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:

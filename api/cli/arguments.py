@@ -51,8 +51,8 @@ class JobInputs:
         typer.Option(
             metavar="NAME:SPEC",
             help="Region of the scene: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, half-space=A,B,C,D (Ax+By+Cz>=D), "
-            "property=NAME>VALUE, mask=FILE.npy (a flag for each Gaussian) or masks=FOLDER (images of views, white "
-            "inside the region). May be repeated; where regions overlap, the later one wins.",
+            "property=NAME>VALUE, mask=FILE (a flag for each Gaussian: packed bits in a .bin, or .npy) or masks=FOLDER "
+            "(images of views, white inside the region). May be repeated; where regions overlap, the later one wins.",
         ),
     ] = None
     region_style: Annotated[

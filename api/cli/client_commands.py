@@ -32,7 +32,7 @@ from sgsst_core.files.formats import (
     result_name,
 )
 from sgsst_core.stylizing.progress_bar import clock, live_bar
-from worker.region_requests import RegionOptions, region_requests
+from worker.region_requests import RegionOptions, RegionRequest, region_requests
 from worker.styles import parse_styles
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def submit(
 ) -> None:
     """Submit a job to a service, with the options of stylize. With --out, wait for the result."""
     styles, settings = _styles_and_parameters(inputs, options, parameters)
-    files = {"cameras": inputs.cameras, "photos": inputs.images}
+    files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": _masks(inputs.regions)}
     with _client(url, key) as client:
         if dry_run:
             with _sending_and_planning() as (progress, planning):
@@ -104,6 +104,18 @@ def _styles_and_parameters(
     return images, values | _parse_parameters(parameters)
 
 
+def _masks(regions: Sequence[RegionOptions]) -> dict[str, Path]:
+    """Return the mask file or folder of each region that has one, by the name under which it is sent."""
+    requests = region_requests(regions)
+    return {_mask_name(each): each.selection.path for each in requests if each.selection and each.selection.path}
+
+
+def _mask_name(region: RegionRequest) -> str:
+    """Return the name under which the mask of a region is sent; its suffix determines the format."""
+    suffix = region.selection.path.suffix if region.selection and region.selection.path else ""
+    return f"{region.name}{suffix}"
+
+
 def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> list[dict[str, Any]]:
     """Return regions as JSON objects for the API.
 
@@ -113,6 +125,8 @@ def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> 
     objects = {region.name: region.model_dump(mode="json", exclude_defaults=True) for region in regions}
     unused_names = iter(names)
     for request in region_requests(regions):
+        if request.selection and request.selection.path:
+            objects[request.name]["select"] = f"{request.selection.kind}={_mask_name(request)}"
         if request.styles:
             objects[request.name]["style"] = [f"{next(unused_names)}:{file.weight!r}" for file in request.styles]
     return list(objects.values())

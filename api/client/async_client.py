@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,6 +13,7 @@ from httpx_sse import aconnect_sse
 from api.client import uploads
 from api.client.answers import Event, Job, checked, unreachable
 from api.client.downloads import Download, Progress
+from api.client.inputs import JobFiles
 from api.client.transport import TRIES, Transport
 
 #: Jobs per page of a list.
@@ -61,6 +62,7 @@ class AsyncClient:
         *,
         cameras: str | Path | None = None,
         photos: str | Path | None = None,
+        masks: Mapping[str, str | Path] | None = None,
         webhook: str | None = None,
         progress: Progress = no_progress,
         **parameters: Any,
@@ -72,6 +74,8 @@ class AsyncClient:
             style: Style image, or several that are mixed with the weights of the parameter `style_weights`.
             cameras: Camera file or folder, as for `sgsst stylize --cameras`; None requires the parameter `orbit`.
             photos: Folder of photos for the content term; None for unstylized renders.
+            masks: Mask files, or folders of mask images, by the names that the parameter `regions` gives them
+                (`mask=NAME`, `masks=NAME`).
             webhook: URL that is called when the job has ended; None for none.
             progress: Callback that receives the uploaded bytes and the total bytes of all large files.
             parameters: Fields of `JobParameters`; those that are None are not sent.
@@ -79,7 +83,7 @@ class AsyncClient:
         Raises:
             RequestError: If an input cannot be used; the message says which and why.
         """
-        files = Path(scene), _paths(style), _path(cameras), _path(photos)
+        files = JobFiles(Path(scene), _paths(style), _path(cameras), _path(photos), _masks(masks))
         created = await uploads.create_job(self._transport, files, parameters, webhook=webhook, progress=progress)
         return Job.of(created)
 
@@ -91,6 +95,7 @@ class AsyncClient:
         *,
         cameras: str | Path | None = None,
         photos: str | Path | None = None,
+        masks: Mapping[str, str | Path] | None = None,
         progress: Progress = no_progress,
         planning: Progress = no_progress,
         **parameters: Any,
@@ -100,7 +105,7 @@ class AsyncClient:
         Args:
             planning: Callback that receives the number of surveyed views and the number of all views.
         """
-        files = Path(scene), _paths(style), _path(cameras), _path(photos)
+        files = JobFiles(Path(scene), _paths(style), _path(cameras), _path(photos), _masks(masks))
         return await uploads.plan_job(self._transport, files, parameters, progress=progress, planning=planning)
 
     async def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> str:
@@ -208,6 +213,10 @@ class AsyncClient:
 
 def _paths(value: str | Path | Sequence[str | Path]) -> list[Path]:
     return [Path(value)] if isinstance(value, str | Path) else [Path(each) for each in value]
+
+
+def _masks(masks: Mapping[str, str | Path] | None) -> dict[str, Path]:
+    return {name: Path(path) for name, path in (masks or {}).items()}
 
 
 def _path(value: str | Path | None) -> Path | None:

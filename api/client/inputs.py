@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from api.client.answers import RequestError
 
-_PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
+_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
 
 
 @dataclass(frozen=True)
@@ -21,16 +21,38 @@ class InputFile:
     size: int
 
 
-def input_files(scene: Path, styles: Sequence[Path], cameras: Path | None, photos: Path | None) -> list[InputFile]:
+@dataclass(frozen=True)
+class JobFiles:
+    """Local files of a job.
+
+    Attributes:
+        scene: Scene file.
+        styles: Style images.
+        cameras: Camera file or folder; None for an orbit.
+        photos: Folder of photos; None for none.
+        masks: Mask files, or folders of mask images, by the names that the job's regions give them.
+    """
+
+    scene: Path
+    styles: Sequence[Path]
+    cameras: Path | None = None
+    photos: Path | None = None
+    masks: Mapping[str, Path] = field(default_factory=dict)
+
+
+def input_files(job: JobFiles) -> list[InputFile]:
     """Return all files that a job needs.
 
     Raises:
         RequestError: If a file is missing.
     """
-    files = [("scene", scene, scene.name)]
-    files += [("style", path, name) for path, name in zip(styles, different_names(styles), strict=True)]
-    files += [("cameras", path, path.name) for path in (camera_files(cameras) if cameras else [])]
-    files += [("photos", path, name) for path, name in (photo_files(photos) if photos else [])]
+    files = [("scene", job.scene, job.scene.name)]
+    files += [("style", path, name) for path, name in zip(job.styles, different_names(job.styles), strict=True)]
+    files += [("cameras", path, path.name) for path in (camera_files(job.cameras) if job.cameras else [])]
+    files += [("photos", path, name) for path, name in (image_files(job.photos) if job.photos else [])]
+    for mask, path in job.masks.items():
+        images = [(each, f"{mask}/{name}") for each, name in image_files(path)] if path.is_dir() else [(path, mask)]
+        files += [("mask", each, name) for each, name in images]
     for _, path, _ in files:
         if not path.is_file():
             raise RequestError(f"{path}: not a file. Check the path.")
@@ -69,13 +91,13 @@ def camera_files(path: Path) -> list[Path]:
     raise RequestError(f"{path}: contains no cameras. Give a cameras.json, a COLMAP model or a transforms.json.")
 
 
-def photo_files(folder: Path) -> list[tuple[Path, str]]:
-    """Return all photos below a folder, with the names under which they are sent.
+def image_files(folder: Path) -> list[tuple[Path, str]]:
+    """Return all images below a folder, with their paths relative to it.
 
     Raises:
         RequestError: If there are none.
     """
-    photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
-    if not photos:
-        raise RequestError(f"{folder}: contains no photos. Give a folder of image files.")
-    return [(path, path.relative_to(folder).as_posix()) for path in photos]
+    images = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _IMAGE_SUFFIXES and path.is_file())
+    if not images:
+        raise RequestError(f"{folder}: contains no images. Give a folder of image files.")
+    return [(path, path.relative_to(folder).as_posix()) for path in images]

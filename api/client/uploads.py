@@ -6,7 +6,7 @@ import base64
 import hashlib
 import json
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from httpx_sse import ServerSentEvent
 
 from api.client.answers import ApiError, RequestError, refusal
 from api.client.downloads import Progress
-from api.client.inputs import input_files
+from api.client.inputs import JobFiles, input_files
 from api.client.transport import Transport, in_thread
 
 #: Maximum bytes of a part; larger files are uploaded in parts.
@@ -68,17 +68,14 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
     }
 
 
-Files = tuple[Path, Sequence[Path], Path | None, Path | None]
-
-
 async def create_job(
-    transport: Transport, files: Files, parameters: Mapping[str, Any], *, webhook: str | None, progress: Progress
+    transport: Transport, files: JobFiles, parameters: Mapping[str, Any], *, webhook: str | None, progress: Progress
 ) -> dict[str, Any]:
     """Submit a job, and return the service's response.
 
     Args:
         transport: Connections to the service.
-        files: Scene, style images, cameras and photos.
+        files: Local files of the job.
         parameters: Parameters of the job; those that are None are not sent.
         webhook: URL that is called when the job has ended.
         progress: Callback that receives the uploaded bytes and the total bytes of all large files.
@@ -92,7 +89,7 @@ async def create_job(
 
 
 async def plan_job(
-    transport: Transport, files: Files, parameters: Mapping[str, Any], *, progress: Progress, planning: Progress
+    transport: Transport, files: JobFiles, parameters: Mapping[str, Any], *, progress: Progress, planning: Progress
 ) -> dict[str, Any]:
     """Plan a job without queueing it. The other arguments are the same as for `create_job`.
 
@@ -122,10 +119,10 @@ async def plan_job(
 
 
 async def _send_files(
-    transport: Transport, files: Files, parameters: Mapping[str, Any], progress: Progress
+    transport: Transport, files: JobFiles, parameters: Mapping[str, Any], progress: Progress
 ) -> list[tuple[str, Any]]:
     """Upload the large files, and return the form fields of the request, which contain the small files."""
-    inputs = await in_thread(input_files, *files)
+    inputs = await in_thread(input_files, files)
     total = sum(file.size for file in inputs if file.size > PART_BYTES)
     done = 0
     fields: list[tuple[str, Any]] = []

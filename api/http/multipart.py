@@ -33,6 +33,7 @@ from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_na
 from service.settings import ServiceSettings
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats import read_scene_header
+from worker.region_requests import MOST_REGIONS
 
 #: Maximum bytes of a text field: JSON parameters or an id.
 _MAX_TEXT = 1 << 16
@@ -242,7 +243,7 @@ class _Form:
     def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings, receipt: Receipt) -> None:
         self.received = Received()
         self._blobs, self._settings, self._receipt = blobs, settings, receipt
-        self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + 1
+        self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + MOST_REGIONS + 1
         self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
         self._parts = 0
         self._headers: dict[bytes, bytes] = {}

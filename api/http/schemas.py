@@ -146,7 +146,7 @@ class InputView(BaseModel):
 
     model_config = _with_example(role="scene", name="scene.ply", size=42301, sha256=SHA256)
 
-    role: Literal["scene", "style", "cameras", "photos"]
+    role: Literal["scene", "style", "cameras", "photos", "mask"]
     name: str
     size: int
     sha256: str

@@ -40,6 +40,7 @@ from service.parameters import JobParameters
 from sgsst_core.errors import (
     CameraError,
     ImageError,
+    MaskError,
     SceneError,
     SettingsError,
     SgsstError,
@@ -73,6 +74,7 @@ class JobFromUploads(BaseModel):
     )
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
+    mask: list[str] = Field(default_factory=list, max_length=10_000, description="Masks that `regions` name.")
     parameters: JobParameters = Field(default_factory=JobParameters)
     webhook: str | None = Field(None, max_length=2000, description="URL to notify when the job ends.")
 
@@ -97,6 +99,12 @@ _FORM = {
             "description": "cameras.json, transforms.json, or the files of a COLMAP model.",
         },
         "photos": {"type": "array", "items": _FILE, "description": "Photos with the names that the cameras give."},
+        "mask": {
+            "type": "array",
+            "items": _FILE,
+            "description": "Mask that a region in `regions` names: one bit per Gaussian (.bin), or .npy; or images of "
+            "views in a folder.",
+        },
         "parameters": {"type": "string", "description": "JSON: see JobParameters."},
         "webhook": {"type": "string", "description": "URL to notify when the job ends."},
     },
@@ -124,6 +132,10 @@ _CORE_ERRORS: dict[type[SgsstError], tuple[str | None, str]] = {
     SceneError: ("scene", "scene.ply: holds no Gaussians (element vertex 0). Export the scene again."),
     ImageError: ("style", "style.jpg: is not an image that can be read. Give a PNG or JPEG."),
     CameraError: ("cameras", "cameras.json: holds no cameras. Export them again."),
+    MaskError: (
+        "mask",
+        "head.bin: has 100 bytes, but scene.ply has 616 Gaussians. One bit for each makes 77 bytes.",
+    ),
     SettingsError: (None, "Both numbers of steps are 0, so that nothing would change. Give some."),
     WeightsError: (None, "The service has no weights of vgg19: its operator has to fetch them."),
     TooManyIntersectionsError: (

@@ -19,7 +19,9 @@ from worker.styles import MOST_STYLE_IMAGES
 RESULT = "stylized.ply"
 #: Name of the checkpoint that an unfinished job resumes from; the leading dot hides it from users.
 CHECKPOINT = ".checkpoint"
-ROLES = ("scene", "style", "cameras", "photos")
+ROLES = ("scene", "style", "cameras", "photos", "mask")
+#: Roles whose files keep their folders: cameras and regions refer to them by relative paths.
+_FOLDER_ROLES = ("photos", "mask")
 #: Maximum number of style images: those that belong to no region, plus one for each region.
 MOST_STYLES = MOST_STYLE_IMAGES + MOST_REGIONS
 #: Maximum number of camera files: a COLMAP model has up to five (cameras, images, points3D, rigs, frames), and a
@@ -57,14 +59,15 @@ class Staged:
 def clean_name(role: str, name: str, number: int) -> str:
     """Return a safe name for an input: inside its folder and without special characters.
 
-    Photos keep their folders, because cameras may refer to them; other files keep only the last path component.
+    Photos and masks keep their folders; other files keep only the last path component.
     """
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", ".")]
     stripped = [_last_bytes(re.sub(r"[^\w .+@,=()-]+", "_", part)).strip() for part in parts]
     cleaned = [part if not part.startswith(".") else f"_{part[1:]}" for part in stripped if part]
-    if role != "photos":
+    if role not in _FOLDER_ROLES:
         cleaned = cleaned[-1:]
-    fallback = {"scene": "scene.ply", "style": "style", "cameras": "cameras.json"}.get(role, f"photo_{number}")
+    fallbacks = {"scene": "scene.ply", "style": "style", "cameras": "cameras.json", "mask": "mask.bin"}
+    fallback = fallbacks.get(role, f"photo_{number}")
     return "/".join(cleaned[-_MAX_DEPTH:]) or fallback
 
 
@@ -86,19 +89,25 @@ def region_styles(regions: Sequence[RegionRequest]) -> list[str]:
     return [clean_name("style", str(file.path), 0) for region in regions for file in region.styles]
 
 
+def region_mask(region: RegionRequest) -> Path | None:
+    """Return the staged path of a region's mask or folder of masks; None if it is selected in another way."""
+    path = region.selection and region.selection.path
+    return Path("mask", clean_name("mask", str(path), 0)) if path else None
+
+
 def check_roles(
     inputs: Sequence[Mapping[str, Any]],
     *,
     orbit: bool,
     weights: Sequence[float] | None = None,
-    of_regions: Sequence[str] = (),
+    regions: Sequence[RegionRequest] = (),
 ) -> None:
     """Raise an error unless a job has exactly the files that it needs.
 
     Args:
         orbit: Whether the cameras are on an orbit, which excludes camera files.
         weights: Weights of the style images that belong to no region; None for equal weights.
-        of_regions: Names of the style images of regions.
+        regions: Regions of the job, whose styles and masks must be among the inputs.
 
     Raises:
         RefusedInputError: If a file is missing, superfluous or inconsistent with the parameters.
@@ -109,7 +118,8 @@ def check_roles(
             what = "is missing" if not by_role[role] else f"is there {len(by_role[role])} times"
             times = "once" if most == 1 else f"once, or up to {most} of them"
             raise RefusedInputError(f"The file {role!r} {what}. Send it {times}.", "invalid-request", input=role)
-    own = _check_region_styles([entry["name"] for entry in by_role["style"]], of_regions)
+    own = _check_region_styles([entry["name"] for entry in by_role["style"]], region_styles(regions))
+    _check_region_masks([entry["name"] for entry in by_role["mask"]], regions)
     if weights is not None and len(weights) != own:
         raise RefusedInputError(
             f"style_weights has {len(weights)} values for {own} files 'style' that belong to no region. Give one per "
@@ -142,7 +152,8 @@ def check_roles(
     )
     if twice:
         raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}. Rename one.", "invalid-request")
-    _check_folders(by_role["photos"])
+    for role in _FOLDER_ROLES:
+        _check_folders(role, by_role[role])
 
 
 def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int:
@@ -165,6 +176,33 @@ def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int
     return own
 
 
+def _check_region_masks(names: Sequence[str], regions: Sequence[RegionRequest]) -> None:
+    """Verify that the masks of regions have been sent, and that every mask belongs to a region."""
+    unused = set(names)
+    for region in regions:
+        path = region_mask(region)
+        if path is None or region.selection is None:
+            continue
+        folder = region.selection.kind == "masks"
+        sent = {name: Path("mask", name) for name in names}
+        found = {name for name, file in sent.items() if (path in file.parents if folder else path == file)}
+        if not found:
+            raise RefusedInputError(
+                f"Region {region.name!r} is selected by {region.selection.text}, but no file 'mask' has that "
+                f"{'folder' if folder else 'name'}. Send it, or correct the name.",
+                "invalid-request",
+                input="mask",
+            )
+        unused -= found
+    if unused:
+        raise RefusedInputError(
+            f"The mask {min(unused)!r} belongs to no region. Select a region by mask=NAME or masks=FOLDER, or leave "
+            "out the file.",
+            "invalid-request",
+            input="mask",
+        )
+
+
 def _first_duplicate(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None:
     seen: set[tuple[str, str]] = set()
     for name in names:
@@ -174,13 +212,15 @@ def _first_duplicate(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None
     return None
 
 
-def _check_folders(photos: Sequence[Mapping[str, Any]]) -> None:
-    """Reject photos if the name of one is also the folder of another."""
-    names = {entry["name"] for entry in photos}
+def _check_folders(role: str, inputs: Sequence[Mapping[str, Any]]) -> None:
+    """Reject the inputs of a role if the name of one is also the folder of another."""
+    names = {entry["name"] for entry in inputs}
     for name in names:
         parent = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in names), None)
         if parent:
-            raise RefusedInputError(f"The photo {parent!r} is also the folder of {name!r}.", "invalid-request")
+            raise RefusedInputError(
+                f"The file {parent!r} of {role!r} is also the folder of {name!r}. Rename one.", "invalid-request"
+            )
 
 
 def _check_camera_files(names: Sequence[str]) -> None:
@@ -218,8 +258,8 @@ def layout(inputs: Sequence[Mapping[str, Any]]) -> tuple[Staged, list[tuple[Path
             path = Path("cameras", name)
             cameras.append(name)
         else:
-            path = Path("photos", name)
-            photos = True
+            path = Path(role, name)
+            photos = photos or role == "photos"
         files.append((path, entry["sha256"]))
     return Staged(scene, tuple(styles), _camera_path(cameras), Path("photos") if photos else None), files
 

@@ -265,7 +265,7 @@ class Inspector:
         """Return the CPU time limit of a task in seconds."""
         reading = self._settings.inspection_seconds + _SECONDS_PER_BYTE * size
         if work == "validate":
-            return reading
+            return reading + (self._settings.dry_run_seconds if parameters.selects_by_images else 0)
         known = self.recall("validate", inputs, parameters) or {"gaussians": 0, "views": 0, "pixels": 0}
         surveying: float = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
         surveying += _PLAN_SECONDS_PER_PIXEL * known["pixels"]

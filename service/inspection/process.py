@@ -13,6 +13,7 @@ import functools
 import json
 import math
 import os
+import re
 import resource
 import select
 import signal
@@ -34,14 +35,14 @@ from service.errors import (
     TooManyPixelsError,
     TooManyViewsError,
 )
-from service.files.staging import Staged
+from service.files.staging import ROLES, Staged
 from service.inspection.sandbox import confine, installation
 from service.parameters import JobParameters
 from service.request import scene_request, stylize_request
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.decision import warnings_of
-from sgsst_core.errors import CameraError, InvalidInputError, SgsstError, WeightsError
+from sgsst_core.errors import CameraError, InvalidInputError, MaskError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.cache_folder import cache_folder
 from sgsst_core.files.formats import format_of_name, read_scene_header
@@ -65,6 +66,7 @@ from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import Capture, about_rendering, choose_axes, read_capture
 from worker.inputs import check_something_in_view, load_styles, read_regions
 from worker.processes import die_with_parent
+from worker.region_requests import RegionRequest
 from worker.request import check_choice, check_steps
 
 #: Time at which all modules were imported.
@@ -151,10 +153,20 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     with _errors_of("cameras"):
         capture = capture.checked(file.scene, source.near)
         findings |= {"views": len(capture.cameras), "pixels": _pixels(capture.cameras)}
+    with _errors_of("mask"):
+        for path in _mask_images(job.regions):
+            _check_pixel_count(path, limits)
     with _errors_of("regions"):
         regions = read_regions(job, file, capture.cameras)
     capture = replace(capture, decisions=(*about_axes, *about_rendering(file), *capture.decisions))
     return findings, _Inputs(file.scene, capture, style, regions)
+
+
+def _mask_images(regions: Sequence[RegionRequest]) -> list[Path]:
+    """Return the files in the mask folders of regions."""
+    selections = [region.selection for region in regions if region.selection and region.selection.kind == "masks"]
+    folders = [selection.path for selection in selections if selection.path]
+    return [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
 
 
 def _pixels(cameras: Sequence[Camera]) -> int:
@@ -253,7 +265,7 @@ def _errors_of(role: str) -> Iterator[None]:
         yield
     except BaseException as error:
         if not hasattr(error, "role"):
-            error.role = role  # type: ignore[attr-defined]
+            error.role = "mask" if isinstance(error, MaskError) else role  # type: ignore[attr-defined]
         raise
 
 
@@ -309,7 +321,12 @@ def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
 
 
 def _refusal(code: str, message: str, role: str | None) -> dict[str, Any]:
-    return {"error": {"code": code, "message": message.removeprefix(f"{role}/"), "input": role}}
+    return {"error": {"code": code, "message": _without_folders(message), "input": role}}
+
+
+def _without_folders(message: str) -> str:
+    """Return the message with the users' names of files, without the folders of the staging area."""
+    return re.sub(rf"(?<!\S)(?:{'|'.join(ROLES)})/", "", message)
 
 
 def _over_limit(message: str, role: str | None = None) -> dict[str, Any]:
@@ -445,9 +462,9 @@ def _prefer_oom_kill() -> None:
 
 
 def _memory_besides_reading(request: dict[str, Any]) -> int:
-    """Return the memory limit in bytes for everything but reading: threads, and planning or compressing."""
+    """Return the memory limit in bytes for everything but reading: threads, and rendering or compressing."""
     threads: int = request["threads"] * _THREAD_BYTES
-    if request["work"] == "validate":
+    if request["work"] == "validate" and not JobParameters(**request["parameters"]).selects_by_images:
         return threads
     return threads + (request["parameters"]["memory_limit"] or default_memory_limit())
 

@@ -80,13 +80,6 @@ def test_standard_properties_are_selectable_in_every_format(tmp_path: Path, file
             select(parse_selection("property=extra>4", "a"), source, cameras(), 0.2)
 
 
-@pytest.mark.parametrize("kind", [bool, np.uint8, np.float64])
-def test_gaussian_mask_selects_its_rows(tmp_path: Path, file: SceneFile, kind: type) -> None:
-    wanted = np.arange(24) % 3 == 0
-    np.save(tmp_path / "m.npy", wanted.astype(kind))
-    assert labels_of(file, region("a", f"mask={tmp_path}/m.npy")) == wanted.astype(int).tolist()
-
-
 def test_dropped_rows_are_dropped_from_masks_and_properties(tmp_path: Path) -> None:
     scene = wall(6, 4)
     scene.means[3, 0] = torch.nan
@@ -99,33 +92,11 @@ def test_dropped_rows_are_dropped_from_masks_and_properties(tmp_path: Path) -> N
     mask = np.zeros(24)
     mask[[3, 5]] = 1
     np.save(tmp_path / "m.npy", mask)
+    (tmp_path / "m.bin").write_bytes(np.packbits(mask.astype(bool), bitorder="little").tobytes())
     wanted = [0, 0, 0, 0, 1, *[0] * 18]  # the file's row 5 is the scene's row 4
-    assert labels_of(file, region("a", f"mask={tmp_path}/m.npy")) == wanted
+    for name in ("m.npy", "m.bin"):
+        assert labels_of(file, region("a", f"mask={tmp_path}/{name}")) == wanted
     assert labels_of(file, region("a", "property=extra=5")) == wanted
-
-
-@pytest.mark.parametrize(
-    ("array", "message"),
-    [
-        (np.zeros(23), r"has the shape \(23,\), but .* has 24 Gaussians"),
-        (np.zeros((24, 1)), r"has the shape \(24, 1\)"),
-        (np.full(24, 2), "values other than 0 and 1"),
-        (np.full(24, np.nan), "values other than 0 and 1"),
-        (np.array(["a"] * 24), "does not hold an array of flags or numbers"),
-        (np.array([None] * 24), "cannot be read as .npy"),
-        (b"no npy at all", "cannot be read as .npy"),
-        (b"\x93NUMPY\x01\x00\x02\x00{\n", "cannot be read as .npy"),
-        (None, "cannot be read as .npy"),
-    ],
-)
-def test_invalid_masks_are_refused(tmp_path: Path, file: SceneFile, array: Any, message: str) -> None:
-    path = tmp_path / "m.npy"
-    if isinstance(array, bytes):
-        path.write_bytes(array)
-    elif array is not None:
-        np.save(path, array, allow_pickle=True)
-    with pytest.raises(SceneError, match=message):
-        labels_of(file, region("a", f"mask={path}"))
 
 
 def test_image_masks_of_some_views_select_gaussians(tmp_path: Path) -> None:

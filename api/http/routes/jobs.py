@@ -58,7 +58,7 @@ from service.errors import (
     UnknownUploadError,
 )
 from service.examples import JOB_ID
-from service.files.staging import check_roles, clean_name, default_job_name, region_styles
+from service.files.staging import check_roles, clean_name, default_job_name
 from service.inspection.inspector import Show
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
@@ -175,8 +175,8 @@ def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
     received, parameters, webhook = parts
     check_weights()
     inputs, rows = _resolve_inputs(context, caller, received)
-    styles = region_styles(parameters.region_requests)
-    check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights, of_regions=styles)
+    regions = parameters.region_requests
+    check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights, regions=regions)
     if webhook:
         check_url(webhook, context.settings)
     checked = context.inspector.recall("validate", inputs, parameters) is not None
@@ -230,7 +230,7 @@ async def _from_json(request: Request, context: Context) -> Parts:
     job.parameters.settings()
     styles = [job.style] if isinstance(job.style, str) else job.style
     named = [("scene", job.scene), *(("style", each) for each in styles)]
-    named += [("cameras", each) for each in job.cameras] + [("photos", each) for each in job.photos]
+    named += [(role, each) for role in ("cameras", "photos", "mask") for each in getattr(job, role)]
     uploads = [(index, *each) for index, each in enumerate(named)]
     return Received(uploads=uploads), job.parameters, job.webhook
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from PIL import Image
 
 from api.cli.main import main
 from service.files.artifacts import Artifacts
@@ -46,6 +47,25 @@ def submit(files: list[str], capsys: pytest.CaptureFixture[str], *options: str) 
     """Submit a job, and return its id."""
     assert main(["submit", *files, *options]) == 0
     return capsys.readouterr().out.strip()
+
+
+def test_masks_of_regions_are_sent(
+    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+) -> None:
+    """Each mask is sent under its region's name, so that two files of one name do not collide."""
+    for folder, content in (("a", bytes(77)), ("b", bytes([1, *bytes(76)]))):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mask.bin").write_bytes(content)
+    Image.new("L", (64, 48), 255).save(tmp_path / "a" / "view_0.png")
+    told = [f"--region=one:mask={tmp_path}/a/mask.bin", f"--region=two:mask={tmp_path}/b/mask.bin"]
+    job_id = submit(files, capsys, *told, f"--region=three:masks={tmp_path}/a")
+    with service.client() as client:
+        job = client.get(f"/v1/jobs/{job_id}").json()
+        second = client.get(f"/v1/jobs/{job_id}/inputs/mask:1").content
+    assert [each["select"] for each in job["parameters"]["regions"]] == ["mask=one.bin", "mask=two.bin", "masks=three"]
+    names = [entry["name"] for entry in job["inputs"] if entry["role"] == "mask"]
+    assert names == ["one.bin", "two.bin", "three/view_0.png"]
+    assert second == bytes([1, *bytes(76)])
 
 
 def finish(service: Service, job_id: str, content: bytes, folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import json
 import re
 import socket
@@ -15,9 +16,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import httpx
+import numpy as np
 import psutil
 import pytest
 from annotated_types import Ge, Gt
+from PIL import Image
 
 from api.cli.main import main
 from api.cli.options import kind_of
@@ -255,8 +258,8 @@ def test_regions_name_style_files(client: httpx.Client, files: dict[str, bytes])
         (answer({**right, "style": "day.png"}), "invalid-request"),
         (answer(right, style_weights=[1, 1]), "invalid-request"),
         (answer(right, files=form(files, style=("night sky.png", other))), "invalid-request"),
-        (answer({"name": "a", "select": "mask=a.npy"}), "invalid-settings"),
-        (answer({"name": "a", "select": "masks=/etc"}), "invalid-settings"),
+        (answer({"name": "a", "select": "mask=a.npy"}), "invalid-request"),
+        (answer({"name": "a", "select": "masks=/etc"}), "invalid-request"),
         (answer({"name": "a", "select": "sphere=1"}), "invalid-settings"),
         (answer({"name": "a"}), "invalid-settings"),
         (answer({"name": "a", "select": "property=nothing>1"}), "invalid-scene"),
@@ -266,6 +269,71 @@ def test_regions_name_style_files(client: httpx.Client, files: dict[str, bytes])
         refused(refusal, 422, code)
     for bad in ({"name": "a b", "select": "sphere=0,0,0,1"}, {"name": "a", "weight": 0}, {"nam": 1}):
         assert answer(bad).status_code == 422
+
+
+WHOLE = np.packbits(np.ones(616, bool)).tobytes()
+LEFT = np.packbits(np.arange(616) % 28 < 14, bitorder="little").tobytes()
+
+
+def test_masks_select_regions(client: httpx.Client, files: dict[str, bytes]) -> None:
+    """Columns 14 to 27 of the wall fill the right half of the views, where the images are white."""
+    right = Image.new("L", (64, 48))
+    right.paste(255, (32, 0, 64, 48))
+    views = io.BytesIO()
+    right.save(views, "PNG")
+    by_view = [("mask", (f"right/view_{i}.png", views.getvalue())) for i in range(2)]
+    parts = [*form(files), ("mask", ("left.bin", LEFT)), *by_view]
+    regions = [{"name": "right", "select": "masks=right"}, {"name": "left", "select": "mask=left.bin", "freeze": True}]
+    told = {"parameters": json.dumps({"regions": regions, "preset": "preview"})}
+    good = client.post("/v1/jobs?dry_run=true", files=parts, data=told)
+    assert good.status_code == 200, good.text
+    decisions = {each["item"]: each["decision"] for each in good.json()["plan"]["decisions"]}
+    assert "308 Gaussians stay unchanged" in decisions["region left"]
+    assert "308 of 616 Gaussians" in decisions["region right"]
+
+    uploads = {}
+    for name, content in (("scene.ply", files["scene"]), ("style.png", files["style"]), ("left.bin", LEFT)):
+        metadata = {"Upload-Metadata": f"filename {base64.b64encode(name.encode()).decode()}"}
+        created = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(len(content)), **metadata})
+        headers = {**TUS, "Upload-Offset": "0", "Content-Type": OFFSET_STREAM}
+        assert client.patch(created.headers["location"], headers=headers, content=content).status_code == 204
+        uploads[name] = created.headers["location"].rpartition("/")[2]
+    body = {"scene": uploads["scene.ply"], "style": uploads["style.png"], "mask": [uploads["left.bin"]]}
+    job = client.post("/v1/jobs", json={**body, "parameters": {"orbit": 2, "regions": regions[1:]}})
+    assert job.status_code == 202, job.text
+    assert [entry["name"] for entry in job.json()["inputs"] if entry["role"] == "mask"] == ["left.bin"]
+    sent = client.get(f"/v1/jobs/{job.json()['id']}/inputs/mask")
+    assert (sent.content, sent.headers["content-type"]) == (LEFT, "application/octet-stream")
+
+
+@pytest.mark.parametrize(
+    ("select", "name", "content", "code", "detail"),
+    [
+        ("mask=m.bin", "m.bin", bytes(76), "invalid-mask", "m.bin: has 76 bytes, but scene.ply has 616 Gaussians."),
+        ("mask=m.bin", "m.bin", bytes(1 << 20), "invalid-mask", "m.bin: has 1,048,576 bytes"),
+        ("mask=m.bin", "m.bin", b"", "invalid-mask", "m.bin: is empty"),
+        ("mask=m.npy", "m.npy", b"PK\x03\x04", "invalid-mask", "m.npy: cannot be read as .npy"),
+        ("mask=m.npy", "m.npy", b"\x93NUMPY\x01\x00\x29\x23" + b"[" * 9001, "invalid-mask", "cannot be read as .npy"),
+        ("mask=other.bin", "m.bin", WHOLE, "invalid-request", "no file 'mask' has that name"),
+        ("masks=m.bin", "m.bin", WHOLE, "invalid-request", "no file 'mask' has that folder"),
+        ("sphere=0,0,0,1", "m.bin", WHOLE, "invalid-request", "'m.bin' belongs to no region"),
+        ("masks=m", "m/view_0.png", b"no image", "invalid-image", "m/view_0.png: is not an image"),
+        ("masks=m", "m/view_0.png", png(2**31 - 1, 2**31 - 1, b""), "invalid-image", "m/view_0.png"),
+        ("masks=m", "m/nowhere.png", png(4, 3, zlib.compress(bytes(3 * 13))), "invalid-image", "holds no mask for any"),
+        ("masks=m", "m/view_0.png", png(4, 9, zlib.compress(bytes(9 * 13))), "invalid-image", "another aspect ratio"),
+        ("mask=m.bin", "m.bin", WHOLE, "invalid-settings", "Every Gaussian is frozen (a)"),
+    ],
+)
+def test_unusable_masks_are_refused(
+    client: httpx.Client, files: dict[str, bytes], select: str, name: str, content: bytes, code: str, detail: str
+) -> None:
+    regions = [{"name": "a", "select": select, "freeze": True}]
+    parts = [*form(files), ("mask", (name, content))]
+    answer = client.post("/v1/jobs", files=parts, data={"parameters": json.dumps({"regions": regions})})
+    problem = refused(answer, 422, code)
+    assert detail in problem["detail"]
+    assert problem["input"] in ("mask", "regions")
+    assert "mask/" not in problem["detail"]
 
 
 def test_file_names_cannot_escape_folder(client: httpx.Client, files: dict[str, bytes]) -> None:
