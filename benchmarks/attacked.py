@@ -56,13 +56,13 @@ class Attacked:
 
     def jobs(self) -> list[dict[str, Any]]:
         """Return all jobs that the service lists."""
-        found: list[dict[str, Any]] = []
+        submitted: list[dict[str, Any]] = []
         query: dict[str, Any] = {"limit": 100}
         while True:
             answer = self.call("GET", "/v1/jobs", params=query).json()
-            found += answer["jobs"]
+            submitted += answer["jobs"]
             if not answer["next_cursor"]:
-                return found
+                return submitted
             query["cursor"] = answer["next_cursor"]
 
     def waiting(self) -> int:
@@ -84,17 +84,17 @@ class Attacked:
     def wait_for_all(self) -> dict[str, dict[str, Any]]:
         """Wait until all accepted jobs have ended or time is up, and return the last status of each existing job."""
         deadline = time.monotonic() + PATIENCE
-        found: dict[str, dict[str, Any]] = {}
+        finished: dict[str, dict[str, Any]] = {}
         while time.monotonic() < deadline:
             for job_id in self.accepted:
-                if found.get(job_id, {}).get("status") not in FINISHED:
+                if finished.get(job_id, {}).get("status") not in FINISHED:
                     answer = self.call("GET", f"/v1/jobs/{job_id}")
                     if answer.status_code == 200:
-                        found[job_id] = answer.json()
-            if all(found.get(job_id, {}).get("status") in FINISHED for job_id in self.accepted):
+                        finished[job_id] = answer.json()
+            if all(finished.get(job_id, {}).get("status") in FINISHED for job_id in self.accepted):
                 break
             time.sleep(0.5)
-        return found
+        return finished
 
     def published(self, job_id: str) -> int:
         """Return the number of events that announce a job's result."""
@@ -109,5 +109,5 @@ class Attacked:
         """Return the distance of a job's colors from the expected ones, relative to the change by the job."""
         (folder / "result.ply").write_bytes(self.result(job_id))
         paths = (folder / "result.ply", expected, self.files["scene"])
-        found, wanted, before = (read_scene(path).scene.sh_dc for path in paths)
-        return float((found - wanted).norm() / (wanted - before).norm())
+        result, wanted, before = (read_scene(path).scene.sh_dc for path in paths)
+        return float((result - wanted).norm() / (wanted - before).norm())

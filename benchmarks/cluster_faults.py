@@ -158,11 +158,11 @@ class Cluster:
         user = ["setpriv", "--reuid", "postgres", "--regid", "postgres", "--clear-groups"]
         host.call("chmod", "755", str(host.disk))
         host.call("install", "-d", "-o", "postgres", str(data))
-        made = host.call(
+        initialized = host.call(
             *user, f"{programs}/initdb", "-D", str(data), "-U", "sgsst", "-A", "trust", "--locale=C", "-EUTF8"
         )
-        if made.returncode:
-            raise RuntimeError(made.stderr.decode())
+        if initialized.returncode:
+            raise RuntimeError(initialized.stderr.decode())
         host.call("sh", "-c", f"echo 'host all all {self.network.prefix}.0/24 trust' >> {data}/pg_hba.conf")
         host.run([*user, f"{programs}/postgres", "-D", str(data), "-h", host.address, "-p", str(PG_PORT), "-k", ""], {})
 
@@ -176,8 +176,8 @@ class Cluster:
 
 
 def _postgres_programs() -> Path:
-    found = shutil.which("initdb")
-    places = [Path(found).resolve()] if found else sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    initdb = shutil.which("initdb")
+    places = [Path(initdb).resolve()] if initdb else sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
     if not places:
         raise RuntimeError("initdb is missing: apt-get install -y postgresql")
     return places[-1].parent
@@ -249,13 +249,13 @@ class Run(Attacked):
         self.wait_for_steps(120)
         time.sleep(self.chance.uniform(0, 4))
         began = time.monotonic()
-        told = getattr(self, "_" + kind.replace("-", "_"))()
+        details = getattr(self, "_" + kind.replace("-", "_"))()
         mended = time.monotonic()
         self.fill()
         again = self.wait_for_steps(300)
         record = {
             "kind": kind,
-            **told,
+            **details,
             "seconds": round(mended - began, 1),
             "until_steps_after_mending": None if again is None else round(again, 1),
         }
@@ -406,11 +406,11 @@ def measure(
         reader.start()
         try:
             attacked = attack(run, kinds, faults, seconds)
-            found = run.wait_for_all()
+            jobs = run.wait_for_all()
         finally:
             run.over.set()
             reader.join()
-        return {"attacked_seconds": round(attacked, 1), **_count(run, found, expected, folder), **_left(run, found)}
+        return {"attacked_seconds": round(attacked, 1), **_count(run, jobs, expected, folder), **_left(run, jobs)}
 
 
 def attack(run: Run, kinds: Sequence[str], faults: int, limit: float | None) -> float:
@@ -430,20 +430,20 @@ def _expected(folder: Path, files: dict[str, Path]) -> dict[int, Path]:
     installed = os.environ.get("SGSST_CACHE")
     os.environ["SGSST_CACHE"] = str(folder / "weights")
     try:
-        found = {}
+        paths = {}
         for seed in SEEDS:
             (folder / f"expected_{seed}").mkdir()
-            found[seed] = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{seed}")
-        return found
+            paths[seed] = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{seed}")
+        return paths
     finally:
         os.environ.pop("SGSST_CACHE")
         if installed is not None:
             os.environ["SGSST_CACHE"] = installed
 
 
-def _count(run: Run, found: dict[str, dict[str, Any]], expected: dict[int, Path], folder: Path) -> dict[str, Any]:
+def _count(run: Run, jobs: dict[str, dict[str, Any]], expected: dict[int, Path], folder: Path) -> dict[str, Any]:
     """Return the number of lost, twice published and differing jobs, and related figures."""
-    ended = [job_id for job_id in run.accepted if found.get(job_id, {}).get("status") == "succeeded"]
+    ended = [job_id for job_id in run.accepted if jobs.get(job_id, {}).get("status") == "succeeded"]
     different, farthest = 0, 0.0
     for job_id in ended:
         wanted, ranks = expected[run.accepted[job_id]["seed"]], run.accepted[job_id]["workers"]
@@ -456,11 +456,11 @@ def _count(run: Run, found: dict[str, dict[str, Any]], expected: dict[int, Path]
         "faults": len(run.faults),
         "jobs_accepted": len(run.accepted),
         "lost": len(run.accepted) - len(ended),
-        "not_succeeded": [found.get(job_id, {}).get("error") for job_id in run.accepted if job_id not in ended],
+        "not_succeeded": [jobs.get(job_id, {}).get("error") for job_id in run.accepted if job_id not in ended],
         "published_twice": sum(run.published(job_id) != 1 for job_id in ended),
         "different": different,
         "farthest_of_two_ranks": farthest,
-        "most_attempts_of_a_job": max((len(job["attempts"]) for job in found.values()), default=0),
+        "most_attempts_of_a_job": max((len(job["attempts"]) for job in jobs.values()), default=0),
         "reads_unanswered": len(run.unanswered),
         "longest_unanswered_seconds": round(max(run.unanswered, default=0.0), 1),
         "seconds_until_steps_after_mending": {
@@ -481,12 +481,12 @@ def _spread(values: list[float | None]) -> dict[str, float | int | None]:
     }
 
 
-def _left(run: Run, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _left(run: Run, jobs: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return leftover files on hosts and in the object store, after dispatchers have had time to clean up."""
     deadline = time.monotonic() + SWEEP
     while True:
         hosts = {name: _files_of_jobs(run.cluster[name]) for name in (*NODES, *DISPATCHERS)}
-        stray = _stray_objects(run, found)
+        stray = _stray_objects(run, jobs)
         if (not any(hosts.values()) and not stray) or time.monotonic() > deadline:
             return {"left_on_hosts": hosts, "left_in_store": stray}
         time.sleep(5)
@@ -494,11 +494,11 @@ def _left(run: Run, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 def _files_of_jobs(host: Host) -> int:
     below = [str(host.disk / "data" / name) for name in ("ranks", "work")]
-    told = host.call("find", *below, "-mindepth", "2").stdout.decode().split()
-    return len(told)
+    paths = host.call("find", *below, "-mindepth", "2").stdout.decode().split()
+    return len(paths)
 
 
-def _stray_objects(run: Run, found: dict[str, dict[str, Any]]) -> list[str]:
+def _stray_objects(run: Run, jobs: dict[str, dict[str, Any]]) -> list[str]:
     """Return stored objects of jobs that are not published artifacts."""
     listing = subprocess.run(
         [sys.executable, "-c", _LIST],
@@ -514,7 +514,7 @@ def _stray_objects(run: Run, found: dict[str, dict[str, Any]]) -> list[str]:
     stray = []
     for job_id, names in by_job.items():
         known = {each["name"] for each in run.call("GET", f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]}
-        stray += names if job_id not in found else sorted(names)[len(known) :]
+        stray += names if job_id not in jobs else sorted(names)[len(known) :]
     return stray
 
 

@@ -180,11 +180,11 @@ class Network:
         """Create a switch with an unused name, so that no other process uses the same network."""
         for number in _NETWORKS:
             self.prefix, self.name = f"10.77.{number}", f"sgsst{number}"
-            made = subprocess.run(["ip", "link", "add", self.name, "type", "bridge"], capture_output=True, text=True)
-            if made.returncode == 0:
+            process = subprocess.run(["ip", "link", "add", self.name, "type", "bridge"], capture_output=True, text=True)
+            if process.returncode == 0:
                 return
         raise RuntimeError(
-            f"no network of 10.77.{_NETWORKS[0]} to {_NETWORKS[-1]} could be taken: {made.stderr.strip()}"
+            f"no network of 10.77.{_NETWORKS[0]} to {_NETWORKS[-1]} could be taken: {process.stderr.strip()}"
         )
 
     def host(self, name: str, number: int, disk_bytes: int = 1 << 30) -> Host:
@@ -225,10 +225,12 @@ class Host:
         _ip("netns", "delete", self._space, check=False)  # its file survives a reboot if /run is on a disk
         _ip("netns", "add", self._space)
         self._plug_in()
-        made = f"hostname {self.name}; mount -t tmpfs -o size={self._disk_bytes} tmpfs {self.disk}; exec sleep infinity"
+        setup = (
+            f"hostname {self.name}; mount -t tmpfs -o size={self._disk_bytes} tmpfs {self.disk}; exec sleep infinity"
+        )
         command = ["ip", "netns", "exec", self._space, "unshare", "--uts", "--pid", "--mount", "--fork", "--mount-proc"]
         with self.log.open("ab") as log:
-            self._first = subprocess.Popen([*command, "--kill-child", "bash", "-c", made], stdout=log, stderr=log)
+            self._first = subprocess.Popen([*command, "--kill-child", "bash", "-c", setup], stdout=log, stderr=log)
         deadline = time.monotonic() + 20
         while self.call("mountpoint", "-q", str(self.disk)).returncode:
             if time.monotonic() > deadline:
@@ -276,9 +278,9 @@ class Host:
         assert self._first is not None
         children = Path(f"/proc/{self._first.pid}/task/{self._first.pid}/children")
         deadline = time.monotonic() + 10
-        while not (found := children.read_text().split()) and time.monotonic() < deadline:
+        while not (pids := children.read_text().split()) and time.monotonic() < deadline:
             time.sleep(0.02)
-        return ["nsenter", "-t", found[0], "-n", "-u", "-p", "-m", f"--wd={Path.cwd()}"]
+        return ["nsenter", "-t", pids[0], "-n", "-u", "-p", "-m", f"--wd={Path.cwd()}"]
 
     def _plug_in(self) -> None:
         """Connect the host: create a device in its network and one at the switch."""

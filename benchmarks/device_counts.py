@@ -50,9 +50,9 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
         weights = comparing_pixels(tiny_weights("vgg19"))  # as with feature scale `even`
         plan, planning_context = make_plan(scene, cameras(1, *SMALL), settings, weights=weights)
         plan = replace(plan, precision=precision)  # independent of what is fastest on this processor
-        kept = planning_context if plan.precision == planning_context.network.precision else None
+        context = planning_context if plan.precision == planning_context.network.precision else None
         stylizer = Stylizer(
-            prepare_job(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, planning_context=kept)
+            prepare_job(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, planning_context=context)
         )
         steps = []
         for _ in range(2):
@@ -97,24 +97,25 @@ def main() -> int:
     parser.add_argument("--name", default=None, help="of the file in benchmarks/results; none is written without it")
     arguments = parser.parse_args()
     width, height = (int(side) for side in arguments.size.split("x"))
-    found = {}
+    by_case = {}
     precisions: tuple[Precision, ...] = ("float32", "bfloat16")
     for scan in (False, True):
         for precision in precisions:
             name = f"{'scan' if scan else 'scene'}, {precision}"
-            found[name] = counted(scan, precision, (width, height))
-            print(f"{name}: {found[name]['scales']} scales", flush=True)
+            by_case[name] = counted(scan, precision, (width, height))
+            print(f"{name}: {by_case[name]['scales']} scales", flush=True)
             for step in ("first", "steady"):
                 print(
-                    f"  {step:<8}" + "  ".join(f"{key} {value}" for key, value in found[name][step].items()), flush=True
+                    f"  {step:<8}" + "  ".join(f"{key} {value}" for key, value in by_case[name][step].items()),
+                    flush=True,
                 )
-            print(f"  loss    {found[name]['launches of the loss']}", flush=True)
-    for kind, lines in found["scan, float32"]["lines"].items():
+            print(f"  loss    {by_case[name]['launches of the loss']}", flush=True)
+    for kind, lines in by_case["scan, float32"]["lines"].items():
         print(f"{kind} of a steady step, scan, float32")
         for line, count in lines.items():
             print(f"  {count:>6}  {line}")
     if arguments.name:
-        write_result(arguments.name, {"size": [width, height], **found})
+        write_result(arguments.name, {"size": [width, height], **by_case})
     return 0
 
 

@@ -81,7 +81,7 @@ class Chaos:
         self._current: Fault | DaemonFault | None = None
         self._reports = 0
         self._at: float | None = None  # time of the current fault in seconds since the epoch
-        self.found: list[dict[str, Any]] = []
+        self.injected: list[dict[str, Any]] = []
         self._arm()
 
     def run(self) -> RanksResult:
@@ -91,7 +91,7 @@ class Chaos:
         ended = stylize_on_ranks(self._request, 2, listener, options=options, cluster=self._cluster)
         if self._current is not None:
             self._faults.append(self._current)
-        for entry, attempt in zip(self.found, ended.attempts, strict=True):
+        for entry, attempt in zip(self.injected, ended.attempts, strict=True):
             entry.pop("at", None)  # still present if the next fault occurred before the job made a step
             entry |= {
                 "reason": attempt.reason,
@@ -102,7 +102,7 @@ class Chaos:
 
     def _arm(self) -> None:
         self._current, self._at, self._reports = None, None, 0
-        if len(self.found) < FAULTS_A_JOB and self._faults:
+        if len(self.injected) < FAULTS_A_JOB and self._faults:
             self._current = self._faults.pop(0)
         if isinstance(self._current, Fault):
             self._current.write(self._request)
@@ -116,15 +116,15 @@ class Chaos:
     def _happened(self, line: str) -> None:
         print(f"  {line}", flush=True)
         if line.startswith("Going on"):
-            self.found[-1]["seconds_to_running"] = round(time.time() - self.found[-1].pop("at"), 2)
+            self.injected[-1]["seconds_to_running"] = round(time.time() - self.injected[-1].pop("at"), 2)
             return
         if isinstance(self._current, Fault):
             at = fired(self._request)
             self._at = None if at is None else at + self._current.delay
         if self._current is None or self._at is None:  # not an injected fault: a rank responded late on a busy machine
-            self.found.append({"fault": {"what": "none"}, "at": time.time()})
+            self.injected.append({"fault": {"what": "none"}, "at": time.time()})
             return
-        self.found.append({"fault": asdict(self._current), "at": self._at})
+        self.injected.append({"fault": asdict(self._current), "at": self._at})
         forget(self._request)
         self._arm()
 
@@ -175,7 +175,7 @@ def main() -> None:
     chance = random.Random(arguments.seed)
     faults = list(itertools.islice(random_faults(chance), arguments.faults))
     os.environ["PYTHONPATH"] = os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])
-    found: list[dict[str, Any]] = []
+    outcomes: list[dict[str, Any]] = []
     jobs: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name:
         drivers = [kill_driver(Path(name) / f"driver_{number}", chance) for number in range(arguments.drivers)]
@@ -188,14 +188,14 @@ def main() -> None:
                 request = small_request(Path(name) / f"job_{len(jobs)}", STEPS)
                 chaos = Chaos(request, cluster, faults)
                 ended = chaos.run()
-                found += chaos.found
+                outcomes += chaos.injected
                 difference = abs(_loss(ended) / loss - 1)
                 same = request.out.read_bytes() == content
-                jobs.append({"faults": len(chaos.found), "loss_relative_error": difference, "same_file": same})
+                jobs.append({"faults": len(chaos.injected), "loss_relative_error": difference, "same_file": same})
                 print(json.dumps(jobs[-1]), flush=True)
-                if not chaos.found:
+                if not chaos.injected:
                     sys.exit("No fault has happened in a whole job.")
-    killed = [entry for entry in found if entry["fault"].get("what") == "SIGKILL" and "seconds_to_running" in entry]
+    killed = [entry for entry in outcomes if entry["fault"].get("what") == "SIGKILL" and "seconds_to_running" in entry]
     seconds = sorted(entry["seconds_to_running"] for entry in killed)
     figures = {
         "job": {"steps": STEPS, "ranks": 2, "view": "64x48", "checkpoint_seconds": CHECKPOINT_SECONDS},
@@ -203,7 +203,7 @@ def main() -> None:
         "loss_of_undisturbed": loss,
         "seconds_to_running_after_sigkill": {"median": seconds[len(seconds) // 2], "most": seconds[-1]},
         "jobs": jobs,
-        "faults": found,
+        "faults": outcomes,
         "drivers": drivers,
     }
     print(write_result("faults", figures))

@@ -37,9 +37,9 @@ def simulate(demand: Demand, hours: float, host_days: float, seed: int, patience
         fleet = Fleet(Path(folder), max(demand.gpus // _GPUS_EACH, 1), _GPUS_EACH, host_days, seed)
         warm_up = seconds / 4
         seconds = fleet.run(demand.jobs(hours, seed), seconds, warm_up, patience)
-        found = figures(fleet, seconds, warm_up)
+        measured = figures(fleet, seconds, warm_up)
         fleet.store.close()
-    told = {
+    description = {
         "hours": hours,
         "simulated_hours": round(seconds / 3600, 2),
         "host_days": host_days,
@@ -49,7 +49,7 @@ def simulate(demand: Demand, hours: float, host_days: float, seed: int, patience
     statements = {what: round(count / fleet.calls[what], 1) for what, count in sorted(fleet.statements.items()) if what}
     calls = {what: round(count / seconds, 3) for what, count in sorted(fleet.calls.items())}
     took = {"simulated_in_seconds": round(time.perf_counter() - started)}
-    return {"demand": told, **found, "statements_of": statements, "a_second": calls, **took}
+    return {"demand": description, **measured, "statements_of": statements, "a_second": calls, **took}
 
 
 def _stored() -> dict[str, Any]:
@@ -75,14 +75,14 @@ def main() -> None:
     if arguments.database:
         from benchmarks.fleet_parts.database import measure
 
-        found = measure(arguments.queued, arguments.gpus, arguments.gpus // _GPUS_EACH)
-        stored = _stored() | {"database": found}
+        measured = measure(arguments.queued, arguments.gpus, arguments.gpus // _GPUS_EACH)
+        stored = _stored() | {"database": measured}
     else:
         demand = Demand(arguments.gpus, arguments.load)
-        found = simulate(demand, arguments.hours, arguments.host_days, arguments.seed, arguments.patience)
+        measured = simulate(demand, arguments.hours, arguments.host_days, arguments.seed, arguments.patience)
         stored = _stored()
-        stored["simulated"] = stored.get("simulated", {}) | {arguments.name: found}
-    print(json.dumps(found, indent=1))
+        stored["simulated"] = stored.get("simulated", {}) | {arguments.name: measured}
+    print(json.dumps(measured, indent=1))
     print(write_result("fleet", stored))
 
 

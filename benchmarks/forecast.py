@@ -174,19 +174,19 @@ class Passes:
         self.sizes = {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
         tiles = {scale: loss.divider.tiles(scaled) for scale, scaled in self.sizes.items()}
         self.tiles = [(tile, self.sizes[scale]) for scale, own in tiles.items() for tile in own]
-        self.kept = loss.tiling.cached([tile.outer.pixels for tile, _ in self.tiles])
+        self.cached = loss.tiling.cached([tile.outer.pixels for tile, _ in self.tiles])
 
     def network(self) -> tuple[list[Work], list[Work]]:
         """Return the work of forward pass and backward pass; the latter includes recomputing activations."""
         forward, backward = [], []
-        for (tile, _), kept in zip(self.tiles, self.kept, strict=True):
+        for (tile, _), is_cached in zip(self.tiles, self.cached, strict=True):
             outer = tile.outer
             with Counted() as there:
                 activations = self.loss.network.forward(meta(outer.bottom - outer.top, outer.right - outer.left, 3))
             with Counted() as back:
                 self.loss.network.backward(activations, lambda *_: None)
             forward += there.works
-            backward += back.works if kept else there.works + back.works
+            backward += back.works if is_cached else there.works + back.works
         return forward, backward
 
     def style(self) -> tuple[list[Work], list[Work]]:
@@ -307,22 +307,24 @@ def colors(job: Job) -> list[Work]:
     return [*counted.works, Work(0, (3 + 7) * 12 * job.gaussians)]
 
 
-def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kept: bool = False) -> dict[str, Part]:
+def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_cached: bool = False) -> dict[str, Part]:
     """Return the parts of a step.
 
     Args:
         job: Scene and views.
         precision: Precision of the feature network.
         coarse: Whether the step belongs to phase 1, which uses the coarsest scale alone.
-        everything_kept: Whether content features, intersections and frozen colors of all views are cached.
+        everything_cached: Whether content features, intersections and frozen colors of all views are cached.
     """
     loss = make_loss(precision)
     count = loss.tiling.scale_count(job.size)
     passes = Passes(loss, job.size, [count - 1] if coarse else range(count))
     forward, backward = passes.network()
     moments, style = passes.style()
-    kept = dict.fromkeys(("content", "lists", "colors"), 1.0) if everything_kept else kept_shares(job, loss, coarse)
-    missing = {name: 1 - share for name, share in kept.items()}
+    cached = (
+        dict.fromkeys(("content", "lists", "colors"), 1.0) if everything_cached else cached_fractions(job, loss, coarse)
+    )
+    missing = {name: 1 - share for name, share in cached.items()}
     uncached = [*forward, *render(job), *passes.scaled()]
     frozen = rest(job)
     return {
@@ -342,7 +344,7 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_kep
     }
 
 
-def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
+def cached_fractions(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     """Return the fractions of views whose content features, tile intersections and frozen colors fit the caches."""
     views = view_budget(job, loss)
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
@@ -356,7 +358,7 @@ def kept_shares(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
         ),
         "colors": (views / 4, 12.0 * job.gaussians),
     }
-    return {name: min(1.0, room // each / job.views) for name, (room, each) in of_a_view.items()}
+    return {name: min(1.0, budget // each / job.views) for name, (budget, each) in of_a_view.items()}
 
 
 def view_budget(job: Job, loss: SosLoss) -> int:
@@ -384,37 +386,37 @@ def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
     kinds: dict[str, dict[str, bool]] = {
         "sos": {},
         "coarse": {"coarse": True},
-        "sos, all kept": {"everything_kept": True},
-        "coarse, all kept": {"coarse": True, "everything_kept": True},
+        "sos, all cached": {"everything_cached": True},
+        "coarse, all cached": {"coarse": True, "everything_cached": True},
     }
     parts = {kind: step_parts(job, precision, **options) for kind, options in kinds.items()}
-    found: dict[str, Any] = {
+    forecasts: dict[str, Any] = {
         kind: {name: step_seconds(own, shares, precision, launches) for name, shares in SHARES.items()}
         for kind, own in parts.items()
     }
     paper = make_settings("paper")
-    for hours, end in (("hours", ""), ("hours, all kept", ", all kept")):
-        found[hours] = {
+    for hours, end in (("hours", ""), ("hours, all cached", ", all cached")):
+        forecasts[hours] = {
             name: (
-                paper.steps_coarse * found[f"coarse{end}"][name]["total"]
-                + paper.steps_sos * found[f"sos{end}"][name]["total"]
+                paper.steps_coarse * forecasts[f"coarse{end}"][name]["total"]
+                + paper.steps_sos * forecasts[f"sos{end}"][name]["total"]
             )
             / 3600
             for name in SHARES
         }
-    found["kept"] = kept_shares(job, make_loss(precision), coarse=False)
-    found["teraflops"] = sum(w.operations for w in parts["sos"]["convolutions forward"].works) / 1e12
-    return found
+    forecasts["cached"] = cached_fractions(job, make_loss(precision), coarse=False)
+    forecasts["teraflops"] = sum(w.operations for w in parts["sos"]["convolutions forward"].works) / 1e12
+    return forecasts
 
 
-def table(found: Mapping[str, Mapping[str, Any]]) -> str:
+def table(results: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a Markdown table of milliseconds per step by precision: likely value, and range in parentheses."""
-    lines = ["| part of a step, ms | " + " | ".join(found) + " |", "|---|" + "---:|" * len(found)]
-    first = next(iter(found.values()))["sos"]["likely"]
+    lines = ["| part of a step, ms | " + " | ".join(results) + " |", "|---|" + "---:|" * len(results)]
+    first = next(iter(results.values()))["sos"]["likely"]
 
     def row(name: str, kind: str, part: str, factor: float = 1e3, digits: int = 1) -> str:
         cells = []
-        for each in found.values():
+        for each in results.values():
             values = {n: factor * (v[part] if part else v) for n, v in each[kind].items()}
             low, mid, high = (values[n] for n in ("optimistic", "likely", "pessimistic"))
             cells.append(f"{mid:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})")
@@ -422,10 +424,10 @@ def table(found: Mapping[str, Mapping[str, Any]]) -> str:
 
     lines += [row(part, "sos", part) for part in first if part != "total"]
     lines.append(row("**a step**", "sos", "total"))
-    lines.append(row("a step, all kept", "sos, all kept", "total"))
+    lines.append(row("a step, all cached", "sos, all cached", "total"))
     lines.append(row("a step of phase 1", "coarse", "total"))
     lines.append(row("10,000 and 10,000 steps, hours", "hours", "", 1, 2))
-    lines.append(row("the same, all kept", "hours, all kept", "", 1, 2))
+    lines.append(row("the same, all cached", "hours, all cached", "", 1, 2))
     return "\n".join(lines)
 
 
@@ -438,8 +440,8 @@ def main() -> None:
         name: {precision: forecast(job, precision, arguments.launches) for precision in PRECISIONS}
         for name, job in JOBS.items()
     }
-    for name, found in results.items():
-        print(f"\n{name}\n\n{table(found)}")
+    for name, result in results.items():
+        print(f"\n{name}\n\n{table(result)}")
     assumptions = {
         "peaks": PEAKS,
         "bandwidth": BANDWIDTH,

@@ -75,9 +75,9 @@ class Target:
             self.answers[answer[9:12].decode() or "none"] += 1
 
     def _memory(self, field: str) -> int:
-        found = re.search(rf"{field}:\s+(\d+) kB", self._status.read_text())
-        assert found
-        return 1024 * int(found[1])
+        match = re.search(rf"{field}:\s+(\d+) kB", self._status.read_text())
+        assert match
+        return 1024 * int(match[1])
 
 
 def _request(first: str, kind: str, body: bytes) -> bytes:
@@ -194,12 +194,12 @@ def main() -> None:
     parser.add_argument("--attacks", nargs="+", choices=ATTACKS, default=list(ATTACKS))
     parser.add_argument("--name", default="hostile_memory", help="name of the result file")
     arguments = parser.parse_args()
-    found = {}
+    results = {}
     print(f"{'attack':<12} {'growth':>9} {'time':>8}  answers")
     for name in arguments.attacks:
-        found[name] = figures = measure(name)
+        results[name] = figures = measure(name)
         print(f"{name:<12} {figures['growth_mb']:>6} MB {figures['seconds']:>6} s  {figures['answers']}", flush=True)
-    print(write_result(arguments.name, {"allowed_mb": ALLOWED / MB, "attacks": found}))
+    print(write_result(arguments.name, {"allowed_mb": ALLOWED / MB, "attacks": results}))
 
 
 if __name__ == "__main__":

@@ -52,17 +52,17 @@ def compare_rows(
     Returns:
         Colors of each row, from its last seed.
     """
-    colors, found = {UNSTYLIZED: unstylized[0]}, {UNSTYLIZED: unstylized[1]}
+    colors, judgments = {UNSTYLIZED: unstylized[0]}, {UNSTYLIZED: unstylized[1]}
     print(f"{pair:28}", *(f"{name:>9}" for name in columns))
-    _print_row(UNSTYLIZED, found[UNSTYLIZED], columns)
+    _print_row(UNSTYLIZED, judgments[UNSTYLIZED], columns)
     for row in rows:
         results = []
         for seed in seeds.split(","):
             colors[row], figures = run(row, int(seed))
             results.append(figures)
-        found[row] = _mean(results)
-        _print_row(row, found[row], columns)
-        add_pair(result, pair, description, found)
+        judgments[row] = _mean(results)
+        _print_row(row, judgments[row], columns)
+        add_pair(result, pair, description, judgments)
     return colors
 
 

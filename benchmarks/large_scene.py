@@ -106,18 +106,18 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     places[places >= 0] = torch.arange(int((places >= 0).sum()), dtype=torch.int32)
     one = build_tile_intersections(scene.subset(torch.arange(1)), cameras[0])
     intersections_of_subset(one, places[1:2].numpy())  # compiles
-    found: dict[str, list[float]] = {"handed": [], "render": [], "gradient": [], "plain": [], "survey": []}
+    by_part: dict[str, list[float]] = {"handed": [], "render": [], "gradient": [], "plain": [], "survey": []}
     colors = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(2))
     for camera in cameras:
         whole = rasterizer.intersections(camera)
-        found["handed"].append(timed(lambda whole=whole: intersections_of_subset(whole, places.numpy())))  # type: ignore[misc]
+        by_part["handed"].append(timed(lambda whole=whole: intersections_of_subset(whole, places.numpy())))  # type: ignore[misc]
         image = rasterizer.render(colors, camera)
-        found["render"].append(timed(lambda camera=camera: rasterizer.render(colors, camera)))  # type: ignore[misc]
+        by_part["render"].append(timed(lambda camera=camera: rasterizer.render(colors, camera)))  # type: ignore[misc]
         gradient = timed(lambda image=image, camera=camera: rasterizer.color_gradient(image, camera))  # type: ignore[misc]
-        found["gradient"].append(gradient)
-        found["plain"].append(timed(lambda camera=camera: Rasterizer.survey(rasterizer, camera)))  # type: ignore[misc]
-        found["survey"].append(timed(lambda camera=camera: rasterizer.survey(camera)))  # type: ignore[misc]
-    seconds = {f"{name}_seconds": statistics.median(values) for name, values in found.items()}
+        by_part["gradient"].append(gradient)
+        by_part["plain"].append(timed(lambda camera=camera: Rasterizer.survey(rasterizer, camera)))  # type: ignore[misc]
+        by_part["survey"].append(timed(lambda camera=camera: rasterizer.survey(camera)))  # type: ignore[misc]
+    seconds = {f"{name}_seconds": statistics.median(values) for name, values in by_part.items()}
     return {
         "lists_seconds": isects,
         "ratio_lists_one_thread_to_all": alone / isects,

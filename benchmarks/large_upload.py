@@ -99,9 +99,9 @@ def memory_of(process: psutil.Process) -> dict[str, int]:
         status = Path(f"/proc/{process.pid}/status").read_text()
     except OSError:
         return {}
-    found = dict(re.findall(r"(VmRSS|RssAnon):\s+(\d+) kB", status))
+    fields = dict(re.findall(r"(VmRSS|RssAnon):\s+(\d+) kB", status))
     names = {"_peak": "VmRSS", "_own_peak": "RssAnon"}
-    return {field: 1024 * int(found[name]) for field, name in names.items() if name in found}
+    return {field: 1024 * int(fields[name]) for field, name in names.items() if name in fields}
 
 
 class Trial:
@@ -151,10 +151,10 @@ class Trial:
 
     def dry_run(self) -> dict[str, Any]:
         """Request a dry run that refers to the upload."""
-        told = {"scene": self._upload, "parameters": json.dumps(self._parameters)}
+        body = {"scene": self._upload, "parameters": json.dumps(self._parameters)}
         with self._files["style"].open("rb") as style, self._files["cameras"].open("rb") as cameras:
             files = {"style": ("style.png", style), "cameras": ("cameras.json", cameras)}
-            answer = self._client.post("/v1/jobs", params={"dry_run": True}, data=told, files=files)
+            answer = self._client.post("/v1/jobs", params={"dry_run": True}, data=body, files=files)
         answer.raise_for_status()
         plan = answer.json()
         return {name: plan[name] for name in ("gaussians", "views", "estimated_seconds", "memory_bytes")}
@@ -230,16 +230,16 @@ def write_inputs(folder: Path, millions: float, scene: Path | None) -> dict[str,
 
 def run_stages(trial: Trial, memory: Memory, stages: list[str], api: Callable[[], int]) -> dict[str, Any]:
     """Run the stages and return their figures."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name in stages:
         before = api()
         memory.begin()
         started = time.perf_counter()
-        told = getattr(trial, name)()
+        result = getattr(trial, name)()
         seconds = round(time.perf_counter() - started, 1)
-        found[name] = {"seconds": seconds, **told, "api_before_mb": round(before / 1e6, 1), **memory.figures()}
-        print(name, json.dumps(found[name], indent=2), flush=True)
-    return found
+        results[name] = {"seconds": seconds, **result, "api_before_mb": round(before / 1e6, 1), **memory.figures()}
+        print(name, json.dumps(results[name], indent=2), flush=True)
+    return results
 
 
 def main() -> None:

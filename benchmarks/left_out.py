@@ -44,8 +44,8 @@ def main() -> None:
     results = {}
     for text in arguments.scenes:
         name = text.partition("=")[0]
-        found = {label: _in_a_process(text, kept) for label, kept in _configurations()}
-        results[name] = _savings(found)
+        measured = {label: _in_a_process(text, cached) for label, cached in _configurations()}
+        results[name] = _savings(measured)
         _print(name, results[name])
     write_result("left_out", {"style": arguments.style.name, "resolution": arguments.resolution, "scenes": results})
 
@@ -54,9 +54,9 @@ def _configurations() -> list[tuple[str, Sequence[str]]]:
     return [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
 
 
-def _in_a_process(scene: str, kept: Sequence[str]) -> dict[str, Any]:
+def _in_a_process(scene: str, cached: Sequence[str]) -> dict[str, Any]:
     options = [argument for argument in sys.argv[1:] if "=" not in argument or argument.startswith("--")]
-    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", ",".join(kept)]
+    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", ",".join(cached)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
@@ -66,8 +66,8 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     ply, _, cameras = arguments.scenes[0].partition("=")[2].partition(":")
     scene = read_scene(Path(ply)).scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)
-    kept = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
-    settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, early_stop=False, keep=kept)
+    cached = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
+    settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, early_stop=False, keep=cached)
     stylizer = Stylizer.planned(scene, views, load_image(arguments.style), settings)
     for _ in range(arguments.rounds * len(stylizer.job.views.covered)):
         stylizer.run_step()
@@ -83,8 +83,8 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _savings(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    lean = found["lean"]
+def _savings(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    lean = results["lean"]
     rows = {
         label: {
             **values,
@@ -92,7 +92,7 @@ def _savings(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
             "bytes_saved": values["peak_bytes"] - lean["peak_bytes"],
             "loss_change": values["loss"] / lean["loss"] - 1,
         }
-        for label, values in found.items()
+        for label, values in results.items()
     }
     predicted = {
         "seconds": lean["predicted_seconds"] / lean["seconds"],

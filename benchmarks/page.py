@@ -83,16 +83,16 @@ _SCENE = """async ([base, frames, width, height]) => {
 
 def memory_bytes() -> dict[str, int]:
     """Return the resident bytes of the browser by kind of process; pages shared by processes count once in each."""
-    found: dict[str, int] = {}
+    totals: dict[str, int] = {}
     for process in psutil.Process().children(recursive=True):
         try:
             line = process.cmdline()
             kind = next((part.partition("=")[2] for part in line if part.startswith("--type=")), "browser")
             if line and "chrom" in line[0] and kind in ("browser", "renderer", "gpu-process"):
-                found[kind] = found.get(kind, 0) + process.memory_info().rss
+                totals[kind] = totals.get(kind, 0) + process.memory_info().rss
         except psutil.Error:
             continue
-    return found
+    return totals
 
 
 def measure_page(url: str) -> dict[str, Any]:
@@ -100,9 +100,9 @@ def measure_page(url: str) -> dict[str, Any]:
     with open_browser() as browser:
         watched = Watched(browser, url, width=1280, height=800)
         watched.page.goto(url)
-        found: dict[str, Any] = watched.page.evaluate(_LOADED)
+        measured: dict[str, Any] = watched.page.evaluate(_LOADED)
         watched.check()
-        return {"chromium": browser.version, **found}
+        return {"chromium": browser.version, **measured}
 
 
 def measure_scene(url: str, path: Path, frames: int, size: tuple[int, int]) -> dict[str, Any]:
@@ -117,15 +117,15 @@ def measure_scene(url: str, path: Path, frames: int, size: tuple[int, int]) -> d
         watched.page.locator("#given").set_input_files(path)
         base = str(watched.page.locator("script[type=module]").get_attribute("src")).rsplit("/", 1)[0]
         before = memory_bytes()
-        found: dict[str, Any] = watched.page.evaluate(_SCENE, [base, frames, *size])
+        measured: dict[str, Any] = watched.page.evaluate(_SCENE, [base, frames, *size])
         after = memory_bytes()
         watched.check()
     for name in ("turn", "wipe"):
-        times = found.pop(f"{name}_ms")
-        found[f"{name}_frame_ms"] = round(statistics.median(times))
-        found[f"{name}_frames_per_second"] = round(1000 / statistics.median(times), 2)
+        times = measured.pop(f"{name}_ms")
+        measured[f"{name}_frame_ms"] = round(statistics.median(times))
+        measured[f"{name}_frames_per_second"] = round(1000 / statistics.median(times), 2)
     grown = {kind: after[kind] - before.get(kind, 0) for kind in after}
-    rounded = {name: round(value, 2) if isinstance(value, float) else value for name, value in found.items()}
+    rounded = {name: round(value, 2) if isinstance(value, float) else value for name, value in measured.items()}
     return {"scene": path.name, **rounded, "resident_bytes": after, "resident_bytes_of_the_scene": grown}
 
 
@@ -142,9 +142,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, Service(Path(folder) / "data", alone=True) as service:
         figures: dict[str, Any] = {"page": measure_page(service.url), "window": list(size), "scenes": []}
         for path in arguments.scenes:
-            found = measure_scene(service.url, path, arguments.frames, size)
-            figures["scenes"].append(found)
-            print(found, write_result("page", figures), flush=True)
+            measured = measure_scene(service.url, path, arguments.frames, size)
+            figures["scenes"].append(measured)
+            print(measured, write_result("page", figures), flush=True)
 
 
 if __name__ == "__main__":

@@ -26,9 +26,9 @@ _WIDTH = 1280
 
 def save(watched: Watched, name: str, folder: Path, width: int = _WIDTH) -> None:
     """Save a screenshot of the window as page_NAME.webp, scaled to `width` pixels."""
-    with Image.open(io.BytesIO(watched.page.screenshot())) as picture:
-        size = (width, round(picture.height * width / picture.width))
-        picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(
+    with Image.open(io.BytesIO(watched.page.screenshot())) as image:
+        size = (width, round(image.height * width / image.width))
+        image.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(
             folder / f"page_{name}.webp", quality=_QUALITY, method=6
         )
 
@@ -55,8 +55,8 @@ def finished(service: Service, job_id: str) -> bool:
 
 def shown_step(page: Any) -> int:
     """Return the number of the current step as shown on a job's page, or 0 if it shows none."""
-    found = re.search(r"step (\d+)", page.locator(".state").inner_text())
-    return int(found[1]) if found else 0
+    match = re.search(r"step (\d+)", page.locator(".state").inner_text())
+    return int(match[1]) if match else 0
 
 
 def take(

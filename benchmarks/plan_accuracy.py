@@ -152,8 +152,8 @@ def _print(case: dict[str, Any]) -> None:
             own = case["own_plan"][name] / case["took"][name]
             print(f"  {name:<20}{values} ratio {ratio:.2f} (the job's own plan {own:.2f})")
     print("  parts", case["parts"], "measuring", case["measuring"])
-    told = (f"{promise['stage'][:1]}{promise['step']}:{promise['ratio']:.2f}" for promise in case["promises"])
-    print("  promised over taken:", *told, flush=True)
+    ratios = (f"{promise['stage'][:1]}{promise['step']}:{promise['ratio']:.2f}" for promise in case["promises"])
+    print("  promised over taken:", *ratios, flush=True)
 
 
 if __name__ == "__main__":

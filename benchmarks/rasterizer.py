@@ -100,17 +100,17 @@ def scenes(arguments: argparse.Namespace) -> dict[str, tuple[Scene, Camera]]:
         scene = read_scene(arguments.scene).scene
         cameras = read_cameras(arguments.cameras) if arguments.cameras else orbit(scene, 8)
         return {arguments.scene.stem: (scene, with_size(cameras[0], WIDTH, HEIGHT))}
-    found: dict[str, tuple[Scene, Camera]] = {}
+    by_name: dict[str, tuple[Scene, Camera]] = {}
     for name in ("snowmiku_plush", "biker"):
         if (DATA / name / "point_cloud.ply").is_file():
             scene = read_scene(DATA / name / "point_cloud.ply").scene
             file = DATA / name / "cameras.json"
-            found[name] = (
+            by_name[name] = (
                 scene,
                 with_size((read_cameras(file) if file.is_file() else orbit(scene, 8))[0], WIDTH, HEIGHT),
             )
     scene = surface_scene(100_000)
-    return found or {"generated": (scene, with_size(orbit(scene, 8)[0], WIDTH, HEIGHT))}
+    return by_name or {"generated": (scene, with_size(orbit(scene, 8)[0], WIDTH, HEIGHT))}
 
 
 def main() -> None:

@@ -82,7 +82,7 @@ def forecast(work: IterationWork) -> dict[str, Any]:
     time spent on communication.
     """
     one = max(loads(divide(work.pieces, work.halo, (1.0,)), work.halo))
-    found = {}
+    by_scene = {}
     for ranks in RANKS:
         largest = max(loads(divide(work.pieces, work.halo, (1.0,) * ranks), work.halo))
         links = {
@@ -92,14 +92,14 @@ def forecast(work: IterationWork) -> dict[str, Any]:
             }
             for name, link in LINKS.items()
         }
-        found[str(ranks)] = {"bound_by_halos": one / largest, "bytes_sent": work.sent(ranks), "links": links}
-    return found
+        by_scene[str(ranks)] = {"bound_by_halos": one / largest, "bytes_sent": work.sent(ranks), "links": links}
+    return by_scene
 
 
-def table(found: dict[str, Any]) -> str:
+def table(by_scene: dict[str, Any]) -> str:
     """Return the forecast as Markdown."""
     lines = ["| GPUs | halos alone | " + " | ".join(LINKS) + " |", "|---:" * (2 + len(LINKS)) + "|"]
-    for ranks, entry in found.items():
+    for ranks, entry in by_scene.items():
         cells = [f"{part['speed_up']:.1f} ({part['communication_share']:.0%})" for part in entry["links"].values()]
         lines.append(f"| {ranks} | {entry['bound_by_halos']:.1f} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -108,10 +108,10 @@ class Run(Attacked):
         """Send SIGKILL to a random process of a kind; return False if none appears in time."""
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline:
-            found = self.service.processes(target)
-            if found:
+            processes = self.service.processes(target)
+            if processes:
                 with contextlib.suppress(Exception):
-                    chance.choice(found).send_signal(signal.SIGKILL)
+                    chance.choice(processes).send_signal(signal.SIGKILL)
                     return True
             time.sleep(0.01)
         return False
@@ -192,8 +192,8 @@ def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) ->
     expected = {}
     for number, seed in enumerate(SEEDS):
         (folder / f"expected_{number}").mkdir()
-        made = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{number}")
-        expected[seed] = made.read_bytes()
+        undisturbed_run = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{number}")
+        expected[seed] = undisturbed_run.read_bytes()
     (folder / "long").mkdir()
     long = {**PARAMETERS, "seed": SEEDS[0], "steps_sos": RANK_STEPS}
     one_rank = undisturbed(files, long, folder / "long") if rank_kills else None
@@ -203,10 +203,10 @@ def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) ->
         attack(run, kills, chance)
         attacked = time.monotonic() - started
         on_ranks = attack_ranks(run, rank_kills, chance)
-        found = run.wait_for_all()
-        ended = [job_id for job_id in run.accepted if found.get(job_id, {}).get("status") == "succeeded"]
+        jobs = run.wait_for_all()
+        ended = [job_id for job_id in run.accepted if jobs.get(job_id, {}).get("status") == "succeeded"]
         known = {job["id"] for job in run.jobs()}
-        attempts = Counter(each["outcome"] for job in found.values() for each in job["attempts"])
+        attempts = Counter(each["outcome"] for job in jobs.values() for each in job["attempts"])
         alike = [job_id for job_id in ended if job_id != on_ranks]
         figures: dict[str, Any] = {
             "kills": dict(run.kills),
@@ -218,12 +218,12 @@ def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) ->
             "published_twice": sum(published(run, job_id) != 1 for job_id in ended),
             "different": sum(run.result(job_id) != expected[run.accepted[job_id]["seed"]] for job_id in alike),
             "attempts": dict(attempts),
-            "most_attempts_of_a_job": max(len(job["attempts"]) for job in found.values()),
+            "most_attempts_of_a_job": max(len(job["attempts"]) for job in jobs.values()),
             "requests_sent_again": run.resent,
             "seconds_until_the_api_answers": spread(run.api_back),
             "seconds_until_a_job_runs_again_after_a_dispatchers_death": spread(run.running_again),
             "seconds_until_everything_is_ready_again": spread(run.everything_back),
-            "not_succeeded": [job.get("error") for job in found.values() if job["status"] != "succeeded"],
+            "not_succeeded": [job.get("error") for job in jobs.values() if job["status"] != "succeeded"],
         }
         if one_rank is not None and on_ranks in ended:
             figures["two_ranks_from_one"] = run.distance(on_ranks, one_rank, folder)

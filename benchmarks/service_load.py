@@ -112,7 +112,7 @@ class Connection:
         return f"{method} {path} HTTP/1.1\r\nHost: {self._host}:{self._port}\r\n{kind}\r\n".encode()
 
 
-async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float, made: list[str]) -> dict[str, Any]:
+async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float, created: list[str]) -> dict[str, Any]:
     """Submit jobs with uploaded files from several clients, as fast as possible, and append their ids to `made`."""
     took: list[float] = []
     failures: Counter[str] = Counter()
@@ -121,7 +121,7 @@ async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float,
     async def submit(number: int) -> None:
         connection = Connection(urls[number % len(urls)])
         while time.perf_counter() < end:
-            parameters = body["parameters"] | {"seed": number * 1_000_000 + len(made)}
+            parameters = body["parameters"] | {"seed": number * 1_000_000 + len(created)}
             text = json.dumps(body | {"parameters": parameters}).encode()
             started = time.perf_counter()
             try:
@@ -131,7 +131,7 @@ async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float,
                 continue
             took.append(time.perf_counter() - started)
             if status == 202:
-                made.append(json.loads(answer)["id"])
+                created.append(json.loads(answer)["id"])
             else:
                 failures[str(status)] += 1
         connection.close()
@@ -139,7 +139,12 @@ async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float,
     started = time.perf_counter()
     await asyncio.gather(*(submit(number) for number in range(_SUBMITTERS)))
     elapsed = time.perf_counter() - started
-    return {"per_second": round(len(made) / elapsed, 1), "accepted": len(made), "failures": failures, **spread(took)}
+    return {
+        "per_second": round(len(created) / elapsed, 1),
+        "accepted": len(created),
+        "failures": failures,
+        **spread(took),
+    }
 
 
 async def at_a_rate(urls: Sequence[str], path: Callable[[int], str], rate: float, seconds: float) -> dict[str, Any]:
@@ -252,9 +257,9 @@ async def watch(
     }
 
 
-def _moment(told: str | None) -> float:
+def _moment(timestamp: str | None) -> float:
     """Convert a time from the API to seconds since 1970; return 0 for None."""
-    return datetime.fromisoformat(told).timestamp() if told else 0.0
+    return datetime.fromisoformat(timestamp).timestamp() if timestamp else 0.0
 
 
 async def large_upload(client: httpx.AsyncClient, path: Path, api: psutil.Process) -> dict[str, Any]:
@@ -320,11 +325,13 @@ async def measure(
         print(figures["status"], flush=True)
         figures["watchers"] = await watch(urls, running, arguments.watchers, arguments.seconds, apis)
         print(figures["watchers"], flush=True)
-        made: list[str] = []
-        submitting = submissions(urls, body, arguments.seconds, made)
+        created: list[str] = []
+        submitting = submissions(urls, body, arguments.seconds, created)
         figures["submissions"] = await with_processor(apis, submitting, "accepted")
         print(figures["submissions"], flush=True)
-        asking = at_a_rate(urls, lambda number: f"/v1/jobs/{made[number % len(made)]}", 200, arguments.seconds / 2)
+        asking = at_a_rate(
+            urls, lambda number: f"/v1/jobs/{created[number % len(created)]}", 200, arguments.seconds / 2
+        )
         figures["status_of_queued_jobs"] = await with_processor(apis, asking, "requests")
         print(figures["status_of_queued_jobs"], flush=True)
         figures["job_still_running"] = (await client.get(f"/v1/jobs/{running}")).json()["status"] == "running"

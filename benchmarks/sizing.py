@@ -99,11 +99,11 @@ def table(probe: Probe, settings: Settings, views: int) -> str:
     return "\n".join(lines)
 
 
-def _cell(found: Prediction) -> str:
-    memory = f"{found.peak_bytes / 1e9:.1f}"
-    if found.device_bytes is not None:
-        memory += f" + {found.device_bytes / 1e9:.1f}"
-    hours = (found.job + found.ending) / 3600
+def _cell(prediction: Prediction) -> str:
+    memory = f"{prediction.peak_bytes / 1e9:.1f}"
+    if prediction.device_bytes is not None:
+        memory += f" + {prediction.device_bytes / 1e9:.1f}"
+    hours = (prediction.job + prediction.ending) / 3600
     return f"{memory} GB, {hours:.1f} h" if hours >= 1 else f"{memory} GB, {hours * 60:.0f} min"
 
 

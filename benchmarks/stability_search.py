@@ -44,9 +44,9 @@ def main() -> None:
     if arguments.only is not None:
         _tell(arguments.only)
         return
-    ended, found = search(arguments.seconds, arguments.first)
+    ended, failures = search(arguments.seconds, arguments.first)
     print(f"{sum(ended.values())} jobs: " + ", ".join(f"{count} {how}" for how, count in ended.most_common()))
-    figures = {"seconds": arguments.seconds, "first": arguments.first, "ended": dict(ended), "found": found}
+    figures = {"seconds": arguments.seconds, "first": arguments.first, "ended": dict(ended), "failures": failures}
     write_result("stability_search", figures)
 
 
@@ -57,16 +57,16 @@ def search(seconds: float, first: int = 0) -> tuple[Counter[str], dict[int, str]
         Number of jobs by outcome, and the problem of each job that violated a bound, by its number.
     """
     ended: Counter[str] = Counter()
-    found: dict[int, str] = {}
+    failures: dict[int, str] = {}
     number, started = first, time.monotonic()
     while number == first or time.monotonic() - started < seconds:
         how, problem = outcome(drawn(number))
         ended[how] += 1
         if problem:
-            found[number] = problem
+            failures[number] = problem
             print(f"{number}: {problem}", flush=True)
         number += 1
-    return ended, found
+    return ended, failures
 
 
 def outcome(situation: Situation) -> tuple[str, str | None]:

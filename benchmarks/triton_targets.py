@@ -178,14 +178,14 @@ KERNELS: dict[str, Target] = {
 
 def compile_kernel(name: str, target: str) -> dict[str, Any]:
     """Compile one kernel for one target, and return registers, spills, shared memory and compile time."""
-    found = KERNELS[name]
+    kernel = KERNELS[name]
     signature = {
-        argument: "constexpr" if argument in found.constants else {**_TYPES, **found.types}[argument]
-        for argument in found.kernel.arg_names
+        argument: "constexpr" if argument in kernel.constants else {**_TYPES, **kernel.types}[argument]
+        for argument in kernel.kernel.arg_names
     }
-    source = ASTSource(found.kernel, signature, constexprs=found.constants)
+    source = ASTSource(kernel.kernel, signature, constexprs=kernel.constants)
     started = time.perf_counter()
-    compiled = triton.compile(source, target=TARGETS[target], options={"num_warps": found.warps})
+    compiled = triton.compile(source, target=TARGETS[target], options={"num_warps": kernel.warps})
     seconds = time.perf_counter() - started
     used = _of_nvidia(compiled.asm["cubin"]) if "cubin" in compiled.asm else _of_amd(compiled.asm["amdgcn"])
     return {**used, "shared_bytes": compiled.metadata.shared, "seconds": round(seconds, 2)}
@@ -198,15 +198,15 @@ def _of_nvidia(binary: bytes) -> dict[str, int]:
         file = Path(folder) / "kernel.cubin"
         file.write_bytes(binary)
         said = subprocess.run([tool, "--dump-resource-usage", file], capture_output=True, text=True, check=True).stdout
-    found = dict(re.findall(r"(REG|STACK|LOCAL):(\d+)", said))
-    return {"registers": int(found["REG"]), "spilled": int(found["STACK"]) + int(found["LOCAL"])}
+    fields = dict(re.findall(r"(REG|STACK|LOCAL):(\d+)", said))
+    return {"registers": int(fields["REG"]), "spilled": int(fields["STACK"]) + int(fields["LOCAL"])}
 
 
 def _of_amd(assembly: str) -> dict[str, int]:
-    found = dict(re.findall(r"\.(vgpr_count|vgpr_spill_count|sgpr_spill_count):\s+(\d+)", assembly))
+    fields = dict(re.findall(r"\.(vgpr_count|vgpr_spill_count|sgpr_spill_count):\s+(\d+)", assembly))
     return {
-        "registers": int(found["vgpr_count"]),
-        "spilled": int(found["vgpr_spill_count"]) + int(found["sgpr_spill_count"]),
+        "registers": int(fields["vgpr_count"]),
+        "spilled": int(fields["vgpr_spill_count"]) + int(fields["sgpr_spill_count"]),
     }
 
 

@@ -55,8 +55,8 @@ def with_float_steps(profile: bytes, steps: int) -> bytes:
     body += bytes(-len(body) % 4)
     tags = [(name, start + 12, size) for name, start, size in tags]
     tags.append((b"D2B0", 132 + 12 * len(tags) + 12 + len(body), len(data)))
-    found = profile[4:128] + struct.pack(">I", count + 1) + b"".join(struct.pack(">4sII", *tag) for tag in tags)
-    return struct.pack(">I", 4 + len(found) + len(body) + len(data)) + found + body + data
+    head = profile[4:128] + struct.pack(">I", count + 1) + b"".join(struct.pack(">4sII", *tag) for tag in tags)
+    return struct.pack(">I", 4 + len(head) + len(body) + len(data)) + head + body + data
 
 
 def _lab_of_inks(cyan: float, magenta: float, yellow: float, black: float) -> np.ndarray:

@@ -78,19 +78,19 @@ def controlled_server(*, durable: bool = False) -> Iterator[Postgres]:
     Args:
         durable: Whether commits are written to disk before they are acknowledged, as realistic timing requires.
     """
-    made = Postgres(durable=durable)
-    made.start()
+    started = Postgres(durable=durable)
+    started.start()
     try:
-        yield made
+        yield started
     finally:
-        made.remove()
+        started.remove()
 
 
 @contextmanager
 def server(*, durable: bool = False) -> Iterator[str]:
     """Run a server within the block, and yield its URL, without a database name."""
-    with controlled_server(durable=durable) as made:
-        yield made.url
+    with controlled_server(durable=durable) as started:
+        yield started.url
 
 
 def fresh_database(url: str) -> str:
@@ -104,7 +104,7 @@ def fresh_database(url: str) -> str:
 
 
 def _programs() -> Path | None:
-    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/pg_ctl"))
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/pg_ctl"))
     on_path = shutil.which("pg_ctl")
-    place = found[-1] if found else Path(on_path).resolve() if on_path else None
+    place = programs[-1] if programs else Path(on_path).resolve() if on_path else None
     return place.parent if place else None

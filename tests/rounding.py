@@ -35,10 +35,10 @@ class RoundedToTf32(FeatureNetwork):
         self._decisions = decisions
 
     def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
-        kept = super().forward(rgb, cache=cache)
+        activations = super().forward(rgb, cache=cache)
         if self._decisions:
-            kept.outputs = self._decisions.forward(rgb, cache=cache).outputs
-        return kept
+            activations.outputs = self._decisions.forward(rgb, cache=cache).outputs
+        return activations
 
     def _convolve(self, x: Tensor, step: vgg._Convolution) -> Tensor:
         return super()._convolve(to_tf32(x), replace(step, weight=to_tf32(step.weight)))

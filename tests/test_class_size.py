@@ -39,12 +39,12 @@ def classes(source: str) -> list[ast.ClassDef]:
 def test_no_class_has_more_than_15_attributes(package: str) -> None:
     paths = sorted((ROOT / package).rglob("*.py"))
     assert paths
-    found = {
+    counts = {
         f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}": len(attributes(node))
         for path in paths
         for node in classes(path.read_text())
     }
-    assert {name: count for name, count in found.items() if count > MOST_ATTRIBUTES} == {}
+    assert {name: count for name, count in counts.items() if count > MOST_ATTRIBUTES} == {}
 
 
 def test_attributes_set_by_several_methods_are_counted_once() -> None:

@@ -19,17 +19,17 @@ LARGEST = 500_000
 
 def outputs(notebook: Any) -> list[str]:
     """Return the texts of all outputs, and the types of images; omit the progress bar and the bytes of images."""
-    found = []
+    texts = []
     for cell in notebook.cells:
         for each in cell.get("outputs", []):
             data = each.get("data", {})
             if each["output_type"] == "stream":
-                found.append(each["text"])
+                texts.append(each["text"])
             elif "image/jpeg" in data:
-                found.append("image/jpeg")
+                texts.append("image/jpeg")
             elif each["output_type"] == "execute_result":
-                found.append(data["text/plain"])
-    return found
+                texts.append(data["text/plain"])
+    return texts
 
 
 def test_stored_outputs_are_small() -> None:

@@ -23,8 +23,8 @@ PRIVATE = re.compile(
 
 def test_only_listed_modules_use_private_names() -> None:
     files = [path for package in ("sgsst_core", "worker", "service", "api") for path in (ROOT / package).rglob("*.py")]
-    found = {path.relative_to(ROOT).as_posix() for path in files if PRIVATE.search(path.read_text())}
-    assert found == {"worker/ranks/cluster.py", "worker/ranks/process_group.py"}, (
+    users = {path.relative_to(ROOT).as_posix() for path in files if PRIVATE.search(path.read_text())}
+    assert users == {"worker/ranks/cluster.py", "worker/ranks/process_group.py"}, (
         "Another module uses a private name of a package. Do without it, or add a test of the name here that says what "
         "to do when it is gone, and bound the package in pyproject.toml."
     )
@@ -73,8 +73,8 @@ def test_ray_can_keep_the_loopback_address() -> None:
     sources = [
         (Path(spec.origin).parent / "_private" / name).read_text() for name in ("ray_constants.py", "services.py")
     ]
-    found = '"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"' in sources[0] and "ENABLE_RAY_CLUSTER" in sources[1]
-    assert found, (
+    is_supported = '"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"' in sources[0] and "ENABLE_RAY_CLUSTER" in sources[1]
+    assert is_supported, (
         "Ray no longer reads RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER. Find what keeps it from replacing 127.0.0.1 by an "
         "address that others reach, and change worker/ranks/cluster.py; tests/worker/ranks/test_sockets.py lists the "
         "sockets."

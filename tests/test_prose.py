@@ -69,14 +69,14 @@ def docstrings(path: Path) -> Iterator[tuple[int, str]]:
 def test_docstrings_start_with_a_noun_or_a_verb(package: str) -> None:
     paths = sorted((ROOT / package).rglob("*.py"))
     assert paths
-    found = [
+    bad = [
         f"{path.relative_to(ROOT)}:{line}: {text.splitlines()[0]}"
         for path in paths
         for line, docstring in docstrings(path)
         for text in prose(docstring)
         if OPENS_BADLY.match(text)
     ]
-    assert found == []
+    assert bad == []
 
 
 @pytest.mark.parametrize(

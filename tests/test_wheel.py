@@ -67,19 +67,21 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def required(requirements: list[str]) -> dict[str, Distribution]:
     """Return the installed distributions that requirements without extras need, directly or not."""
-    found: dict[str, Distribution] = {}
+    distributions: dict[str, Distribution] = {}
     waiting = [(Requirement(line), "") for line in requirements]
     while waiting:
         requirement, extra = waiting.pop()
         name = canonicalize_name(requirement.name)
         if requirement.marker and not requirement.marker.evaluate({"extra": extra}):
             continue
-        if name not in found:
-            found[name] = distribution(name)
-            waiting += [(Requirement(line), "") for line in found[name].requires or ()]
+        if name not in distributions:
+            distributions[name] = distribution(name)
+            waiting += [(Requirement(line), "") for line in distributions[name].requires or ()]
         for wanted in requirement.extras:
-            waiting += [(Requirement(line), wanted) for line in found[name].requires or () if "extra ==" in line]
-    return found
+            waiting += [
+                (Requirement(line), wanted) for line in distributions[name].requires or () if "extra ==" in line
+            ]
+    return distributions
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +120,9 @@ def test_packages_are_imported_from_the_wheel(installed: Path, tmp_path: Path) -
 
 
 def test_web_page_and_its_assets_are_installed(installed: Path, tmp_path: Path) -> None:
-    code = "from api.http.static import static_files as found; print(found().digest, *found().pages, *found().files)"
+    code = (
+        "from api.http.static import static_files as served; print(served().digest, *served().pages, *served().files)"
+    )
     digest, *names = run([installed / "python", "-c", code], tmp_path).split()
     assert digest == static_files().digest, "another byte"
     assert {"index.html", "docs.html", "vendor/swagger-ui/swagger-ui-bundle.js"} <= set(names)

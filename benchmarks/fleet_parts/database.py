@@ -35,7 +35,7 @@ _INPUTS = [{"role": "scene", "name": "scene.ply", "sha256": _SHA, "size": 10**9}
 _PREVIEW_SECONDS = 20.0
 #: Fraction of a saturated fleet's GPUs that are reserved for multi-GPU jobs (3 % were idle in simulation). At most as
 #: many dispatchers as there are reserved GPUs poll for a short job to backfill and find none.
-_KEPT_GPUS = 0.03
+_RESERVED_GPUS = 0.03
 
 
 def measure(queued: int, gpus: int, dispatchers: int) -> dict[str, Any]:
@@ -44,11 +44,11 @@ def measure(queued: int, gpus: int, dispatchers: int) -> dict[str, Any]:
         settings = ServiceSettings(data=Path(folder), database=fresh_database(url), lease_seconds=3600)
         store = open_store(settings)
         _fill(store, queued)
-        found: dict[str, Any] = {"queued": queued, "owners": _OWNERS, "lease_query_ms": _lease_query(store)}
-        calls = found["calls"] = _calls(store, int(url.rsplit(":", 1)[1].partition("/")[0]))
-        found["fleet"] = _fleet(calls, gpus, dispatchers)
+        measured: dict[str, Any] = {"queued": queued, "owners": _OWNERS, "lease_query_ms": _lease_query(store)}
+        calls = measured["calls"] = _calls(store, int(url.rsplit(":", 1)[1].partition("/")[0]))
+        measured["fleet"] = _fleet(calls, gpus, dispatchers)
         store.close()
-    return found
+    return measured
 
 
 def _fill(store: Store, queued: int) -> None:
@@ -81,8 +81,12 @@ def _lease_query(store: Store) -> dict[str, float]:
         store.leases.take("one")
     event.remove(store.database.engine, "before_cursor_execute", before)
     event.remove(store.database.engine, "after_cursor_execute", after)
-    found = sorted(took[10:])
-    return {"least": _ms(found[0]), "p50": _ms(statistics.median(found)), "p99": _ms(found[int(0.99 * len(found))])}
+    sorted_seconds = sorted(took[10:])
+    return {
+        "least": _ms(sorted_seconds[0]),
+        "p50": _ms(statistics.median(sorted_seconds)),
+        "p99": _ms(sorted_seconds[int(0.99 * len(sorted_seconds))]),
+    }
 
 
 def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
@@ -93,18 +97,18 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
         """Return the leases of this thread; no two dispatchers write to the same job."""
         return leases[threading.current_thread().name]
 
-    def take(*room: Callable[[Any], Any]) -> None:
-        lease = store.leases.take(threading.current_thread().name, *room)
+    def take(*rules: Callable[[Any], Any]) -> None:
+        lease = store.leases.take(threading.current_thread().name, *rules)
         while lease is None:  # another thread has locked the next row
-            lease = store.leases.take(threading.current_thread().name, *room)
+            lease = store.leases.take(threading.current_thread().name, *rules)
         own().append(lease)
 
-    def keeping(lets_in: bool) -> list[Callable[[Any], Any]]:
+    def reserving(lets_in: bool) -> list[Callable[[Any], Any]]:
         """Return filters that reject the first job, which is too large, and reserve GPUs for it.
 
         If `lets_in`, the next job may use the reserved GPUs; otherwise, no job may.
         """
-        return [lambda job: False, lambda job: True, lambda kept: lambda job: lets_in]
+        return [lambda job: False, lambda job: True, lambda reserved: lambda job: lets_in]
 
     def some() -> Lease:
         own().append(own().pop(0))
@@ -125,8 +129,8 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
     what: dict[str, Callable[[], Any]] = {
         "submit": lambda: store.jobs.create(submitted, limit=10**9),
         "lease": take,
-        "lease into kept room": lambda: take(*keeping(True)),
-        "keep room, in vain": lambda: store.leases.take(threading.current_thread().name, *keeping(False)),
+        "lease of reserved GPUs": lambda: take(*reserving(True)),
+        "reserve GPUs in vain": lambda: store.leases.take(threading.current_thread().name, *reserving(False)),
         "gpus": lambda: store.leases.hold_gpus(some(), 2),
         "begin": lambda: store.leases.start(some()),
         "progress": lambda: store.leases.report_progress(some(), progress),
@@ -201,7 +205,7 @@ def _fleet(calls: dict[str, dict[str, float]], gpus: int, dispatchers: int) -> d
         "renew eight": dispatchers * 3 / LEASE_SECONDS,
         "look at eight": dispatchers / POLL_SECONDS,
         "look at the queue": dispatchers / POLL_SECONDS,
-        "keep room, in vain": min(_KEPT_GPUS * gpus, dispatchers) / POLL_SECONDS,
+        "reserve GPUs in vain": min(_RESERVED_GPUS * gpus, dispatchers) / POLL_SECONDS,
         "alive": dispatchers * 3 / LEASE_SECONDS,
     }
     statements = {name: round(rate * calls[name]["statements"], 1) for name, rate in rates.items()}

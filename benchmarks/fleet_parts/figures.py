@@ -48,11 +48,11 @@ def _wait(record: Record, now: float) -> float:
 
 def spread(values: Iterable[float]) -> dict[str, float]:
     """Return percentiles of times in seconds."""
-    found = sorted(values)
-    if not found:
+    ordered = sorted(values)
+    if not ordered:
         return {}
     places = {"p50": 0.5, "p99": 0.99, "most": 1.0}
-    return {name: round(found[min(int(share * len(found)), len(found) - 1)], 1) for name, share in places.items()}
+    return {name: round(ordered[min(int(share * len(ordered)), len(ordered) - 1)], 1) for name, share in places.items()}
 
 
 def _grouped(records: Sequence[Record], name: Any) -> dict[str, list[Record]]:

@@ -98,7 +98,7 @@ class Host:
     running: dict[str, Attempt] = field(default_factory=dict)
     life: int = 0
     up: bool = True
-    keeps_room_for: str | None = None
+    reserved_for: str | None = None
     looks_again: bool = False
 
     @property
@@ -221,7 +221,7 @@ class Fleet:
 
     def _somebody_looks(self) -> None:
         """Schedule polls of all hosts with free GPUs, in random order."""
-        hosts = [host for host in self.hosts if host.free and host.keeps_room_for is None]
+        hosts = [host for host in self.hosts if host.free and host.reserved_for is None]
         self._chance.shuffle(hosts)
         for host in hosts:
             if not self._waiting:
@@ -232,20 +232,20 @@ class Fleet:
         """Lease all jobs that fit a host, as a real dispatcher does in each poll."""
         while host.free and self._waiting:
             self._do("lease")
-            found = host.selector.lease_next_job(host.held)
-            if found is None:
+            lease = host.selector.lease_next_job(host.held)
+            if lease is None:
                 self._do("look")
-                host.keeps_room_for = self._reserved(host)
-                if host.keeps_room_for is None and not host.looks_again:
+                host.reserved_for = self._reserved(host)
+                if host.reserved_for is None and not host.looks_again:
                     host.looks_again = True
                     self._at(self.now + _LOOK_AGAIN, lambda: self._look_again(host))
                 return
-            host.keeps_room_for = None
-            self._start(host, *found)
+            host.reserved_for = None
+            self._start(host, *lease)
 
     def _look_again(self, host: Host) -> None:
         host.looks_again = False
-        if host.keeps_room_for is None:
+        if host.reserved_for is None:
             self._look(host)
 
     def _reserved(self, host: Host) -> str | None:
@@ -263,8 +263,8 @@ class Fleet:
         attempt = Attempt(record, lease, grant, self.now, self.now)
         host.running[lease.job_id] = attempt
         for other in self.hosts:
-            if other.keeps_room_for == lease.job_id:
-                other.keeps_room_for = None
+            if other.reserved_for == lease.job_id:
+                other.reserved_for = None
                 self._at(self._soon(), lambda other=other: self._look(other))  # type: ignore[misc]
         life = host.life
         self._at(self.now + record.job.start_seconds(), lambda: self._planned(host, life, attempt))
@@ -344,7 +344,7 @@ class Fleet:
         self._at(self._soon(), self._somebody_looks)
 
     def _repair(self, host: Host) -> None:
-        host.up, host.keeps_room_for = True, None
+        host.up, host.reserved_for = True, None
         self._do("failure")
         self.store.operations.record_heartbeat(host.selector.dispatcher, host.gpus, host.gpus)
         self._look(host)

@@ -114,7 +114,7 @@ def in_a_process(part: str, budget: float) -> dict[str, Any]:
                 process.wait()
         findings = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     ended = {"status": "failed", **said} if said else findings.pop("_ended")
-    return {**ended, "seconds": round(time.perf_counter() - started, 1), "found": findings}
+    return {**ended, "seconds": round(time.perf_counter() - started, 1), "findings": findings}
 
 
 def _without_parts(arguments: list[str]) -> list[str]:
@@ -126,18 +126,20 @@ def _without_parts(arguments: list[str]) -> list[str]:
 
 def run_part(part: str, arguments: argparse.Namespace) -> int:
     """Run one part in this process, and add its status as the last finding."""
-    found = Findings(arguments.findings)
+    findings = Findings(arguments.findings)
     try:
-        importlib.import_module(f"benchmarks.gpu.{part}").run(sizes_of(arguments), found)
+        importlib.import_module(f"benchmarks.gpu.{part}").run(sizes_of(arguments), findings)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in _OWN:
             raise
-        found.end({"status": "skipped", "reason": f"{error.name} is not installed"})
+        findings.end({"status": "skipped", "reason": f"{error.name} is not installed"})
     except Exception:
-        found.end({"status": "failed", "reason": traceback.format_exc()})
+        findings.end({"status": "failed", "reason": traceback.format_exc()})
     else:
-        status = {"status": "failed", "reason": "; ".join(found.broken)} if found.broken else {"status": "succeeded"}
-        found.end(status)
+        status = (
+            {"status": "failed", "reason": "; ".join(findings.broken)} if findings.broken else {"status": "succeeded"}
+        )
+        findings.end(status)
     return 0
 
 

@@ -16,7 +16,7 @@ _LAYOUTS = {"channels_last": torch.channels_last, "planes": torch.contiguous_for
 _REPEATS = 3
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Measure the layers from the largest to the smallest; layers of the same shape only once."""
     quick = sizes == QUICK
     weights, (width, height) = small_weights() if quick else network_weights(), sizes.view
@@ -31,7 +31,7 @@ def run(sizes: Sizes, found: Findings) -> None:
         for precision in (precision for precision, there in available.items() if there):
             for direction in ("forward", "backward"):
                 rates = _rates(weight, (height // stride, width // stride), precision, direction)
-                found.add(f"{name}/{precision}/{direction}", rates)
+                findings.add(f"{name}/{precision}/{direction}", rates)
 
 
 def _rates(weight: torch.Tensor, size: tuple[int, int], precision: str, direction: str) -> dict[str, float]:

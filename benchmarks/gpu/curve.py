@@ -33,7 +33,7 @@ VIEWS = 6
 LEARNING_RATE = 2.5e-3
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Compare the loss curves of GPU and CPU."""
     quick = sizes == QUICK
     with tempfile.TemporaryDirectory() as folder:
@@ -47,11 +47,11 @@ def run(sizes: Sizes, found: Findings) -> None:
         finally:
             other.kill()
         expected = json.loads(path.read_text())
-    found.add("scene", scene)
-    found.add("losses", losses)
-    found.add("losses_on_the_cpu", expected)
-    found.add("largest_difference_of_a_step", largest_difference(losses, expected, 1))
-    found.check("loss", largest_difference(losses, expected, 1 if quick else VIEWS), BOUND)
+    findings.add("scene", scene)
+    findings.add("losses", losses)
+    findings.add("losses_on_the_cpu", expected)
+    findings.add("largest_difference_of_a_step", largest_difference(losses, expected, 1))
+    findings.check("loss", largest_difference(losses, expected, 1 if quick else VIEWS), BOUND)
 
 
 def largest_difference(losses: list[float], expected: list[float], window: int) -> float:

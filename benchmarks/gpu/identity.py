@@ -6,8 +6,8 @@ from benchmarks.gpu.part import Findings, Sizes, device
 from sgsst_core.bench.device_identity import identity
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Add all names and values."""
     del sizes  # the same for all sizes
     for name, value in identity(device()):
-        found.add(name, value)
+        findings.add(name, value)

@@ -86,7 +86,7 @@ class Launches:
         self.kernels[name].bytes.append(sum({tensor.data_ptr(): tensor.nbytes for tensor in tensors}.values()))
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Record the kernels of steps, then those of cached blend weights."""
     quick, launches = sizes == QUICK, Launches()
     width, height = sizes.view
@@ -104,20 +104,20 @@ def run(sizes: Sizes, found: Findings) -> None:
         launches.forget()
         for _ in range(_STEPS):
             stylizer.run_step()
-    report(launches, "step", found, _STEPS)
+    report(launches, "step", findings, _STEPS)
     if device().type == "cuda":
-        found.add("step/all_launches", _all_launches(stylizer))
+        findings.add("step/all_launches", _all_launches(stylizer))
     launches.forget()
     rasterizer = CachedRasterizer(scene, uncached=make_rasterizer("triton", scene))
     colors, camera = torch.full((len(scene), 3), 0.5, device=device()), stylizer.job.views.cameras[0]
     with launches.recorded():
         for _ in range(2):
             rasterizer.color_gradient(rasterizer.render(colors, camera), camera)
-    report(launches, "cached_weights", found, 1)
-    found.add("first_launch_seconds", {name: kernel.first for name, kernel in sorted(launches.kernels.items())})
+    report(launches, "cached_weights", findings, 1)
+    findings.add("first_launch_seconds", {name: kernel.first for name, kernel in sorted(launches.kernels.items())})
 
 
-def report(launches: Launches, place: str, found: Findings, rounds: int) -> None:
+def report(launches: Launches, prefix: str, findings: Findings, rounds: int) -> None:
     """Add a row for each kernel, those that take the longest first."""
     for name, kernel in sorted(launches.kernels.items(), key=lambda item: -sum(item[1].seconds)):
         if kernel.seconds:
@@ -127,7 +127,7 @@ def report(launches: Launches, place: str, found: Findings, rounds: int) -> None
                 "microseconds": 1e6 * total / len(kernel.seconds),
                 "gigabytes_per_second": sum(kernel.bytes) / total / 1e9,
             }
-            found.add(f"{place}/{name}", row)
+            findings.add(f"{prefix}/{name}", row)
 
 
 def _all_launches(stylizer: Stylizer) -> dict[str, int]:

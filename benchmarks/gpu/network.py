@@ -24,46 +24,46 @@ PEAKS: dict[str, dict[str, float]] = {
 }
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Measure the network on a square image in every available precision."""
     weights = small_weights() if sizes == QUICK else network_weights()
-    found.add("network", f"{weights.name}, {weights.source}")
-    found.add("side", sizes.network)
+    findings.add("network", f"{weights.name}, {weights.source}")
+    findings.add("side", sizes.network)
     use_whole_float32()
-    picture = texture(sizes.network, sizes.network).to(device())
+    image = texture(sizes.network, sizes.network).to(device())
     exact: dict[str, Tensor] = {}
     for precision, make in precisions(weights).items():
         network = make()
-        features = network.forward(picture, cache=False).features
+        features = network.forward(image, cache=False).features
         exact = exact or features
-        found.add(f"{precision}/error_of_features", max(_error(features[name], exact[name]) for name in exact))
-        for name, action in _passes(network, picture).items():
+        findings.add(f"{precision}/error_of_features", max(_error(features[name], exact[name]) for name in exact))
+        for name, action in _passes(network, image).items():
             taken = seconds(action, device(), sizes.repeats)
             rate = flop(weights, sizes.network) * (2 if name == "both" else 1) / taken / 1e12
-            found.add(f"{precision}/{name}", {"seconds": taken, "tflops": rate, "share": share(rate, precision)})
+            findings.add(f"{precision}/{name}", {"seconds": taken, "tflops": rate, "share": share(rate, precision)})
     if "tf32" not in precisions(weights):
-        found.add("tf32", {"skipped": "the feature network has no such precision"})
+        findings.add("tf32", {"skipped": "the feature network has no such precision"})
 
 
 def precisions(weights: BackboneWeights) -> dict[str, Callable[[], FeatureNetwork]]:
     """Return functions that construct the network, by precision; float32 comes first."""
-    found: dict[str, dict[str, Any]] = {"float32": {}, "bfloat16": {"dtype": torch.bfloat16}}
+    variants: dict[str, dict[str, Any]] = {"float32": {}, "bfloat16": {"dtype": torch.bfloat16}}
     if "tf32" in inspect.signature(FeatureNetwork).parameters:
-        found["tf32"] = {"tf32": True}
+        variants["tf32"] = {"tf32": True}
 
     def make(options: dict[str, Any]) -> Callable[[], FeatureNetwork]:
         return lambda: FeatureNetwork(weights, STYLE_LAYERS, device=device(), **options)
 
-    return {name: make(options) for name, options in found.items()}
+    return {name: make(options) for name, options in variants.items()}
 
 
-def _passes(network: FeatureNetwork, picture: Tensor) -> dict[str, Callable[[], object]]:
+def _passes(network: FeatureNetwork, image: Tensor) -> dict[str, Callable[[], object]]:
     def add(layer: str, features: Tensor, gradient: Tensor) -> None:
         gradient.add_(features)
 
     return {
-        "forward": lambda: network.forward(picture),
-        "both": lambda: network.backward(network.forward(picture), add),
+        "forward": lambda: network.forward(image),
+        "both": lambda: network.backward(network.forward(image), add),
     }
 
 
@@ -87,5 +87,5 @@ def share(tflops: float, precision: str) -> float | None:
     return tflops / known[precision] if known else None
 
 
-def _error(found: Tensor, exact: Tensor) -> float:
-    return float((found.double() - exact.double()).norm() / exact.double().norm())
+def _error(actual: Tensor, exact: Tensor) -> float:
+    return float((actual.double() - exact.double()).norm() / exact.double().norm())

@@ -10,7 +10,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.trial import drawing_problem
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Compare all available rasterizers on one view. Raise an error if `triton` is unavailable."""
     gaussians, width, height = sizes.parity
     scene, camera = surface_scene(gaussians, degree=3), views(1, width, height)[0]
@@ -19,11 +19,11 @@ def run(sizes: Sizes, found: Findings) -> None:
         if problem and name == "triton":
             raise RuntimeError(f"rasterizer 'triton': {problem}")
         if problem:
-            found.add(name, {"skipped": problem})
+            findings.add(name, {"skipped": problem})
             continue
         rasterizer = make_rasterizer(name, scene, background=BACKGROUND, device=device())
         for check in rasterizer_checks(rasterizer, scene, camera):
-            found.check(f"{name}/{check.name}", check.error, check.bound)
+            findings.check(f"{name}/{check.name}", check.error, check.bound)
         if name != "cuda":  # gsplat adds gradients in no fixed order
             step = Step.of(rasterizer, scene, camera, small_weights() if sizes == QUICK else network_weights())
-            found.check(f"{name}/different_of_{sizes.bits}_repeats", step.different_repeats(sizes.bits), 0.0)
+            findings.check(f"{name}/different_of_{sizes.bits}_repeats", step.different_repeats(sizes.bits), 0.0)

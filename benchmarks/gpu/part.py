@@ -57,16 +57,16 @@ def device() -> torch.device:
     return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
 
 
-def print_rows(found: dict[str, Any]) -> None:
+def print_rows(findings: dict[str, Any]) -> None:
     """Print findings as rows of a table, at once."""
-    for name, value in leaves(found):
+    for name, value in leaves(findings):
         print(f"  {name:<58}{value:.5g}" if isinstance(value, float) else f"  {name:<58}{value}", flush=True)
 
 
-def leaves(found: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
+def leaves(tree: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
     """Return all leaf values with their paths; of a long list of numbers, only the first and last values."""
     lines: list[tuple[str, Any]] = []
-    for name, value in found.items():
+    for name, value in tree.items():
         if isinstance(value, dict):
             lines += leaves(value, f"{above}{name}/")
         elif isinstance(value, list) and value and isinstance(value[0], float) and len(value) > 4:
@@ -94,10 +94,10 @@ class Findings:
     def add(self, name: str, value: Any) -> None:
         """Add a JSON-serializable value; with the name "a/b", it is entry `b` of the object `a`."""
         *groups, last = name.split("/")
-        place = self.entries
+        entries = self.entries
         for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = value
+            entries = entries.setdefault(group, {})
+        entries[last] = value
         self._write()
         print_rows({name: value})
 

@@ -32,7 +32,7 @@ GRADIENT_BOUND = 1e-4
 COLORS_BOUND = 1e-2
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Compare the gradient of the first step, and the colors after some steps."""
     expected_gradient, expected = follow(ALONE, sizes)
     address = free_address()
@@ -41,10 +41,10 @@ def run(sizes: Sizes, found: Findings) -> None:
         results = [torch.load(Path(folder) / f"{rank}.pt") for rank in range(RANKS)]
     start = surface_scene(sizes.gaussians[0], degree=3).sh_dc
     gradient, colors = results[0]
-    found.add("ranks", RANKS)
-    found.check("ranks_that_differ", float(sum(not torch.equal(own[1], colors) for own in results)), 0.0)
-    found.check("gradient", _error(gradient, expected_gradient, torch.zeros(())), GRADIENT_BOUND)
-    found.check("colors", _error(colors, expected, start), COLORS_BOUND)
+    findings.add("ranks", RANKS)
+    findings.check("ranks_that_differ", float(sum(not torch.equal(own[1], colors) for own in results)), 0.0)
+    findings.check("gradient", _error(gradient, expected_gradient, torch.zeros(())), GRADIENT_BOUND)
+    findings.check("colors", _error(colors, expected, start), COLORS_BOUND)
 
 
 def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
@@ -83,6 +83,6 @@ def run_rank(rank: int, address: str, folder: str, sizes: Sizes) -> None:
         dist.destroy_process_group()
 
 
-def _error(found: Tensor, expected: Tensor, start: Tensor) -> float:
+def _error(actual: Tensor, expected: Tensor, start: Tensor) -> float:
     """Return the error relative to the distance between expected and initial value."""
-    return float((found.double() - expected.double()).norm() / (expected.double() - start.double()).norm())
+    return float((actual.double() - expected.double()).norm() / (expected.double() - start.double()).norm())

@@ -17,16 +17,16 @@ from sgsst_core.stylizing.stylizer import Stylizer
 _WARM = 2
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Measure all sizes; on a GPU in all precisions, the fastest first."""
     precisions: tuple[Precision, ...] = ("bfloat16", "float32", "tf32") if device().type == "cuda" else ("float32",)
     for width, height, gaussians in sizes.steps:
         scene = surface_scene(gaussians, degree=3)
         for precision in precisions:
-            _measure(sizes, scene, (width, height), precision, found)
+            _measure(sizes, scene, (width, height), precision, findings)
 
 
-def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Precision, found: Findings) -> None:
+def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Precision, findings: Findings) -> None:
     width, height = size
     place = f"{width}x{height}/{precision}"
     forget_peak(device())
@@ -50,14 +50,14 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     names = {name for record in records for name in record.parts}
     parts = {name: statistics.median(record.parts.get(name, 0.0) for record in records) for name in sorted(names)}
     prediction = stylizer.job.plan.prediction
-    found.add(f"{place}/gaussians", len(scene))
-    found.add(f"{place}/rasterizer", stylizer.job.plan.rasterizer)
-    found.add(f"{place}/precision", stylizer.job.plan.precision)
-    found.add(f"{place}/seconds", statistics.median(taken))
-    found.add(f"{place}/seconds_by_part", parts)
-    found.add(f"{place}/planned_seconds", prediction.seconds if prediction else None)
-    found.add(f"{place}/device_allocated_bytes", peak_bytes(device()))
-    found.add(f"{place}/device_reserved_bytes", reserved_bytes(device()))
-    found.add(f"{place}/planned_device_bytes", prediction.device_bytes if prediction else None)
-    found.add(f"{place}/process_peak_bytes", peak_memory())
-    found.add(f"{place}/planned_process_bytes", prediction.peak_bytes if prediction else None)
+    findings.add(f"{place}/gaussians", len(scene))
+    findings.add(f"{place}/rasterizer", stylizer.job.plan.rasterizer)
+    findings.add(f"{place}/precision", stylizer.job.plan.precision)
+    findings.add(f"{place}/seconds", statistics.median(taken))
+    findings.add(f"{place}/seconds_by_part", parts)
+    findings.add(f"{place}/planned_seconds", prediction.seconds if prediction else None)
+    findings.add(f"{place}/device_allocated_bytes", peak_bytes(device()))
+    findings.add(f"{place}/device_reserved_bytes", reserved_bytes(device()))
+    findings.add(f"{place}/planned_device_bytes", prediction.device_bytes if prediction else None)
+    findings.add(f"{place}/process_peak_bytes", peak_memory())
+    findings.add(f"{place}/planned_process_bytes", prediction.peak_bytes if prediction else None)

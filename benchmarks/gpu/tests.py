@@ -18,7 +18,7 @@ _FINE = (0, 5)
 _MISSING = ("ModuleNotFoundError", "the tests need VGG16")
 
 
-def run(sizes: Sizes, found: Findings) -> None:
+def run(sizes: Sizes, findings: Findings) -> None:
     """Run the tests, and add their outcomes to the findings.
 
     Raises:
@@ -35,9 +35,9 @@ def run(sizes: Sizes, found: Findings) -> None:
         outcomes = [outcome(case) for case in ElementTree.parse(path).iter("testcase")]
     for kind in ("passed", "failed", "skipped"):
         own = [(name, said) for name, what, said in outcomes if what == kind]
-        found.add(kind, len(own) if kind == "passed" else dict(own))
+        findings.add(kind, len(own) if kind == "passed" else dict(own))
     unexplained = ended.returncode not in _FINE and not any(what != "passed" for _, what, _ in outcomes)
-    found.check("tests_that_failed", float(sum(what == "failed" for _, what, _ in outcomes) + unexplained), 0.0)
+    findings.check("tests_that_failed", float(sum(what == "failed" for _, what, _ in outcomes) + unexplained), 0.0)
 
 
 def marked_files() -> list[Path]:

@@ -87,15 +87,15 @@ class Service:
             family = [psutil.Process(self._process.pid), *psutil.Process(self._process.pid).children(recursive=True)]
         except psutil.Error:
             return []
-        found = []
+        matching = []
         for process in family:
             try:
                 named = any(part.startswith(module) for part in process.cmdline())
                 if named and process.status() != psutil.STATUS_ZOMBIE:
-                    found.append(process)
+                    matching.append(process)
             except psutil.Error:
                 continue
-        return found
+        return matching
 
     def process(self, module: str) -> psutil.Process | None:
         """Return the first of `processes(module)`, or None if there is none."""
@@ -108,15 +108,15 @@ class Service:
 
     def survivors(self) -> list[psutil.Process]:
         """Return all running processes that the service has started, including those in other sessions."""
-        found = []
+        alive = []
         for process in psutil.process_iter():
             try:
                 mine = process.environ().get("SGSST_DATA") == str(self.data)
                 if mine and process.status() != psutil.STATUS_ZOMBIE:
-                    found.append(process)
+                    alive.append(process)
             except psutil.Error:
                 continue
-        return found
+        return alive
 
     def stop(self, number: int = signal.SIGTERM) -> None:
         """Stop the service with a signal, as a user or the system would."""
@@ -158,9 +158,9 @@ def check_documented(answer: httpx.Response) -> None:
         pattern = re.sub(r"\{[a-z_]+\}", "[^/]+", template.replace("{name}", "(?s:.+)"))
         if not re.fullmatch(pattern, path) or method not in operations:
             continue
-        found = operations[method]["responses"].get(str(answer.status_code))
-        assert found, f"{method} {template}: {answer.status_code} is not documented"
-        examples = found["content"][answer.headers["content-type"]]["examples"]
+        documented = operations[method]["responses"].get(str(answer.status_code))
+        assert documented, f"{method} {template}: {answer.status_code} is not documented"
+        examples = documented["content"][answer.headers["content-type"]]["examples"]
         code = answer.json()["code"]
         assert code in examples, f"{method} {template}: {answer.status_code} {code} is not documented"
 
@@ -171,8 +171,8 @@ def wait_for(
     """Return the first true value of a condition; fail after `PATIENCE` seconds."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
-        found = condition()
-        if found:
-            return found
+        value = condition()
+        if value:
+            return value
         time.sleep(every)
     raise AssertionError(f"waited in vain for {what}\n{said()}")

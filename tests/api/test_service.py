@@ -65,8 +65,8 @@ def short_job(files: dict[str, Path], service: Service) -> str:
     async def sent() -> Job:
         async with AsyncClient(service.url) as client:
             parameters: dict[str, Any] = PARAMETERS | {"steps_sos": 5}
-            made = await client.submit(files["scene"], files["style"], cameras=files["cameras"], **parameters)
-            return await client.wait(made.id)
+            submitted = await client.submit(files["scene"], files["style"], cameras=files["cameras"], **parameters)
+            return await client.wait(submitted.id)
 
     ended = asyncio.run(sent())
     assert ended.status == "succeeded", ended.error
@@ -83,17 +83,17 @@ def submit(client: httpx.Client, files: dict[str, Path], **parameters: Any) -> s
 
 
 def job(client: httpx.Client, job_id: str) -> dict[str, Any]:
-    found: dict[str, Any] = client.get(f"/v1/jobs/{job_id}").json()
-    return found
+    content: dict[str, Any] = client.get(f"/v1/jobs/{job_id}").json()
+    return content
 
 
 def wait_until(service: Service, client: httpx.Client, job_id: str, *statuses: str) -> dict[str, Any]:
     def there() -> dict[str, Any] | None:
-        found = job(client, job_id)
-        return found if found["status"] in statuses else None
+        current = job(client, job_id)
+        return current if current["status"] in statuses else None
 
-    found: dict[str, Any] = wait_for(there, f"{job_id} to be {statuses}", service.said)
-    return found
+    reached: dict[str, Any] = wait_for(there, f"{job_id} to be {statuses}", service.said)
+    return reached
 
 
 def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int, attempt: int = 1) -> None:
@@ -108,7 +108,7 @@ def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int
 def events(client: httpx.Client, job_id: str, after: int = 0) -> list[tuple[int, str, dict[str, Any]]]:
     """Return all events until the service closes the stream."""
     headers = {"Last-Event-ID": str(after)} if after else {}
-    found = []
+    received = []
     with client.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as stream:
         if stream.status_code == 204:
             return []
@@ -116,8 +116,8 @@ def events(client: httpx.Client, job_id: str, after: int = 0) -> list[tuple[int,
         for block in "".join(stream.iter_text()).split("\n\n"):
             fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
             if "data" in fields:
-                found.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
-    return found
+                received.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
+    return received
 
 
 def result(client: httpx.Client, job_id: str) -> bytes:
@@ -126,11 +126,11 @@ def result(client: httpx.Client, job_id: str) -> bytes:
 
 def check_colors(client: httpx.Client, job_id: str, scene: Path) -> None:
     """Check that the file of stylized colors contains those of the PLY, rounded to float16."""
-    found = np.frombuffer(client.get(f"/v1/jobs/{job_id}/artifacts/colors.f16").content, "<f2").reshape(-1, 3)
+    colors = np.frombuffer(client.get(f"/v1/jobs/{job_id}/artifacts/colors.f16").content, "<f2").reshape(-1, 3)
     stylized = PlyData.read(io.BytesIO(result(client, job_id)))["vertex"]
     exact = np.stack([stylized[f"f_dc_{channel}"] for channel in range(3)], 1).astype(np.float64)
-    assert np.abs(found - exact).max() <= max(2.0**-11 * np.abs(exact).max(), 2.0**-25)
-    assert len(found) == len(read_scene(scene).scene), "each belongs to a row of what was sent"
+    assert np.abs(colors - exact).max() <= max(2.0**-11 * np.abs(exact).max(), 2.0**-25)
+    assert len(colors) == len(read_scene(scene).scene), "each belongs to a row of what was sent"
 
 
 def check_course(client: httpx.Client, job_id: str, steps: list[int]) -> None:
@@ -156,9 +156,9 @@ def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], ex
         assert any(kind == "artifact" and str(what).startswith("previews/") for kind, what in kinds)
         last_step = max(number for number, (kind, _) in enumerate(kinds) if kind == "progress")
         assert kinds.index(("artifact", "log.txt")) < last_step, "the log can be read while the job runs"
-        told = [data for _, kind, data in seen if kind == "progress"]
-        steps = [data["step"] for data in told if data["stage"] != "planning"]  # steps of planning are views
-        assert all(0 <= data["step"] <= data["total"] == 3 for data in told if data["stage"] == "planning")
+        progress = [data for _, kind, data in seen if kind == "progress"]
+        steps = [data["step"] for data in progress if data["stage"] != "planning"]  # steps of planning are views
+        assert all(0 <= data["step"] <= data["total"] == 3 for data in progress if data["stage"] == "planning")
         assert all(datetime.fromisoformat(data["updated_at"]).tzinfo for _, kind, data in seen if kind == "progress")
         assert steps == sorted(steps)
         assert steps[-1] == STEPS
@@ -167,17 +167,17 @@ def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], ex
         assert events(client, job_id, after=seen[-1][0]) == []
 
         first = client.get(f"/v1/jobs/{job_id}")
-        found = first.json()
-        assert (found["status"], found["name"], found["attempt"]) == ("succeeded", "my wall", 1)
-        assert found["progress"]["fraction"] == 1
-        assert found["result"]["loss_after"] < found["result"]["loss_before"]
+        shown_job = first.json()
+        assert (shown_job["status"], shown_job["name"], shown_job["attempt"]) == ("succeeded", "my wall", 1)
+        assert shown_job["progress"]["fraction"] == 1
+        assert shown_job["result"]["loss_after"] < shown_job["result"]["loss_before"]
         same = client.get(f"/v1/jobs/{job_id}", headers={"If-None-Match": first.headers["etag"]})
         assert (same.status_code, same.content) == (304, b"")
         listed = client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]
         names = {entry["name"] for entry in listed}
         assert {"stylized.ply", "plan.json", "report.json", "report.html", "log.txt"} <= names
         assert not any(name.startswith(".") for name in names)
-        assert found["preview"] == max(name for name in names if name.startswith("previews/"))
+        assert shown_job["preview"] == max(name for name in names if name.startswith("previews/"))
         check_colors(client, job_id, files["scene"])
         check_course(client, job_id, steps)
         for entry in listed:
@@ -240,8 +240,8 @@ def test_compressed_scene_and_results_in_other_formats(
             suggested = f'attachment; filename="{scene.stem}_style-stylized.{form}"'
             assert first.headers["content-disposition"].startswith(suggested)
             assert first.headers["content-type"] == by_name(form).media_type
-            found = read(tmp_path, first.content)
-            assert (found.format, len(found.scene)) == (form, len(ply.scene))
+            result = read(tmp_path, first.content)
+            assert (result.format, len(result.scene)) == (form, len(ply.scene))
             again = client.get(where, params={"format": form}, headers={"If-None-Match": first.headers["etag"]})
             assert again.status_code == 304, "it is kept"
             assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.{form}").content == first.content
@@ -293,8 +293,8 @@ def test_retried_job_resumes_from_checkpoint(service: Service, files: dict[str, 
         wait_for_step(service, client, job_id, 10)
         assert client.post(f"/v1/jobs/{job_id}/cancel").json()["status"] == "canceling"
         assert client.delete(f"/v1/jobs/{job_id}").status_code == 409
-        found = wait_until(service, client, job_id, "canceled")
-        assert found["attempts"][0]["outcome"] == "canceled"
+        canceled = wait_until(service, client, job_id, "canceled")
+        assert canceled["attempts"][0]["outcome"] == "canceled"
         assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").status_code == 404
         assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
         assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 202
@@ -334,9 +334,9 @@ def test_jobs_survive_killed_processes(service: Service, files: dict[str, Path],
         wait_for(service.ready, "the API", service.said)
         service.kill("service.scheduling.dispatcher")
         wait_for_step(service, client, job_id, 20, attempt=3)
-        found = wait_until(service, client, job_id, "succeeded", "failed")
-        assert [attempt["outcome"] for attempt in found["attempts"]] == ["failed", "lost", "succeeded"]
-        assert found["attempts"][0]["error"]["code"] == "crashed"
+        ended = wait_until(service, client, job_id, "succeeded", "failed")
+        assert [attempt["outcome"] for attempt in ended["attempts"]] == ["failed", "lost", "succeeded"]
+        assert ended["attempts"][0]["error"]["code"] == "crashed"
         assert result(client, job_id) == expected
         places = list((service.data / "artifacts" / job_id).rglob("stylized.ply"))
         assert len(places) == 1, "published twice"
@@ -349,8 +349,8 @@ def test_restart_resumes_running_jobs(files: dict[str, Path], expected: bytes, t
         wait_for_step(service, client, job_id, 10)
         service.stop(signal.SIGINT)
         service.start()
-        found = wait_until(service, client, job_id, "succeeded")
-        assert [attempt["outcome"] for attempt in found["attempts"]] == ["released", "succeeded"]
+        ended = wait_until(service, client, job_id, "succeeded")
+        assert [attempt["outcome"] for attempt in ended["attempts"]] == ["released", "succeeded"]
         assert result(client, job_id) == expected
     assert service.process("service.scheduling.dispatcher") is None
     assert not any((tmp_path / "data" / "work").iterdir())
@@ -360,10 +360,10 @@ def test_restart_resumes_running_jobs(files: dict[str, Path], expected: bytes, t
 def test_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
         job_id = submit(client, files, workers=2, steps_sos=4)
-        found = wait_until(service, client, job_id, "succeeded", "failed")
+        ended = wait_until(service, client, job_id, "succeeded", "failed")
         log = client.get(f"/v1/jobs/{job_id}/artifacts/log.txt").text
-        assert found["status"] == "succeeded", log
-        assert found["result"]["steps"] == 4
+        assert ended["status"] == "succeeded", log
+        assert ended["result"]["steps"] == 4
 
 
 @pytest.mark.slow
@@ -440,15 +440,15 @@ def test_client_commands(service: Service, files: dict[str, Path], expected: byt
     assert sgsst("status", "job_00000000000000000000").returncode == 3
 
     with Client(service.url) as client:
-        found = client.wait(
+        ended = client.wait(
             client.submit(
                 *[files[name] for name in ("scene", "style")], orbit=2, resolution=32, preset="preview", steps_sos=1
             ).id
         )
-        assert found.status == "succeeded", found.error
+        assert ended.status == "succeeded", ended.error
         part = tmp_path / "result.ply.part"
         part.write_bytes(b"an older download of something else")
-        client.download(found.id, tmp_path / "result.ply")
+        client.download(ended.id, tmp_path / "result.ply")
         assert (tmp_path / "result.ply").read_bytes()[:3] == b"ply"
 
 

@@ -72,8 +72,8 @@ def test_damaged_weights_block_jobs(cache: Path, tmp_path: Path) -> None:
             assert refused.json()["code"] == "weights-damaged"
             assert int(refused.headers["retry-after"]) > 0
             check_documented(refused)
-        found = client.get(job).json()
-        assert (found["status"], found["attempt"]) == ("queued", 0)
+        state = client.get(job).json()
+        assert (state["status"], state["attempt"]) == ("queued", 0)
         os.replace(sound, weights)
         wait_for(lambda: client.get("/readyz").status_code == 200, "the service to be ready", service.said)
         wait_for(lambda: client.get(job).json()["status"] == "succeeded", "the job to succeed", service.said)

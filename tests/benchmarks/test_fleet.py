@@ -30,15 +30,15 @@ def test_demand_matches_load_and_is_reproducible() -> None:
 
 
 def test_small_fleet_serves_its_demand_reproducibly() -> None:
-    found = simulate(Demand(16, load=0.8, keys=20), hours=0.5, host_days=1000, seed=1)
-    assert found["jobs"] == found["attempts"] == round(200_000 * 0.016 / 48)
-    assert found["ended"] > 0.7 * found["jobs"]
-    assert 0.4 < found["utilization"] <= 1
-    assert found["starved"] == found["host_failures"] == found["lost_gpu_hours"] == 0
+    measured = simulate(Demand(16, load=0.8, keys=20), hours=0.5, host_days=1000, seed=1)
+    assert measured["jobs"] == measured["attempts"] == round(200_000 * 0.016 / 48)
+    assert measured["ended"] > 0.7 * measured["jobs"]
+    assert 0.4 < measured["utilization"] <= 1
+    assert measured["starved"] == measured["host_failures"] == measured["lost_gpu_hours"] == 0
     again = simulate(Demand(16, load=0.8, keys=20), hours=0.5, host_days=1000, seed=1)
-    for figures in (found, again):
+    for figures in (measured, again):
         del figures["simulated_in_seconds"]
-    assert again == found
+    assert again == measured
 
 
 def test_failing_hosts_lose_time_but_no_jobs(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def test_vgg19_takes_0_72_million_operations_per_pixel_and_pass() -> None:
 def test_activations_beyond_memory_are_recomputed(monkeypatch: pytest.MonkeyPatch) -> None:
     loss = make_loss("float32")
     passes = Passes(loss, SMALL.size, [0])
-    passes.kept = [False]
+    passes.cached = [False]
     forward, backward = passes.network()
     assert sum(work.operations for work in backward) == 2 * sum(work.operations for work in forward)
 
@@ -76,25 +76,25 @@ def test_device_and_host_times_overlap() -> None:
         "a": Part([Work(0, 4.8e12 * shares.bandwidth)] * 3),
         "b": Part([Work(0, 4.8e12 * shares.bandwidth)], 0.5, 100),
     }
-    found = step_seconds(parts, shares, "float32", LAUNCHES)
-    assert (found["a"], found["b"], found["total"]) == pytest.approx((3.0, 0.5, 3.5))
-    assert found["host"] == pytest.approx(shares.launch * (LAUNCHES + 50))
+    seconds = step_seconds(parts, shares, "float32", LAUNCHES)
+    assert (seconds["a"], seconds["b"], seconds["total"]) == pytest.approx((3.0, 0.5, 3.5))
+    assert seconds["host"] == pytest.approx(shares.launch * (LAUNCHES + 50))
     assert step_seconds(parts, shares, "float32", 10**9)["total"] == pytest.approx(1e9 * shares.launch, rel=1e-6)
 
 
 def test_cached_values_are_not_recomputed() -> None:
-    everything = forecast.kept_shares(SMALL, make_loss("float32"), coarse=False)
+    everything = forecast.cached_fractions(SMALL, make_loss("float32"), coarse=False)
     assert everything == {"content": 1.0, "lists": 1.0, "colors": 1.0}
-    garden = forecast.kept_shares(JOBS["5187x3361"], make_loss("float32"), coarse=False)
+    garden = forecast.cached_fractions(JOBS["5187x3361"], make_loss("float32"), coarse=False)
     assert all(0 < share < 1 for share in garden.values())
     parts = forecast.step_parts(SMALL, "bfloat16")
     assert [parts[name].visits for name in parts if name.endswith("recomputed")] == [0.0] * 3
 
 
 def test_forecast_range_contains_likely_value() -> None:
-    found = forecast.forecast(SMALL, "tf32", LAUNCHES)
+    result = forecast.forecast(SMALL, "tf32", LAUNCHES)
     for kind in ("sos", "coarse"):
-        low, mid, high = (found[kind][name]["total"] for name in ("optimistic", "likely", "pessimistic"))
+        low, mid, high = (result[kind][name]["total"] for name in ("optimistic", "likely", "pessimistic"))
         assert 0 < low < mid < high
-    assert found["coarse"]["likely"]["total"] <= found["sos"]["likely"]["total"]
-    assert "| **a step** |" in forecast.table({"tf32": found})
+    assert result["coarse"]["likely"]["total"] <= result["sos"]["likely"]["total"]
+    assert "| **a step** |" in forecast.table({"tf32": result})

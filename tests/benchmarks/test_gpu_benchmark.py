@@ -26,11 +26,11 @@ def test_all_parts_together_take_less_than_nine_minutes() -> None:
 
 
 def test_findings_are_printed_at_once(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    found = Findings(tmp_path / "findings.json")
-    found.add("a/b", {"c": 0.5})
+    findings = Findings(tmp_path / "findings.json")
+    findings.add("a/b", {"c": 0.5})
     assert capfd.readouterr().out.split() == ["a/b/c", "0.5"]
-    found.check("off", 2.0, 1.0)
-    assert found.broken == ["off: 2 exceeds 1"]
+    findings.check("off", 2.0, 1.0)
+    assert findings.broken == ["off: 2 exceeds 1"]
 
 
 def benchmark(folder: Path, *options: str) -> tuple[int, dict[str, Any]]:
@@ -52,35 +52,35 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     assert status == 0
     assert written["quick"]
     assert {"date", "machine", "device", "torch"} <= set(written)
-    found = {name: part["found"] for name, part in parts.items()}
-    assert {"torch", "triton", "copy", "matrix_product"} <= set(found["identity"])
-    assert all(check["passed"] for check in found["poison"]["small"].values())
-    assert len(found["poison"]["small"]) == 7
-    assert all(found["parity"]["triton"][name]["passed"] for name in ("image", "coverage", "gradient"))
-    assert found["parity"]["triton"]["different_of_2_repeats"]["error"] == 0
+    findings = {name: part["findings"] for name, part in parts.items()}
+    assert {"torch", "triton", "copy", "matrix_product"} <= set(findings["identity"])
+    assert all(check["passed"] for check in findings["poison"]["small"].values())
+    assert len(findings["poison"]["small"]) == 7
+    assert all(findings["parity"]["triton"][name]["passed"] for name in ("image", "coverage", "gradient"))
+    assert findings["parity"]["triton"]["different_of_2_repeats"]["error"] == 0
     for place, name in (("step", "render"), ("step", "slot_gradients"), ("cached_weights", "apply_pieces")):
-        assert min(found["kernels"][place][name].values()) > 0
-        assert found["kernels"]["first_launch_seconds"][name] > 0
-    rates = found["convolutions"]["conv1_1"]["bfloat16"]["forward"]
+        assert min(findings["kernels"][place][name].values()) > 0
+        assert findings["kernels"]["first_launch_seconds"][name] > 0
+    rates = findings["convolutions"]["conv1_1"]["bfloat16"]["forward"]
     assert set(rates) == {"channels_last", "channels_last_searched", "planes", "planes_searched"}
     assert min(rates.values()) > 0
     for count in ("60", "120"):
-        entry = found["raster"][count]
+        entry = findings["raster"][count]
         assert PASSES | {"survey_seconds_a_view", "lists_seconds", "lists_bytes", "pairs"} <= set(entry)
         assert PASSES | {"first_render_seconds", "bytes"} <= set(entry["cached_weights"])
         assert entry["spherical_harmonics"]["seconds"] > 0
     for precision in ("float32", "bfloat16"):
-        assert found["network"][precision]["both"]["tflops"] > 0
+        assert findings["network"][precision]["both"]["tflops"] > 0
     for view in ("32x32", "48x32"):
-        entry = found["step"][view]["float32"]
+        entry = findings["step"][view]["float32"]
         assert entry["rasterizer"] == "triton"
         assert {"vgg_forward", "vgg_backward", "render", "raster_backward"} <= set(entry["seconds_by_part"])
         assert entry["planned_process_bytes"] > 0
         assert entry["planned_device_bytes"] is None
-    assert len(found["curve"]["losses"]) == len(found["curve"]["losses_on_the_cpu"]) == 4
-    assert found["curve"]["loss"]["passed"]
-    assert found["ranks"]["colors"]["passed"]
-    assert found["tests"]["failed"] == {}
+    assert len(findings["curve"]["losses"]) == len(findings["curve"]["losses_on_the_cpu"]) == 4
+    assert findings["curve"]["loss"]["passed"]
+    assert findings["ranks"]["colors"]["passed"]
+    assert findings["tests"]["failed"] == {}
 
 
 def test_failed_part_reports_reason_and_others_continue(tmp_path: Path) -> None:
@@ -88,5 +88,5 @@ def test_failed_part_reports_reason_and_others_continue(tmp_path: Path) -> None:
     assert status == 1
     assert written["parts"]["raster"]["status"] == "failed"
     assert "ZeroDivisionError" in written["parts"]["raster"]["reason"]
-    assert written["parts"]["raster"]["found"]["view"] == [48, 32]
+    assert written["parts"]["raster"]["findings"]["view"] == [48, 32]
     assert written["parts"]["network"]["status"] == "succeeded"

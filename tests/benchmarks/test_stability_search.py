@@ -22,9 +22,9 @@ def test_job_number_determines_job() -> None:
 
 
 def test_search_counts_outcomes() -> None:
-    ended, found = search(0.0, 3)
+    ended, failures = search(0.0, 3)
     assert sum(ended.values()) == 1
-    assert not found
+    assert not failures
 
 
 @pytest.mark.parametrize(

@@ -121,12 +121,12 @@ class Containers:
 def _pip(*names: str) -> list[str]:
     """Return the values of the given pip settings on this machine."""
     listed = subprocess.run([sys.executable, "-m", "pip", "config", "list"], capture_output=True, text=True).stdout
-    found = []
+    options = []
     for line in listed.splitlines():
         name, _, value = line.partition("=")
         if name.rpartition(".")[2] in names:
-            found += value.strip("'\"").replace("\\n", " ").split()
-    return found
+            options += value.strip("'\"").replace("\\n", " ").split()
+    return options
 
 
 def _package_sources() -> list[str]:
@@ -151,13 +151,15 @@ def containers() -> Iterator[Containers]:
         pytest.skip(reason)
     storage = os.environ.get("SGSST_TEST_CONTAINERS") or str(Path.home() / ".cache" / "sgsst-containers")
     with tempfile.TemporaryDirectory(prefix="sgsst-containers-") as folder:
-        made = Containers(Path(storage), Path(folder))
+        started = Containers(Path(storage), Path(folder))
         try:
-            made.provide(BASE)
-            made.build("docker.io/library/sgsst:cpu", "cpu")
-            made.provide(DATABASE, "postgres")
-            made.provide(STORE, "store")
-            yield made
+            started.provide(BASE)
+            started.build("docker.io/library/sgsst:cpu", "cpu")
+            started.provide(DATABASE, "postgres")
+            started.provide(STORE, "store")
+            yield started
         finally:
-            made.run("podman", "volume", "prune", "--force", check=False)  # unnamed volumes of the images' own folders
-            made.run("umount", str(Path(storage, "overlay")), check=False)
+            started.run(
+                "podman", "volume", "prune", "--force", check=False
+            )  # unnamed volumes of the images' own folders
+            started.run("umount", str(Path(storage, "overlay")), check=False)

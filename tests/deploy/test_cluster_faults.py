@@ -40,11 +40,11 @@ def test_host_faults_lose_no_job(folder: Path, vgg16_weights: BackboneWeights) -
         pytest.skip(reason)
     before = networks()
     kinds = ("kill-node", "cut-dispatcher", "restart-database")
-    found = cluster_faults.measure(folder, kinds, len(kinds))
-    assert found["faults"] == len(kinds)
-    assert found["jobs_accepted"] >= len(kinds)
-    assert (found["lost"], found["not_succeeded"]) == (0, [])
-    assert (found["published_twice"], found["different"]) == (0, 0)
-    assert not any(found["left_on_hosts"].values())
-    assert found["left_in_store"] == []
+    result = cluster_faults.measure(folder, kinds, len(kinds))
+    assert result["faults"] == len(kinds)
+    assert result["jobs_accepted"] >= len(kinds)
+    assert (result["lost"], result["not_succeeded"]) == (0, [])
+    assert (result["published_twice"], result["different"]) == (0, 0)
+    assert not any(result["left_on_hosts"].values())
+    assert result["left_in_store"] == []
     assert networks() == before

@@ -31,8 +31,8 @@ OPTIONS = {"steps_coarse": 0, "backbone": "vgg16", "compute_everything": True, "
 
 @pytest.fixture(scope="module")
 def podman() -> Iterator[Containers]:
-    with containers() as made:
-        yield made
+    with containers() as started:
+        yield started
 
 
 class Composed:
@@ -105,19 +105,19 @@ def composed(podman: Containers, tiny_cache: Path, tmp_path_factory: pytest.Temp
     weights = tmp_path_factory.mktemp("weights")
     shutil.copytree(tiny_cache, weights, dirs_exist_ok=True)
     weights.chmod(0o777)  # compiled kernels are cached there too
-    made = Composed(podman, weights)
-    made.compose("down", "--volumes")
+    started = Composed(podman, weights)
+    started.compose("down", "--volumes")
     try:
-        made.compose("up", "--detach", "--no-build", "api", "dispatcher", "setup")
+        started.compose("up", "--detach", "--no-build", "api", "dispatcher", "setup")
         time.sleep(3)  # the services that they need do not run yet
-        made.compose("up", "--detach", "--no-build")
-        wait_for(lambda: made.health().get("status") == "ok", "the composed service", made.said)
-        made.key = json.loads(
-            podman.run("podman", "exec", made.name("api"), "sgsst", "keys", "create", "alice", "--json")
+        started.compose("up", "--detach", "--no-build")
+        wait_for(lambda: started.health().get("status") == "ok", "the composed service", started.said)
+        started.key = json.loads(
+            podman.run("podman", "exec", started.name("api"), "sgsst", "keys", "create", "alice", "--json")
         )["key"]
-        yield made
+        yield started
     finally:
-        made.compose("down", "--volumes")
+        started.compose("down", "--volumes")
     assert PROJECT not in podman.run("podman", "ps", "--all", "--format", "{{.Names}}")
     assert PROJECT not in podman.run("podman", "volume", "ls", "--format", "{{.Name}}")
     assert PROJECT not in podman.run("podman", "network", "ls", "--format", "{{.Name}}")

@@ -50,20 +50,20 @@ def build(folder: Path) -> str:
 
 
 def objects(overlay: str) -> list[dict[str, Any]]:
-    return [found for found in yaml.safe_load_all(rendered(overlay)) if found]
+    return [document for document in yaml.safe_load_all(rendered(overlay)) if document]
 
 
 def of_kind(overlay: str, kind: str) -> list[dict[str, Any]]:
-    return [found for found in objects(overlay) if found["kind"] == kind]
+    return [each for each in objects(overlay) if each["kind"] == kind]
 
 
 def pods(overlay: str) -> list[dict[str, Any]]:
     """Return the templates of all pods of an overlay."""
-    found = [each["spec"]["template"] for each in objects(overlay) if each["kind"] in ("Deployment", "Job")]
+    templates = [each["spec"]["template"] for each in objects(overlay) if each["kind"] in ("Deployment", "Job")]
     for cluster in of_kind(overlay, "RayCluster"):
-        found.append(cluster["spec"]["headGroupSpec"]["template"])
-        found += [group["template"] for group in cluster["spec"]["workerGroupSpecs"]]
-    return found
+        templates.append(cluster["spec"]["headGroupSpec"]["template"])
+        templates += [group["template"] for group in cluster["spec"]["workerGroupSpecs"]]
+    return templates
 
 
 def containers(overlay: str) -> list[dict[str, Any]]:
@@ -80,11 +80,11 @@ def test_manifests_match_their_schemas(overlay: str) -> None:
     cluster_schema = json.loads(gzip.decompress(SCHEMA.read_bytes()))
     # the schema is that of a custom resource; Kubernetes adds the members common to all objects
     cluster_schema["properties"] |= {name: {} for name in ("apiVersion", "kind", "metadata")}
-    for found in objects(overlay):
-        if found["kind"] == "RayCluster":
-            jsonschema.validate(found, cluster_schema)
+    for manifest in objects(overlay):
+        if manifest["kind"] == "RayCluster":
+            jsonschema.validate(manifest, cluster_schema)
         else:
-            validate.validate(found, validate.latest_version(), strict=True)
+            validate.validate(manifest, validate.latest_version(), strict=True)
 
 
 @each_overlay
@@ -148,15 +148,15 @@ def policies_of(overlay: str) -> dict[str, dict[str, Any]]:
 def selected(overlay: str, policy: str) -> set[str]:
     """Return the names of the pods that a network policy selects."""
     selector = policies_of(overlay)[policy]["podSelector"]
-    found = set()
+    names = set()
     for labels in (pod["metadata"]["labels"] for pod in pods(overlay)):
         wanted = selector.get("matchLabels", {}).items() <= labels.items()
         for each in selector.get("matchExpressions", ()):
             assert each["operator"] == "In"
             wanted = wanted and labels.get(each["key"]) in each["values"]
         if wanted:
-            found.add(labels["app.kubernetes.io/name"])
-    return found
+            names.add(labels["app.kubernetes.io/name"])
+    return names
 
 
 @each_overlay
@@ -207,10 +207,10 @@ def test_webhooks_are_an_optional_component(tmp_path: Path) -> None:
     """The component enables webhooks and lets dispatchers reach all ports of public addresses, but no private ones."""
     for overlay in OVERLAYS:
         assert "SGSST_WEBHOOKS" not in rendered(overlay)
-    found = changed(tmp_path, lambda overlay: overlay["components"].append("../../components/webhooks"))
-    (settings,) = [each for each in found if each["kind"] == "ConfigMap"]
+    manifests = changed(tmp_path, lambda overlay: overlay["components"].append("../../components/webhooks"))
+    (settings,) = [each for each in manifests if each["kind"] == "ConfigMap"]
     assert settings["data"]["SGSST_WEBHOOKS"] == "true"
-    (policy,) = [each for each in found if each["metadata"]["name"] == "sgsst-webhooks"]
+    (policy,) = [each for each in manifests if each["metadata"]["name"] == "sgsst-webhooks"]
     assert policy["spec"]["podSelector"]["matchLabels"] == {"app.kubernetes.io/name": "sgsst-dispatcher"}
     (way,) = policy["spec"]["egress"]
     blocks = [each["ipBlock"] for each in way["to"]]
@@ -223,9 +223,9 @@ def test_webhooks_are_an_optional_component(tmp_path: Path) -> None:
 
 
 def _holds(block: dict[str, Any], address: str) -> bool:
-    found = ip_address(address)
+    parsed = ip_address(address)
     networks = [ip_network(block["cidr"]), *map(ip_network, block.get("except", ()))]
-    return found in networks[0] and not any(found in network for network in networks[1:])
+    return parsed in networks[0] and not any(parsed in network for network in networks[1:])
 
 
 def test_images_can_be_pinned_by_digest(tmp_path: Path) -> None:
@@ -236,8 +236,8 @@ def test_images_can_be_pinned_by_digest(tmp_path: Path) -> None:
             del image["newTag"]
             image["digest"] = digest
 
-    found = changed(tmp_path, pin)
-    images = re.findall(r"image: (\S+)", yaml.safe_dump_all(found))
+    manifests = changed(tmp_path, pin)
+    images = re.findall(r"image: (\S+)", yaml.safe_dump_all(manifests))
     assert len(images) >= 8
     assert {image.partition("@")[2] for image in images} == {digest}
 
@@ -249,7 +249,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[dict
     kustomization = yaml.safe_load((overlay / "kustomization.yaml").read_text())
     change(kustomization)
     (overlay / "kustomization.yaml").write_text(yaml.safe_dump(kustomization))
-    return [found for found in yaml.safe_load_all(build(overlay)) if found]
+    return [document for document in yaml.safe_load_all(build(overlay)) if document]
 
 
 @each_overlay

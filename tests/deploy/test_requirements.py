@@ -20,14 +20,14 @@ IMAGE |= {"platform_machine": "x86_64", "implementation_name": "cpython", "platf
 
 def packages(file: str) -> dict[str, str]:
     """Return the versions in a lock file by package; fail on packages without digests and on any other content."""
-    found: dict[str, str] = {}
+    versions: dict[str, str] = {}
     for line in (FOLDER / f"{file}.txt").read_text().replace(" \\\n", "").splitlines():
         if line.startswith("#"):
             continue
         matched = re.fullmatch(r"([\w.-]+)==(\S+)(?: ; .*?)?((?:\s+--hash=sha256:[0-9a-f]{64})+)", line)
         assert matched is not None, f"{file}.txt: {line[:100]}"
-        found[canonicalize_name(matched[1])] = matched[2]
-    return found
+        versions[canonicalize_name(matched[1])] = matched[2]
+    return versions
 
 
 def constraints() -> dict[str, str]:
@@ -39,9 +39,9 @@ def constraints() -> dict[str, str]:
 @pytest.mark.parametrize("file", FILES)
 def test_pinned_versions_equal_the_tested_ones(file: str) -> None:
     tested = constraints()
-    found = packages(file)
-    assert found
-    for name, version in found.items():
+    pinned = packages(file)
+    assert pinned
+    for name, version in pinned.items():
         assert tested.get(name) == version.partition("+")[0], f"{name}: run deploy/lock.py"
 
 

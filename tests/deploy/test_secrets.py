@@ -62,15 +62,15 @@ def test_given_password_takes_precedence(folder: Path) -> None:
 
 def test_secret_files_have_the_expected_formats(folder: Path) -> None:
     make_secrets(folder, {})
-    found = read(folder)
+    secrets = read(folder)
     for name in ("database/pgpass", "store/credentials"):
         assert stat.S_IMODE((folder / name).stat().st_mode) == 0o600, "libpq refuses one that others can read"
     credentials = configparser.RawConfigParser()
     credentials.read(folder / "store" / "credentials")
-    assert credentials["default"]["aws_access_key_id"] == found["store/key"]
-    assert credentials["default"]["aws_secret_access_key"] == found["store/secret"]
+    assert credentials["default"]["aws_access_key_id"] == secrets["store/key"]
+    assert credentials["default"]["aws_secret_access_key"] == secrets["store/secret"]
     (identity,) = json.loads((folder / "store" / "s3.json").read_text())["identities"]
-    assert identity["credentials"] == [{"accessKey": found["store/key"], "secretKey": found["store/secret"]}]
+    assert identity["credentials"] == [{"accessKey": secrets["store/key"], "secretKey": secrets["store/secret"]}]
 
 
 def test_compose_file_contains_no_password() -> None:

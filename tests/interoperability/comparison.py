@@ -26,20 +26,20 @@ def run_script(modules: Path, name: str, *arguments: str | Path | int) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def matched(found: Scene, expected: Scene) -> Scene:
+def matched(actual: Scene, expected: Scene) -> Scene:
     """Return the Gaussians of `found` in the order of `expected`, by position."""
-    assert len(found) == len(expected)
-    _, rows = cKDTree(found.means.numpy()).query(expected.means.numpy())
+    assert len(actual) == len(expected)
+    _, rows = cKDTree(actual.means.numpy()).query(expected.means.numpy())
     assert len(np.unique(rows)) == len(expected)
-    return found.subset(torch.from_numpy(rows))
+    return actual.subset(torch.from_numpy(rows))
 
 
-def assert_same(found: Scene, expected: Scene, tolerance: float = 1e-4, opacities: float = OPACITIES) -> None:
+def assert_same(actual: Scene, expected: Scene, tolerance: float = 1e-4, opacities: float = OPACITIES) -> None:
     """Assert that every value of every Gaussian is the same, up to the sign of quaternions."""
-    found = matched(found, expected)
-    assert found.sh_degree == expected.sh_degree
+    actual = matched(actual, expected)
+    assert actual.sh_degree == expected.sh_degree
     for name in TENSORS:
-        one, other = (held(getattr(each, name)).double() for each in (found, expected))
+        one, other = (held(getattr(each, name)).double() for each in (actual, expected))
         if name == "opacities":
             one, other = one.sigmoid(), other.sigmoid()
         if name == "quats":

@@ -82,11 +82,11 @@ def test_glb_matches_splat_transform(modules: Path, scene: Scene, tmp_path: Path
     write_scene(ply, unit)
     write_scene(ours, unit, by_name("glb"))
     splat_transform(modules, ply, theirs)
-    found, expected = (attributes_of(path) for path in (ours, theirs))
-    assert found.keys() == expected.keys()
+    actual, expected = (attributes_of(path) for path in (ours, theirs))
+    assert actual.keys() == expected.keys()
     for name, values in expected.items():
         tolerance = 1 if name == "COLOR_0" else 2e-7
-        np.testing.assert_allclose(found[name].astype(float), values.astype(float), rtol=2e-7, atol=tolerance)
+        np.testing.assert_allclose(actual[name].astype(float), values.astype(float), rtol=2e-7, atol=tolerance)
     assert_same(read_scene(theirs).scene, scene, 1e-6)
 
 
@@ -112,14 +112,14 @@ def test_ksplat_of_reference_writer_is_read(modules: Path, scene: Scene, tmp_pat
     write_scene(ply, within)
     run_script(modules, "ksplat.mjs", ply, theirs, level, 2)
     splat_transform(modules, theirs, back)
-    found = read_scene(theirs).scene
-    assert_same(found, read_scene(back).scene, 1e-6)
+    loaded = read_scene(theirs).scene
+    assert_same(loaded, read_scene(back).scene, 1e-6)
     # colors and opacities are rounded down to 8 bits
-    found = matched(found, within)
-    assert float((found.sh_dc - within.sh_dc).abs().max()) <= 1.01 / 255 / 0.282
-    rounded = replace(found, sh_dc=within.sh_dc)
+    loaded = matched(loaded, within)
+    assert float((loaded.sh_dc - within.sh_dc).abs().max()) <= 1.01 / 255 / 0.282
+    rounded = replace(loaded, sh_dc=within.sh_dc)
     if level == 2:
-        assert float((held(found.sh_rest) - held(within.sh_rest)).abs().max()) <= 1.51 / 255 * 2
+        assert float((held(loaded.sh_rest) - held(within.sh_rest)).abs().max()) <= 1.51 / 255 * 2
         rounded = replace(rounded, sh_rest=within.sh_rest)
     assert_same(rounded, within, 4e-3, opacities=1.01 / 255)
 
@@ -129,14 +129,14 @@ def attributes_of(path: Path) -> dict[str, np.ndarray]:
     data = path.read_bytes()
     size = struct.unpack_from("<I", data, 12)[0]
     document = json.loads(data[20 : 20 + size])
-    found = {}
+    attributes = {}
     for name, index in document["meshes"][0]["primitives"][0]["attributes"].items():
         entry = document["accessors"][index]
         view = document["bufferViews"][entry["bufferView"]]
         kind = np.dtype({5126: "<f4", 5121: "u1"}[entry["componentType"]])
         count = view["byteLength"] // kind.itemsize
-        found[name] = np.frombuffer(data, kind, count, 28 + size + view["byteOffset"])
-    return found
+        attributes[name] = np.frombuffer(data, kind, count, 28 + size + view["byteOffset"])
+    return attributes
 
 
 @pytest.mark.parametrize("name", ["ply", "compressed.ply", "spz", "v4.spz", "sog"])
@@ -153,11 +153,11 @@ def test_gaussforge_reads_written_scenes(scene: Scene, tmp_path: Path, name: str
         "rotations": expected.quats,
     }
     for key, values in names.items():
-        found = torch.tensor(np.frombuffer(answer["data"][key], np.float32).reshape(values.shape).copy())
+        actual = torch.tensor(np.frombuffer(answer["data"][key], np.float32).reshape(values.shape).copy())
         if key == "rotations":  # q and -q are the same rotation
-            found, values = (torch.nn.functional.normalize(each, dim=1) for each in (found, values))
-            values = values * (found * values).sum(dim=1, keepdim=True).sign()
-        torch.testing.assert_close(found, values, rtol=1e-5, atol=1e-5, msg=key)
+            actual, values = (torch.nn.functional.normalize(each, dim=1) for each in (actual, values))
+            values = values * (actual * values).sum(dim=1, keepdim=True).sign()
+        torch.testing.assert_close(actual, values, rtol=1e-5, atol=1e-5, msg=key)
 
 
 def test_every_result_format_is_tested() -> None:

@@ -70,11 +70,11 @@ def test_spark_reads_written_scenes(modules: Path, full_scene: Scene, tmp_path: 
     write_scene(ours, full_scene, by_name(name))
     run_script(modules, "spark.mjs", ours, theirs)
     expected = read_scene(ours).scene
-    found = matched(read_scene(theirs).scene, expected)
-    assert_same(replace(found, sh_rest=expected.sh_rest), expected, 4e-3)
+    loaded = matched(read_scene(theirs).scene, expected)
+    assert_same(replace(loaded, sh_rest=expected.sh_rest), expected, 4e-3)
     values = held(expected.sh_rest)
     limit = values.abs().amax(dim=2, keepdim=True).log2().floor().exp2()
-    error = (held(found.sh_rest) - values.clamp(-limit, limit)).abs() - limit * 0.51 / 255
+    error = (held(loaded.sh_rest) - values.clamp(-limit, limit)).abs() - limit * 0.51 / 255
     assert float(error.max()) <= VALUES.get(name, 0)
 
 
@@ -84,9 +84,9 @@ def test_gsplat_js_reads_ply(modules: Path, scene: Scene, tmp_path: Path) -> Non
     within = replace(scene, sh_dc=scene.sh_dc.clamp(-1.7, 1.7), opacities=scene.opacities.clamp(-5, 5))
     write_scene(ours, within)
     run_script(modules, "gsplat_js.mjs", ours, theirs)
-    found = matched(read_scene(theirs).scene, within)
-    assert float((found.sh_dc - within.sh_dc).abs().max()) <= 0.51 / 255 / 0.282
-    assert_same(replace(found, sh_dc=within.sh_dc, sh_rest=within.sh_rest), within, 0.01, opacities=0.51 / 255)
+    loaded = matched(read_scene(theirs).scene, within)
+    assert float((loaded.sh_dc - within.sh_dc).abs().max()) <= 0.51 / 255 / 0.282
+    assert_same(replace(loaded, sh_dc=within.sh_dc, sh_rest=within.sh_rest), within, 0.01, opacities=0.51 / 255)
 
 
 def test_babylon_reads_glb(modules: Path, scene: Scene, tmp_path: Path) -> None:
@@ -96,10 +96,10 @@ def test_babylon_reads_glb(modules: Path, scene: Scene, tmp_path: Path) -> None:
     write_scene(ours, within, by_name("glb"))
     run_script(modules, "babylon.mjs", ours, theirs)
     expected = with_y_up(within)
-    found = read_scene(theirs).scene
-    assert float((found.sh_dc - expected.sh_dc).abs().max()) <= 0.51 / 255 / 0.282
-    bare = replace(expected, sh_dc=found.sh_dc, sh_rest=found.sh_rest)
-    assert_same(found, bare, 0.015, opacities=0.51 / 255)  # its bytes of quaternions are half a step off
+    loaded = read_scene(theirs).scene
+    assert float((loaded.sh_dc - expected.sh_dc).abs().max()) <= 0.51 / 255 / 0.282
+    bare = replace(expected, sh_dc=loaded.sh_dc, sh_rest=loaded.sh_rest)
+    assert_same(loaded, bare, 0.015, opacities=0.51 / 255)  # its bytes of quaternions are half a step off
     parts = [np.fromfile(f"{theirs}{index}", "u1").reshape(-1, 16)[: len(scene)] for index in range(2)]
     harmonics = np.concatenate(parts, axis=1)[:, :24].reshape(-1, 8, 3)
     rounded = np.clip(held(expected.sh_rest).double().numpy() * 128 + 128, 0, 255)

@@ -36,8 +36,8 @@ class CUDAGraph:
         schema = getattr(func, "_schema", None)
         given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
         places = {tensor.untyped_storage().data_ptr() for tensor in given}
-        made = [leaf for leaf in tree_leaves(result) if isinstance(leaf, torch.Tensor)]
-        into = [None if tensor.untyped_storage().data_ptr() in places else tensor for tensor in made]
+        outputs = [leaf for leaf in tree_leaves(result) if isinstance(leaf, torch.Tensor)]
+        into = [None if tensor.untyped_storage().data_ptr() in places else tensor for tensor in outputs]
         fresh = [tensor for tensor in into if tensor is not None]
         self._written += fresh
         if schema is not None:
@@ -64,8 +64,8 @@ class CUDAGraph:
         device.launch()
         with plainly(), torch.no_grad():
             for func, args, kwargs, into in self._steps:
-                found = [leaf for leaf in tree_leaves(func(*args, **kwargs)) if isinstance(leaf, torch.Tensor)]
-                for place, value in zip(into, found, strict=False):
+                outputs = [leaf for leaf in tree_leaves(func(*args, **kwargs)) if isinstance(leaf, torch.Tensor)]
+                for place, value in zip(into, outputs, strict=False):
                     if place is not None:
                         place.copy_(value)
 

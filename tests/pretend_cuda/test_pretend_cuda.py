@@ -23,8 +23,8 @@ pytest.importorskip("triton")
 
 @pytest.fixture
 def counts() -> Iterator[Counts]:
-    with pretend_cuda() as found:
-        yield found
+    with pretend_cuda() as counts:
+        yield counts
 
 
 def numbers() -> Tensor:
@@ -33,8 +33,14 @@ def numbers() -> Tensor:
 
 def test_tensors_are_created_moved_and_computed_on_device(counts: Counts) -> None:
     there = numbers()
-    made = (torch.zeros(2, device="cuda"), torch.tensor([1.0], device="cuda"), there.new_ones(2), there + 1, there[0])
-    assert all(str(tensor.device) == "cuda:0" for tensor in made)
+    tensors = (
+        torch.zeros(2, device="cuda"),
+        torch.tensor([1.0], device="cuda"),
+        there.new_ones(2),
+        there + 1,
+        there[0],
+    )
+    assert all(str(tensor.device) == "cuda:0" for tensor in tensors)
     assert there.to("cuda") is there
     assert torch.equal((2 * there).sum(dim=0).cpu(), torch.tensor([6.0, 10.0, 14.0]))
     there[0] = 7
@@ -107,11 +113,11 @@ def test_events_measure_time_only_with_timing_enabled(counts: Counts) -> None:
 
 
 def test_new_threads_use_the_simulated_device(counts: Counts) -> None:
-    found: list[str] = []
-    thread = threading.Thread(target=lambda: found.append(str(torch.zeros(2, device="cuda").device)))
+    devices: list[str] = []
+    thread = threading.Thread(target=lambda: devices.append(str(torch.zeros(2, device="cuda").device)))
     thread.start()
     thread.join()
-    assert found == ["cuda:0"]
+    assert devices == ["cuda:0"]
 
 
 def test_device_is_removed_after_the_block() -> None:
@@ -133,6 +139,6 @@ def test_doctor_describes_the_gpu(counts: Counts) -> None:
 
 def test_doctor_explains_why_a_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "exists", lambda path: str(path) == "/dev/nvidia0")
-    found = doctor._gpu()
-    assert found.state == "warning"
-    assert "built for CPUs only" in found.text
+    finding = doctor._gpu()
+    assert finding.state == "warning"
+    assert "built for CPUs only" in finding.text

@@ -36,8 +36,8 @@ SCALARS = 256
 
 @pytest.fixture
 def counts() -> Iterator[Counts]:
-    with pretend_cuda() as found:
-        yield found
+    with pretend_cuda() as counts:
+        yield counts
 
 
 def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 32), **settings: Any) -> StylizeRequest:
@@ -124,7 +124,7 @@ def test_regions_need_no_additional_synchronization(counts: Counts, tmp_path: Pa
     stylizer = prepare(in_regions(request_(tmp_path, size=(64, 48), steps_coarse=2, steps_sos=4))).stylizer
     assert stylizer.job.plan.device == "cuda"
     assert stylizer.job.regions is not None
-    kept, before = stylizer.job.regions.frozen[stylizer.job.plan.seen], stylizer.sh_dc.detach().cpu().clone()
+    frozen, before = stylizer.job.regions.frozen[stylizer.job.plan.seen], stylizer.sh_dc.detach().cpu().clone()
     seen: set[int] = set()
     for _ in range(stylizer.job.total_steps):
         counts.clear()
@@ -134,8 +134,8 @@ def test_regions_need_no_additional_synchronization(counts: Counts, tmp_path: Pa
         assert 1 <= counts.waits.total() <= 1 + first, counts.waits
         assert counts.copies.total() <= SCALARS * (1 + first), counts.copies
     after = stylizer.sh_dc.detach().cpu()
-    assert torch.equal(after[kept].view(torch.int32), before[kept].view(torch.int32))
-    assert bool((after[~kept] != before[~kept]).any(dim=1).all())
+    assert torch.equal(after[frozen].view(torch.int32), before[frozen].view(torch.int32))
+    assert bool((after[~frozen] != before[~frozen]).any(dim=1).all())
 
 
 @pytest.mark.slow
@@ -143,9 +143,9 @@ def test_region_losses_match_cpu(tmp_path: Path) -> None:
     asked = in_regions(request_(tmp_path, size=(64, 48)))
     expected = prepare(asked).stylizer
     with pretend_cuda():
-        found = prepare(asked).stylizer
+        stylizer = prepare(asked).stylizer
         for _ in range(expected.job.total_steps):
-            assert found.run_step().loss == pytest.approx(expected.run_step().loss, rel=2e-4)
+            assert stylizer.run_step().loss == pytest.approx(expected.run_step().loss, rel=2e-4)
 
 
 @pytest.mark.slow
@@ -174,12 +174,12 @@ def test_losses_match_cpu(tmp_path: Path) -> None:
     asked = request_(tmp_path, scan=True, size=(64, 48))
     expected = prepare(asked).stylizer
     with pretend_cuda():
-        found = prepare(asked).stylizer
+        stylizer = prepare(asked).stylizer
         for _ in range(expected.job.total_steps):
-            theirs, ours = expected.run_step(), found.run_step()
+            theirs, ours = expected.run_step(), stylizer.run_step()
             assert ours.view == theirs.view
             assert ours.loss == pytest.approx(theirs.loss, rel=2e-4)
-    assert found.job.plan.device == "cuda"
+    assert stylizer.job.plan.device == "cuda"
     assert expected.job.plan.device == "cpu"
 
 

@@ -81,9 +81,9 @@ class GlobalMemory:
         """Yield region, lanes and byte index [lanes, width] of each tensor accessed by an instruction."""
         if (addresses % np.uint64(width)).any():
             raise FaultError(f"misaligned access of {width} bytes")
-        found = np.searchsorted(self.starts, addresses, side="right") - 1
-        for number in np.unique(found):
-            lanes = np.nonzero(found == number)[0]
+        index = np.searchsorted(self.starts, addresses, side="right") - 1
+        for number in np.unique(index):
+            lanes = np.nonzero(index == number)[0]
             region = self.regions[number]
             offset = (addresses[lanes] - np.uint64(region.start)).astype(np.int64)
             if number < 0 or int(offset.max()) + width > region.size:

@@ -61,10 +61,10 @@ def test_gradients_of_pooling_are_those_of_the_reference(
     source = torch.randn((1, *size, 64), generator=generator).round().to(dtype).permute(0, 3, 1, 2).relu_()
     gradient = torch.randn((1, size[0] // 2, size[1] // 2, 64), generator=generator).to(dtype).permute(0, 3, 1, 2)
     with compiled_kernels(capability):
-        found = fused_max_pool_backward(gradient, source)
+        actual = fused_max_pool_backward(gradient, source)
     expected = torch.zeros_like(source) if min(size) < 2 else max_pool_backward_reference(gradient, source)
-    assert found.is_contiguous(memory_format=torch.channels_last)
-    assert torch.equal(found, expected)
+    assert actual.is_contiguous(memory_format=torch.channels_last)
+    assert torch.equal(actual, expected)
 
 
 def sparse(shape: tuple[int, ...], strides: tuple[int, ...], dtype: torch.dtype) -> Tensor:

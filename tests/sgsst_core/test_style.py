@@ -28,9 +28,9 @@ def features(seed, count=40, offset=0.0):
     return offset + torch.rand((count, 5, 6), dtype=torch.float64, generator=generator)
 
 
-def assert_same(found, wanted, **tolerances):
+def assert_same(actual, wanted, **tolerances):
     for name in ("gram", "mean", "std"):
-        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), **tolerances)
+        torch.testing.assert_close(getattr(actual, name), getattr(wanted, name), **tolerances)
 
 
 def test_mixture_has_the_moments_of_all_positions():
@@ -67,15 +67,15 @@ def test_single_image_has_its_own_targets(tiny_weights):
 
 
 def test_targets_use_each_image_at_its_own_size(tiny_weights):
-    pictures, weights = [synthetic_image(300, 90, seed=1), synthetic_image(40, 64, seed=2)], [3.0, 1.0]
+    images, weights = [synthetic_image(300, 90, seed=1), synthetic_image(40, 64, seed=2)], [3.0, 1.0]
     loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64), coarsest=40)
-    mixed = loss.targets.of_style(Style.weighted(pictures, weights), (64, 80))
-    single = [loss.targets.of_style(Style.of(each), (64, 80)) for each in pictures]
+    mixed = loss.targets.of_style(Style.weighted(images, weights), (64, 80))
+    single = [loss.targets.of_style(Style.of(each), (64, 80)) for each in images]
     for scale, (target,) in mixed.items():
         assert set(target.layers) == set(STYLE_LAYERS)
-        for layer, found in target.layers.items():
+        for layer, statistics in target.layers.items():
             wanted = LayerTarget.mixed([each[scale][0].layers[layer] for each in single], [0.75, 0.25])
-            assert_same(found, wanted, rtol=1e-13, atol=1e-15)
+            assert_same(statistics, wanted, rtol=1e-13, atol=1e-15)
 
 
 def test_tiny_image_is_ignored_in_layers_without_cells(tiny_weights):
@@ -90,9 +90,9 @@ def test_tiny_image_is_ignored_in_layers_without_cells(tiny_weights):
 def test_features_are_matched_with_those_of_all_images(tiny_weights):
     network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights, content=False))
     loss = SosLoss(network, style_loss="nnfm", content_weight=0)
-    pictures = [synthetic_image(40, 48, seed=1), synthetic_image(64, 32, seed=2)]
-    mixed = loss.targets.of_style(Style.weighted(pictures, [1, 5]), (64, 64))[0][0].vectors.units
-    single = [loss.targets.of_style(Style.of(each), (64, 64))[0][0].vectors.units for each in pictures]
+    images = [synthetic_image(40, 48, seed=1), synthetic_image(64, 32, seed=2)]
+    mixed = loss.targets.of_style(Style.weighted(images, [1, 5]), (64, 64))[0][0].vectors.units
+    single = [loss.targets.of_style(Style.of(each), (64, 64))[0][0].vectors.units for each in images]
     assert torch.equal(mixed, torch.cat(single))
 
 

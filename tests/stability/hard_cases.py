@@ -10,7 +10,7 @@ LARGEST_GROWTH = 1 << 30
 
 def check(case: Case) -> None:
     """Run the small version of a case, and check its error bound and memory limit."""
-    found = measure(case)
-    result = found.result
+    actual = measure(case)
+    result = actual.result
     assert result.passed, f"{case.name}: {case.measure} {result.error:.3g}, bound {result.bound:.3g}. {result.note}"
-    assert found.peak_growth < LARGEST_GROWTH
+    assert actual.peak_growth < LARGEST_GROWTH

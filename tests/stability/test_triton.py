@@ -33,14 +33,14 @@ SMALLER = ("5000", "thousands", "needles", "4096 x 16", "in the file")
 
 def rendered_cases() -> list[Case]:
     """Return the cases that compare rasterizers, except the large ones."""
-    found = [
+    cases = [
         case
         for module in (gaussians, views)
         for case in module.cases()
         if case.measure == gaussians._IMAGE and not any(part in case.name for part in SMALLER)
     ]
-    assert len(found) > 25
-    return found
+    assert len(cases) > 25
+    return cases
 
 
 def needles() -> Scene:

@@ -70,9 +70,9 @@ def test_cameras_without_distortion_and_photos_need_no_line(tmp_path: Path) -> N
 def test_photos_of_another_size_and_missing_ones_are_reported(tmp_path: Path) -> None:
     capture = read_capture(request(tmp_path), SCENE)
     photos = write_photos(tmp_path / "photos", ["view_0", "view_2"], (128, 96))
-    found = capture.with_photos(photos)
-    assert [view.name for view in found.cameras] == ["view_0", "view_2"]
-    assert lines(found) == [
+    with_photos = capture.with_photos(photos)
+    assert [view.name for view in with_photos.cameras] == ["view_0", "view_2"]
+    assert lines(with_photos) == [
         "photos: warning: 1 of 3 views are left out: they have no photo: view_1",
         "photos: 2 are resized to their views: they have other sizes, such as 128x96 instead of 64x48",
     ]
@@ -103,12 +103,12 @@ def test_distortion_is_ignored_without_photos_and_removed_from_them(tmp_path: Pa
     ]
     assert {(view.width, view.height) for view in plain.cameras} == {(64, 48)}
     photos = write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2"])
-    found = capture.with_photos(photos)
-    assert lines(found)[0].startswith("lenses: the photos are undistorted: 2 of 3 cameras have lens distortion")
-    sizes = [(view.width, view.height) for view in found.cameras]
+    with_photos = capture.with_photos(photos)
+    assert lines(with_photos)[0].startswith("lenses: the photos are undistorted: 2 of 3 cameras have lens distortion")
+    sizes = [(view.width, view.height) for view in with_photos.cameras]
     assert sizes[0] == sizes[1] < sizes[2] == (64, 48)
-    assert found.photos
-    assert load_photo(found.photos[0], found.cameras[0]).shape == (*sizes[0][::-1], 3)
+    assert with_photos.photos
+    assert load_photo(with_photos.photos[0], with_photos.cameras[0]).shape == (*sizes[0][::-1], 3)
 
 
 def test_photos_of_lenses_without_a_formula_are_refused(tmp_path: Path) -> None:

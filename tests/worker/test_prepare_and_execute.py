@@ -31,16 +31,16 @@ def run_job(
     job: Job, steps: int | None = None, checkpoint_seconds: float = 60.0, warnings: list[str] | None = None
 ) -> Result:
     """Run a job; if `steps` is given, interrupt it after that many steps."""
-    made = 0
+    done = 0
 
     def count(progress: object) -> None:
-        nonlocal made
-        made += 1
+        nonlocal done
+        done += 1
 
     return execute(
         job,
         progress=count,
-        stop=lambda: steps is not None and made >= steps,
+        stop=lambda: steps is not None and done >= steps,
         warn=(warnings if warnings is not None else []).append,
         checkpoint_seconds=checkpoint_seconds,
         run_id="run",
@@ -79,9 +79,9 @@ def test_plan_for_another_device_reuses_the_survey(request_: StylizeRequest) -> 
     """The checkpoint is that of a job on a GPU that no longer exists."""
     first = prepare(request_)
     run_job(first, steps=3)
-    kept = load_checkpoint(first.outputs.checkpoint, first.fingerprint)
-    plan = replace(kept.plan, device="cuda", rasterizer="cuda")
-    save_checkpoint(first.outputs.checkpoint, replace(kept, plan=plan), first.fingerprint)
+    checkpoint = load_checkpoint(first.outputs.checkpoint, first.fingerprint)
+    plan = replace(checkpoint.plan, device="cuda", rasterizer="cuda")
+    save_checkpoint(first.outputs.checkpoint, replace(checkpoint, plan=plan), first.fingerprint)
     second = prepare(request_, resume=Resume(True))
     assert (second.stylizer.job.plan.device, second.stylizer.job.plan.rasterizer) == (
         "cpu",
@@ -184,9 +184,9 @@ def test_optional_resume_starts_without_checkpoint(request_: StylizeRequest) -> 
     assert prepare(request_, resume=Resume(True, required=False)).resumed is None
     run_job(prepare(request_), steps=2)
     assert prepare(request_, resume=Resume(True, required=False, run="another run")).resumed is None
-    found = prepare(request_, resume=Resume(True, required=False, run="run")).resumed
-    assert found is not None
-    assert found.state.step == 2
+    resumed = prepare(request_, resume=Resume(True, required=False, run="run")).resumed
+    assert resumed is not None
+    assert resumed.state.step == 2
 
 
 def test_temporarily_full_disk_is_a_warning(request_: StylizeRequest, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,9 +222,9 @@ def test_colors_file_matches_the_result(request_: StylizeRequest, tmp_path: Path
         assert alone.exists() == request.colors
         if request.colors:
             exact = read_scene(request.out).scene.sh_dc
-            found = np.fromfile(alone, "<f2").reshape(-1, 3)
-            assert found.shape == exact.shape
-            assert np.array_equal(found, exact.numpy().astype(np.float16))
+            colors = np.fromfile(alone, "<f2").reshape(-1, 3)
+            assert colors.shape == exact.shape
+            assert np.array_equal(colors, exact.numpy().astype(np.float16))
 
 
 @pytest.mark.parametrize("why", ["split", "dropped", "attenuated"])

@@ -35,9 +35,9 @@ def test_first_preview_shows_warm_start_colors(tiny_weights: BackboneWeights, tm
     ]
     views = stylizer.job.views
     save_jpg(tmp_path / "wanted.jpg", views.rasterizer.render(views.colors(index, wanted), views.cameras[index]))
-    found, expected = (np.asarray(Image.open(path)) for path in (written[0][1], tmp_path / "wanted.jpg"))
-    np.testing.assert_array_equal(found, expected)
-    assert found.std() > 1
+    actual, expected = (np.asarray(Image.open(path)) for path in (written[0][1], tmp_path / "wanted.jpg"))
+    np.testing.assert_array_equal(actual, expected)
+    assert actual.std() > 1
 
 
 def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
@@ -55,10 +55,10 @@ def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
     assert written[0].name > "step_9999999.jpg", "clients show the last preview by name"
 
     views, index = stylizer.job.views, stylizer.job.evaluation_views[0]
-    found = np.asarray(Image.open(written[0]), dtype=np.float64)
-    middle = found.shape[1] // 2
+    thumbnail = np.asarray(Image.open(written[0]), dtype=np.float64)
+    middle = thumbnail.shape[1] // 2
     for part, colors in ((np.s_[:, :middle], views.scene.sh_dc), (np.s_[:, middle:], stylizer.shown())):
         with torch.no_grad():
             image = views.rasterizer.render(views.colors(index, colors), views.cameras[index])
         wanted = (image.clamp(0, 1) * 255).numpy()[part]
-        assert np.abs(found[part] - wanted).mean() < 5  # JPEG
+        assert np.abs(thumbnail[part] - wanted).mean() < 5  # JPEG

@@ -20,13 +20,13 @@ from worker.styles import MOST_STYLE_IMAGES, StyleFile
     ],
 )
 def test_geometric_selections_are_parsed(text: str, kind: str, numbers: tuple[float, ...]) -> None:
-    found = parse_selection(text, "region a")
-    assert (found.kind, found.numbers, found.text) == (kind, numbers, text)
+    selection = parse_selection(text, "region a")
+    assert (selection.kind, selection.numbers, selection.text) == (kind, numbers, text)
 
 
 def test_property_and_mask_selections_are_parsed() -> None:
-    found = parse_selection("property=f_rest_0<=-0.5", "region a")
-    assert (found.name, found.sign, found.numbers) == ("f_rest_0", "<=", (-0.5,))
+    selection = parse_selection("property=f_rest_0<=-0.5", "region a")
+    assert (selection.name, selection.sign, selection.numbers) == ("f_rest_0", "<=", (-0.5,))
     assert parse_selection("mask=a=b.npy", "region a").path == Path("a=b.npy")
     assert parse_selection("masks=some folder", "region a").path == Path("some folder")
 

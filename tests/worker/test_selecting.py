@@ -28,9 +28,9 @@ def region(name: str, spec: str, **values: Any) -> RegionRequest:
 
 
 def labels_of(file: SceneFile, *requests: RegionRequest) -> list[int]:
-    found = select_regions(requests, file, cameras(), 0.2, load_styles)
-    assert found is not None
-    return found.labels.tolist()
+    regions = select_regions(requests, file, cameras(), 0.2, load_styles)
+    assert regions is not None
+    return regions.labels.tolist()
 
 
 @pytest.fixture
@@ -54,9 +54,9 @@ def test_later_region_wins_overlaps(file: SceneFile) -> None:
     x = file.scene.means[:, 0]
     assert labels_of(file, wide, narrow) == [0 if v < -1 else 1 if v < 1 else 2 for v in x.tolist()]
     assert labels_of(file, narrow, wide) == [0 if v < -1 else 2 for v in x.tolist()]
-    found = select_regions((narrow, wide), file, cameras(), 0.2, load_styles)
-    assert found is not None
-    assert [each.selected for each in found.every] == [0, int((x >= 1).sum()), int((x >= -1).sum())]
+    regions = select_regions((narrow, wide), file, cameras(), 0.2, load_styles)
+    assert regions is not None
+    assert [each.selected for each in regions.every] == [0, int((x >= 1).sum()), int((x >= -1).sum())]
 
 
 @pytest.mark.parametrize("kind", ["i4", "u1", "f8", "f4"])
@@ -108,9 +108,9 @@ def test_image_masks_of_some_views_select_gaussians(tmp_path: Path) -> None:
     right = (scene.means[:, 0] > 0).float()[:, None].expand(-1, 3).contiguous()
     for view in views[:2]:
         save_png(folder / f"{view.name}.png", make_rasterizer("cpu", scene).render(right, view))
-    found = select(parse_selection(f"masks={folder}", "a"), file, views, 0.2)
+    selected = select(parse_selection(f"masks={folder}", "a"), file, views, 0.2)
     clear = scene.means[:, 0].abs() > 0.15
-    assert torch.equal(found[clear], scene.means[clear, 0] > 0)
+    assert torch.equal(selected[clear], scene.means[clear, 0] > 0)
 
 
 def test_invalid_mask_folders_are_refused(tmp_path: Path, file: SceneFile) -> None:
@@ -136,10 +136,10 @@ def test_region_styles_are_loaded(tmp_path: Path, file: SceneFile) -> None:
 
     save_png(tmp_path / "s.png", torch.full((8, 8, 3), 0.5))
     request = region("a", "half-space=1,0,0,0", styles=(StyleFile(tmp_path / "s.png"),), weight=2.0)
-    found = select_regions((request,), file, cameras(), 0.2, load_styles)
-    assert found is not None
-    assert isinstance(found.every[1].style, Style)
-    assert (found.every[1].style.names, found.every[1].weight, found.every[1].select) == (
+    regions = select_regions((request,), file, cameras(), 0.2, load_styles)
+    assert regions is not None
+    assert isinstance(regions.every[1].style, Style)
+    assert (regions.every[1].style.names, regions.every[1].weight, regions.every[1].select) == (
         ("s.png",),
         2.0,
         "half-space=1,0,0,0",

@@ -74,7 +74,7 @@ def second_reader(path: Path) -> dict[str, np.ndarray]:
 def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     other = files.style.with_name("other:2.png")
     Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
-    told = [
+    options = [
         "--style",
         f"{files.style}:1",
         "--style",
@@ -84,7 +84,7 @@ def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.Capture
         "--training-background",
         "palette",
     ]
-    assert main([part for part in files.stylize() if part not in ("--style", str(files.style))] + told) == 0
+    assert main([part for part in files.stylize() if part not in ("--style", str(files.style))] + options) == 0
     shares = f"{files.style.name} 25%, other:2.png 75%"
     assert f"a mixture: {shares}" in capsys.readouterr().out
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
@@ -93,7 +93,7 @@ def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.Capture
         ("other:2.png", 0.75),
     ]
     assert "(75%)" in files.out.with_name("stylized.report.html").read_text()
-    plan = ["plan", str(files.ply), "--cameras", str(files.cameras), "--backbone", "vgg16", *told[:4]]
+    plan = ["plan", str(files.ply), "--cameras", str(files.cameras), "--backbone", "vgg16", *options[:4]]
     assert main([*plan, "--out", str(files.out.with_suffix(".json"))]) == 0
     assert shares in files.out.with_suffix(".json").read_text()
     assert main([*files.stylize(), "--style", f"{other}:0"]) == 2
@@ -104,20 +104,27 @@ def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.Capture
 def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     other = files.style.with_name("other.png")
     Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
-    told = ["--region", "right:half-space=1,0,0,0.5", "--region-style", f"right={other}", "--region-weight", "right=2"]
-    told += ["--region", "left:half-space=-1,0,0,0.5", "--region-freeze", "left", "--region", "far:sphere=0,0,99,1"]
-    assert main(files.stylize("--steps-sos", "2", "--warm-start", "--clamp-aware-gradient", *told)) == 0
+    options = [
+        "--region",
+        "right:half-space=1,0,0,0.5",
+        "--region-style",
+        f"right={other}",
+        "--region-weight",
+        "right=2",
+    ]
+    options += ["--region", "left:half-space=-1,0,0,0.5", "--region-freeze", "left", "--region", "far:sphere=0,0,99,1"]
+    assert main(files.stylize("--steps-sos", "2", "--warm-start", "--clamp-aware-gradient", *options)) == 0
     said = capsys.readouterr().out
     assert "use other.png, with weight 2" in said
     assert "region far:           warning: ignored, because it has no Gaussians" in said
     before, after = second_reader(files.ply), second_reader(files.out)
-    kept = before["x"] <= -0.5
+    frozen = before["x"] <= -0.5
     for name, values in before.items():
-        assert np.array_equal(values[kept].view(np.uint32), after[name][kept].view(np.uint32))
-    assert (after["f_dc_0"][~kept] != before["f_dc_0"][~kept]).all()
+        assert np.array_equal(values[frozen].view(np.uint32), after[name][frozen].view(np.uint32))
+    assert (after["f_dc_0"][~frozen] != before["f_dc_0"][~frozen]).all()
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    found = {each["name"]: each for each in report["regions"]}
-    assert found["right"] | {"gaussians": 0, "fraction": 0} == {
+    by_name = {each["name"]: each for each in report["regions"]}
+    assert by_name["right"] | {"gaussians": 0, "fraction": 0} == {
         "name": "right",
         "select": "half-space=1,0,0,0.5",
         "gaussians": 0,
@@ -127,8 +134,8 @@ def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.
         "freeze": False,
         "stylized": True,
     }
-    assert found["left"]["gaussians"] == kept.sum()
-    assert not found["far"]["stylized"]
+    assert by_name["left"]["gaussians"] == frozen.sum()
+    assert not by_name["far"]["stylized"]
     assert sum(each["fraction"] for each in report["regions"]) == pytest.approx(1)
     plan = [
         "plan",
@@ -140,7 +147,7 @@ def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.
         "--backbone",
         "vgg16",
     ]
-    assert main([*plan, *told, "--out", str(files.out.with_suffix(".json"))]) == 0
+    assert main([*plan, *options, "--out", str(files.out.with_suffix(".json"))]) == 0
     assert "region right" in files.out.with_suffix(".json").read_text()
 
 
@@ -539,12 +546,12 @@ def _shown_until(terminal: int, pattern: str | None) -> str:
     shown = ""
     while pattern is None or not re.search(pattern, shown):
         try:
-            found = os.read(terminal, 4096)
+            data = os.read(terminal, 4096)
         except OSError:  # the other end is closed
             break
-        if not found:
+        if not data:
             break
-        shown += found.decode(errors="replace")
+        shown += data.decode(errors="replace")
     return shown
 
 
@@ -869,18 +876,18 @@ def test_render_writes_one_image_per_view_in_camera_order(
     command = ["render", str(files.ply), "--cameras", str(files.cameras), "--out", str(out)]
     assert main(command) == 0
     assert "3 views" in capsys.readouterr().out
-    pictures = sorted(out.iterdir())
-    assert [picture.name for picture in pictures] == ["0000_b_left.png", "0001_a_left.png", "0002_a_left.png"]
-    arrays = [np.asarray(Image.open(picture)) for picture in pictures]
+    images = sorted(out.iterdir())
+    assert [image.name for image in images] == ["0000_b_left.png", "0001_a_left.png", "0002_a_left.png"]
+    arrays = [np.asarray(Image.open(image)) for image in images]
     assert arrays[0].shape == (48, 64, 3)
     assert (arrays[0][0, 0] == 0).all()
     means = [np.nonzero(array.any(axis=(0, 2)))[0].mean() for array in arrays]
     assert means == sorted(means, reverse=True) or means == sorted(means)
 
     assert main([*command, "--background", "10,20,30", "--resolution", "100", "--views", "1"]) == 0
-    picture = np.asarray(Image.open(out / "0000_a_left.png"))
-    assert picture.shape == (75, 100, 3)
-    assert picture[0, 0].tolist() == [10, 20, 30]
+    image = np.asarray(Image.open(out / "0000_a_left.png"))
+    assert image.shape == (75, 100, 3)
+    assert image[0, 0].tolist() == [10, 20, 30]
 
 
 @pytest.mark.parametrize("path", ["cameras", "orbit"])
@@ -1019,11 +1026,11 @@ def test_render_rejects_same_inputs_as_stylize(
 def test_convert_writes_what_it_reads(files: Files, capsys: pytest.CaptureFixture[str], name: str) -> None:
     written, back = files.out.with_name(f"scene.{name}"), files.out.with_name("back.ply")
     assert main(["convert", str(files.ply), str(written), "--compare", "--cameras", str(files.cameras)]) == 0
-    found = re.search(
+    match = re.search(
         rf"compared: +{name}, .* (renders identical to|([0-9.]+) dB PSNR against) scene.ply", capsys.readouterr().out
     )
-    assert found
-    assert found[2] is None or float(found[2]) > 28
+    assert match
+    assert match[2] is None or float(match[2]) > 28
     assert main(["convert", str(written), str(back)]) == 0
     one, other = (read_scene(path) for path in (written, back))
     assert (one.format, other.format) == (name, "ply")
@@ -1037,8 +1044,8 @@ def test_convert_writes_an_unpacked_sog(files: Files, capsys: pytest.CaptureFixt
         assert main(["convert", str(files.ply), str(out), "--compare", "--cameras", str(files.cameras)]) == 0
     packed, unpacked = (line for line in capsys.readouterr().out.splitlines() if line.startswith("compared:"))
     assert packed == unpacked
-    with zipfile.ZipFile(archive) as found:
-        assert {name: found.read(name) for name in found.namelist()} == {
+    with zipfile.ZipFile(archive) as members:
+        assert {name: members.read(name) for name in members.namelist()} == {
             path.name: path.read_bytes() for path in meta.parent.iterdir()
         }
 

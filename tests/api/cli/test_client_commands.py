@@ -98,10 +98,10 @@ def test_exit_codes_and_errors_as_json(files: list[str], capsys: pytest.CaptureF
         assert main([*command, "--json"]) == code, command
         out, error = capsys.readouterr()
         assert out == ""
-        found = json.loads(error)
-        assert found["code"].startswith(kind)
-        assert found["detail"]
-    assert "Did you mean 'resolution'?" in found["detail"]
+        content = json.loads(error)
+        assert content["code"].startswith(kind)
+        assert content["detail"]
+    assert "Did you mean 'resolution'?" in content["detail"]
     assert main(["cancel", job_id]) == 0
     capsys.readouterr()
     assert main(["watch", job_id]) == 5, "the job did not succeed"
@@ -194,8 +194,8 @@ def test_short_help_and_completion(capsys: pytest.CaptureFixture[str]) -> None:
     complete = {"_SGSST_COMPLETE": "complete_bash", "COMP_WORDS": "sgsst downl", "COMP_CWORD": "1"}
     environment = os.environ | complete | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", "import sys; from api.cli.main import main; sys.exit(main())"]
-    found = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert found.stdout.split() == ["download"], found.stderr
+    process = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert process.stdout.split() == ["download"], process.stderr
 
 
 @pytest.mark.slow

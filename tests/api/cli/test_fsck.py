@@ -54,9 +54,9 @@ def service(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
         for name, value in environment_of(request.getfixturevalue("server")).items():
             monkeypatch.setenv(name, value)
         monkeypatch.setenv("SGSST_ARTIFACTS", f"s3://fsck/{os.urandom(4).hex()}")
-    made = Files(tmp_path)
-    yield made
-    made.store.close()
+    files = Files(tmp_path)
+    yield files
+    files.store.close()
 
 
 @dataclass
@@ -133,12 +133,12 @@ def run(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[st
     """Run `sgsst fsck`; return its exit code and its findings by file name."""
     capsys.readouterr()
     code = main(["fsck", "--json", *options])
-    found = {finding["name"]: finding for finding in json.loads(capsys.readouterr().out)}
-    return code, found
+    findings = {finding["name"]: finding for finding in json.loads(capsys.readouterr().out)}
+    return code, findings
 
 
-def kinds(found: dict[str, dict[str, str]]) -> dict[str, str]:
-    return {name: finding["kind"] for name, finding in found.items()}
+def kinds(findings: dict[str, dict[str, str]]) -> dict[str, str]:
+    return {name: finding["kind"] for name, finding in findings.items()}
 
 
 @pytest.mark.slow
@@ -156,8 +156,8 @@ def test_fsck_finds_a_thousand_lost_and_damaged_files(
         files.lose(name)
     for name in flipped:
         files.flip(name, order)
-    code, found = run(capsys)
-    assert kinds(found) == dict.fromkeys(lost, "missing") | dict.fromkeys(flipped, "damaged")
+    code, findings = run(capsys)
+    assert kinds(findings) == dict.fromkeys(lost, "missing") | dict.fromkeys(flipped, "damaged")
     assert code == MISSING + DAMAGED
     files.store.close()
 
@@ -168,7 +168,7 @@ def test_mend_repairs_all_findings(
     order = random.Random(1)
     scene, unused, good = (service.input(b"input %d" % number) for number in range(3))
     lease = service.job(scene)
-    kept, damaged, checkpoint = service.results(
+    intact, damaged, checkpoint = service.results(
         lease, {"plan.json": b"plan", "stylized.ply": b"ply", CHECKPOINT: b"state"}
     )
     part, whole_part = service.upload(b"half", 8), service.upload(b"half", 8)
@@ -183,24 +183,24 @@ def test_mend_repairs_all_findings(
     for name in orphans:
         service.orphan(name)
     expected = {scene: "damaged", unused: "missing", damaged: "damaged", checkpoint: "missing", part: "missing"}
-    code, found = run(capsys)
-    assert (code, kinds(found)) == (MISSING + DAMAGED, expected), "orphans may still get their rows"
-    assert found[scene]["holders"] == [f"job:{lease.job_id}"]
+    code, findings = run(capsys)
+    assert (code, kinds(findings)) == (MISSING + DAMAGED, expected), "orphans may still get their rows"
+    assert findings[scene]["holders"] == [f"job:{lease.job_id}"]
     monkeypatch.setattr(fsck, "_ORPHAN_SECONDS", -HOUR)
     monkeypatch.setattr(fsck, "_REMOTE_ORPHAN_SECONDS", -HOUR)
     expected |= dict.fromkeys(orphans, "orphaned")
-    code, found = run(capsys, "--mend")
-    assert (code, kinds(found)) == (MISSING + DAMAGED + ORPHANED, expected)
-    assert found[scene]["mended"].startswith("moved to quarantine/"), found[scene]
-    assert found[scene]["mended"].endswith("it comes back when it is sent again")
+    code, findings = run(capsys, "--mend")
+    assert (code, kinds(findings)) == (MISSING + DAMAGED + ORPHANED, expected)
+    assert findings[scene]["mended"].startswith("moved to quarantine/"), findings[scene]
+    assert findings[scene]["mended"].endswith("it comes back when it is sent again")
     assert {row.name for row in service.store.jobs.artifacts(lease.job_id)} == {"plan.json"}
     assert service.blobs.objects.below("quarantine")
 
-    code, found = run(capsys)
-    assert (code, kinds(found)) == (MISSING, {scene: "missing"}), "a job needs it"
+    code, findings = run(capsys)
+    assert (code, kinds(findings)) == (MISSING, {scene: "missing"}), "a job needs it"
     assert service.input(b"input 0") == scene
     assert run(capsys) == (0, {})
-    for name in (scene, good, kept, whole_part):
+    for name in (scene, good, intact, whole_part):
         assert service.place(name).size(name) > 0
 
 

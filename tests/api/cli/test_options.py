@@ -74,14 +74,14 @@ def test_commands_and_parameters_offer_every_option() -> None:
 
 def outside(option: Declared) -> list[float]:
     """Return the numbers just outside an option's bounds."""
-    found: list[float] = []
+    values: list[float] = []
     for item in option.limits:
         if isinstance(item, Ge | Le):
             bound, away = (item.ge, -1) if isinstance(item, Ge) else (item.le, 1)
-            found.append(bound + away * max(1, abs(bound) * 1e-9))  # type: ignore[operator, arg-type]
+            values.append(bound + away * max(1, abs(bound) * 1e-9))  # type: ignore[operator, arg-type]
         else:
-            found.append(item.gt if isinstance(item, Gt) else item.lt)  # type: ignore[arg-type]
-    return found
+            values.append(item.gt if isinstance(item, Gt) else item.lt)  # type: ignore[arg-type]
+    return values
 
 
 BEYOND = [(name, value) for name, option in OPTIONS.items() for value in outside(option)]
@@ -144,10 +144,10 @@ def test_options_reference_is_up_to_date() -> None:
 
 
 def test_options_become_settings() -> None:
-    told = StylizeOptions.model_validate(
+    options = StylizeOptions.model_validate(
         {"preset": "preview", "steps_sos": "7", "near": 0.5, "compute_everything": True}
     )
-    assert told.settings() == make_settings("preview", steps_sos=7, near=0.5, keep=EVERYTHING)
+    assert options.settings() == make_settings("preview", steps_sos=7, near=0.5, keep=EVERYTHING)
     assert StylizeOptions().settings() == make_settings()
     assert StylizeOptions().given_settings() == {}
     assert StylizeOptions(resolution=80).settings().max_resolution == 80
@@ -189,5 +189,9 @@ def test_removed_options_are_rejected_with_advice(name: str, advice: str, capsys
 
 def test_stored_jobs_accept_former_names() -> None:
     stored = {"sh_fade": 0.5, "unseen": "neighbours", "regions": [{"name": "rest", "keep": True}]}
-    found = stored_parameters(stored).model_dump()
-    assert (found["sh_attenuation"], found["unseen"], found["regions"][0]["freeze"]) == (0.5, "neighbors", True)
+    parameters = stored_parameters(stored).model_dump()
+    assert (parameters["sh_attenuation"], parameters["unseen"], parameters["regions"][0]["freeze"]) == (
+        0.5,
+        "neighbors",
+        True,
+    )

@@ -39,9 +39,9 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture(scope="module")
 def store(service: Service) -> Iterator[Store]:
-    made = open_store(ServiceSettings(data=service.data))
-    yield made
-    made.close()
+    opened = open_store(ServiceSettings(data=service.data))
+    yield opened
+    opened.close()
 
 
 @pytest.fixture(autouse=True)
@@ -71,14 +71,14 @@ class Awaited:
         self._runner.close()
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
-        found = getattr(self._client, name)
+        member = getattr(self._client, name)
         if inspect.isasyncgenfunction(getattr(AsyncClient, name)):
 
             async def gather(*args: Any, **options: Any) -> list[Any]:
-                return [item async for item in found(*args, **options)]
+                return [item async for item in member(*args, **options)]
 
             return lambda *args, **options: iter(self._runner.run(gather(*args, **options)))
-        return lambda *args, **options: self._runner.run(found(*args, **options))
+        return lambda *args, **options: self._runner.run(member(*args, **options))
 
 
 both = pytest.mark.parametrize("connect", [Client, Awaited], ids=["Client", "AsyncClient"])
@@ -143,48 +143,50 @@ def test_job_from_upload_to_removal(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(uploads, "PART_BYTES", 10_000)
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     with connect(service.url) as client:
-        made: Job = client.submit(
+        submitted: Job = client.submit(
             files["scene"],
             files["style"],
             cameras=files["cameras"],
             name="mine",
             steps_sos=7,
             background=None,
-            progress=lambda done, total: told.append((done, total)),
+            progress=lambda done, total: reported.append((done, total)),
         )
         large = [path.stat().st_size for path in files.values() if path.stat().st_size > 10_000]
-        assert told[-1] == (sum(large), sum(large))
-        assert [done for done, _ in told] == sorted({done for done, _ in told})
-        assert len(told) == sum(-(-size // 10_000) for size in large)
-        shown: Job = client.job(made.id)
+        assert reported[-1] == (sum(large), sum(large))
+        assert [done for done, _ in reported] == sorted({done for done, _ in reported})
+        assert len(reported) == sum(-(-size // 10_000) for size in large)
+        shown: Job = client.job(submitted.id)
         assert (shown.status, shown.data["name"]) == ("queued", "mine")
         assert shown.data["parameters"] == {**shown.data["parameters"], "steps_sos": 7}
         digests = {entry["role"]: entry["sha256"] for entry in shown.data["inputs"]}
         assert digests == {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
 
-        assert client.cancel(made.id).status == "canceled"
-        assert client.retry(made.id).status == "queued"
-        result = finish(store, service, made.id, bytes(range(256)) * 9000, tmp_path)
-        events: list[Event] = list(client.watch(made.id))
+        assert client.cancel(submitted.id).status == "canceled"
+        assert client.retry(submitted.id).status == "queued"
+        result = finish(store, service, submitted.id, bytes(range(256)) * 9000, tmp_path)
+        events: list[Event] = list(client.watch(submitted.id))
         statuses = [event.data["status"] for event in events if event.kind == "status"]
         assert statuses == ["queued", "canceled", "queued", "starting", "running", "succeeded"]
-        assert list(client.watch(made.id, after=events[3].id)) == events[4:]
-        assert list(client.watch(made.id, after=events[-1].id)) == []
-        assert client.wait(made.id).finished
+        assert list(client.watch(submitted.id, after=events[3].id)) == events[4:]
+        assert list(client.watch(submitted.id, after=events[-1].id)) == []
+        assert client.wait(submitted.id).finished
 
-        assert [entry["name"] for entry in client.artifacts(made.id)] == ["stylized.ply"]
-        told.clear()
+        assert [entry["name"] for entry in client.artifacts(submitted.id)] == ["stylized.ply"]
+        reported.clear()
         target = tmp_path / "mine.ply"
-        assert client.download(made.id, target, progress=lambda done, total: told.append((done, total))) == target
+        assert (
+            client.download(submitted.id, target, progress=lambda done, total: reported.append((done, total))) == target
+        )
         assert target.read_bytes() == result
-        assert told[-1] == (len(result), len(result))
+        assert reported[-1] == (len(result), len(result))
         assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.ply", "result"]
 
-        client.delete(made.id)
+        client.delete(submitted.id)
         with pytest.raises(RequestError, match="no job") as caught:
-            client.job(made.id)
+            client.job(submitted.id)
         assert (caught.value.status, caught.value.problem["code"]) == (404, "not-found")
 
 
@@ -207,12 +209,12 @@ def test_jobs_are_listed_page_by_page(
 ) -> None:
     monkeypatch.setattr("api.client.async_client._PAGE", 2)
     with connect(service.url) as client:
-        made = [client.submit(files["scene"], files["style"], orbit=2, seed=number).id for number in range(5)]
-        assert [job.id for job in client.jobs()][:5] == made[::-1]
-        assert [job.id for job in client.jobs(limit=3)] == made[:1:-1]
-        client.cancel(made[0])
-        assert made[0] not in [job.id for job in client.jobs(status=["queued", "running"])]
-        assert next(iter(client.jobs(status=["canceled"]))).id == made[0]
+        ids = [client.submit(files["scene"], files["style"], orbit=2, seed=number).id for number in range(5)]
+        assert [job.id for job in client.jobs()][:5] == ids[::-1]
+        assert [job.id for job in client.jobs(limit=3)] == ids[:1:-1]
+        client.cancel(ids[0])
+        assert ids[0] not in [job.id for job in client.jobs(status=["queued", "running"])]
+        assert next(iter(client.jobs(status=["canceled"]))).id == ids[0]
 
 
 @both
@@ -234,17 +236,17 @@ def test_plan_queues_nothing_and_rejects_bad_files(
 @both
 def test_plan_reports_progress(connect: Any, service: Service, files: dict[str, Path]) -> None:
     options = {"preset": "preview", "backbone": "vgg16", "resolution": 64, "cameras": files["cameras"]}
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     with connect(service.url) as client:
         plan = client.plan(
             files["scene"],
             files["style"],
-            planning=lambda done, total: told.append((done, total)),
+            planning=lambda done, total: reported.append((done, total)),
             learning_rate=0.1 if connect is Client else 0.3,  # a plan that is cached sends no progress
             **options,
         )
         assert (plan["gaussians"], plan["views"]) == (616, 3)
-        assert told[-1] == (3, 3)
+        assert reported[-1] == (3, 3)
         frozen = {"name": "middle", "select": "sphere=0,0,3,2.5", "freeze": True}
         with pytest.raises(RequestError, match="that a view sees is frozen") as caught:
             client.plan(files["scene"], files["style"], regions=[frozen], **options)
@@ -318,17 +320,19 @@ def test_download_resumes_after_lost_connection(
     with connect(service.url) as client:
         job_id = client.submit(files["scene"], files["style"], orbit=2).id
     content = finish(store, service, job_id, hashlib.sha256(job_id.encode()).digest() * 100_000, tmp_path)
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     # A block is written once it is complete: the first connection leaves one, the second none, the third another one.
     with (
         Relay(int(service.environment["SGSST_PORT"]), [1_500_000, 700, 1_500_000]) as relay,
         connect(relay.url) as client,
     ):
-        target = client.download(job_id, tmp_path / "mine.ply", progress=lambda done, size: told.append((done, size)))
+        target = client.download(
+            job_id, tmp_path / "mine.ply", progress=lambda done, size: reported.append((done, size))
+        )
         assert target.read_bytes() == content
         assert relay.cuts == 3
-    assert {size for _, size in told} == {len(content)}
-    assert [done for done, _ in told] == sorted({done for done, _ in told}), "nothing was sent twice"
+    assert {size for _, size in reported} == {len(content)}
+    assert [done for done, _ in reported] == sorted({done for done, _ in reported}), "nothing was sent twice"
 
 
 @both

@@ -63,8 +63,8 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture
 def client(service: Service) -> Iterator[httpx.Client]:
-    with service.client() as made:
-        yield made
+    with service.client() as opened:
+        yield opened
 
 
 def form(files: dict[str, bytes], **changed: bytes | tuple[str, bytes] | None) -> list[tuple[str, Any]]:
@@ -225,8 +225,8 @@ def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes])
     client.patch(f"/v1/uploads/{upload}", headers=patch, content=files["style"])
     parts = [part for part in form(files) if part[0] != "style"]
     parts += [("style", (None, upload)), ("style", ("b.png", other)), ("style", ("c.png", other))]
-    told = {"parameters": '{"style_weights": [2, 1, 1], "preset": "preview"}'}
-    answer = client.post("/v1/jobs?dry_run=true", files=parts, data=told)
+    data = {"parameters": '{"style_weights": [2, 1, 1], "preset": "preview"}'}
+    answer = client.post("/v1/jobs?dry_run=true", files=parts, data=data)
     assert answer.status_code == 200, answer.text
     decisions = {each["item"]: each["decision"] for each in answer.json()["plan"]["decisions"]}
     assert decisions["styles"] == "a mixture: y.png 50%, b.png 25%, c.png 25%"
@@ -244,8 +244,8 @@ def test_regions_name_style_files(client: httpx.Client, files: dict[str, bytes])
     parts = [*form(files), ("style", ("night sky.png", other))]
 
     def answer(*regions: dict[str, Any], files: Any = parts, **more: Any) -> httpx.Response:
-        told = {"parameters": json.dumps({"regions": regions, "preset": "preview", **more})}
-        return client.post("/v1/jobs?dry_run=true", files=files, data=told)
+        data = {"parameters": json.dumps({"regions": regions, "preset": "preview", **more})}
+        return client.post("/v1/jobs?dry_run=true", files=files, data=data)
 
     right = {"name": "right", "select": "half-space=1,0,0,0", "style": "night sky.png", "weight": 2}
     good = answer(right, {"name": "left", "select": "box=-9,-9,-9,-1,9,9", "freeze": True}, style_weights=[1])
@@ -360,14 +360,14 @@ def test_stored_jobs_are_shown_as_they_were_stored(
     service: Service, client: httpx.Client, files: dict[str, bytes]
 ) -> None:
     """Parameter names that this version lacks are shown as stored. Only a retry of such a job is refused."""
-    made = client.post("/v1/jobs", files=form(files)).json()
+    created = client.post("/v1/jobs", files=form(files)).json()
     store = open_store(ServiceSettings(data=service.data))
-    told = {"preset": "preview", "sharpness": 3, "steps_sos": -5, "workers": "many"}
-    job, _ = store.jobs.create(NewJob("local", "old", 0, told, made["inputs"]), limit=1000)
+    stored_parameters = {"preset": "preview", "sharpness": 3, "steps_sos": -5, "workers": "many"}
+    job, _ = store.jobs.create(NewJob("local", "old", 0, stored_parameters, created["inputs"]), limit=1000)
     (listed,) = [entry for entry in client.get("/v1/jobs").json()["jobs"] if entry["id"] == job.id]
     answer = client.get(f"/v1/jobs/{job.id}")
     assert answer.status_code == 200
-    assert listed["parameters"] == answer.json()["parameters"] == made["parameters"] | told
+    assert listed["parameters"] == answer.json()["parameters"] == created["parameters"] | stored_parameters
     assert client.post(f"/v1/jobs/{job.id}/cancel").json()["status"] == "canceled"
     problem = refused(client.post(f"/v1/jobs/{job.id}/retry"), 422, "invalid-settings")
     assert "stored by an earlier version" in problem["detail"]
@@ -392,26 +392,26 @@ def value_of(option: Declared) -> object:
 def test_submit_sends_every_parameter(
     service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0], "style_weights": [1.0, 2.5]}
-    told["style_background"] = [0.0, 0.0, 0.0]
-    told["regions"] = [
+    parameters = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0], "style_weights": [1.0, 2.5]}
+    parameters["style_background"] = [0.0, 0.0, 0.0]
+    parameters["regions"] = [
         {"name": "left", "select": "half-space=-1,0,0,0", "style": ["3_style.png:0.5"], "weight": 2.0},
         {"name": "rest", "weight": 3.0},
     ]
-    told["scales"] = [1.0, 0.0, 0.5]
+    parameters["scales"] = [1.0, 0.0, 0.5]
     texts = {"background": "white", "style_background": "black", "scales": "1,0,0.5"}
     ply, _, style = write_files(tmp_path, ball())
     command = ["submit", str(ply), "--style", str(style), "--style", f"{style}:2.5", "--url", service.url, "--json"]
     command += ["--region", "left:half-space=-1,0,0,0", "--region-style", f"left={style}:0.5"]
     command += ["--region-weight", "left=2", "--region-weight", "rest=3"]
     for name, option in declared(JobParameters).items():
-        told[name] = told.get(name) or value_of(option)
+        parameters[name] = parameters.get(name) or value_of(option)
         command += [f"--{name.replace('_', '-')}"]
-        command += [] if told[name] is True else [texts.get(name, str(told[name]))]
+        command += [] if parameters[name] is True else [texts.get(name, str(parameters[name]))]
     assert main(command) == 0
-    assert json.loads(capsys.readouterr().out)["parameters"] == told
-    assert client.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]["parameters"] == told
-    assert told.keys() == JobParameters.model_fields.keys()
+    assert json.loads(capsys.readouterr().out)["parameters"] == parameters
+    assert client.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]["parameters"] == parameters
+    assert parameters.keys() == JobParameters.model_fields.keys()
 
 
 # --- bodies --------------------------------------------------------------------------------------------------------
@@ -597,8 +597,8 @@ def test_idempotency_keys_prevent_duplicates(client: httpx.Client, files: dict[s
     assert again.headers["idempotency-replayed"] == "true"
     other = client.post("/v1/jobs", files=form(files), data={"parameters": '{"seed": 1}'}, headers=headers)
     refused(other, 422, "idempotency-key-reused")
-    made = [client.post("/v1/uploads", headers={**TUS, **headers, "Upload-Length": "5"}).json()["id"] for _ in range(2)]
-    assert made[0] == made[1]
+    ids = [client.post("/v1/uploads", headers={**TUS, **headers, "Upload-Length": "5"}).json()["id"] for _ in range(2)]
+    assert ids[0] == ids[1]
 
 
 # --- who is asking -------------------------------------------------------------------------------------------------
@@ -727,8 +727,8 @@ def test_stream_after_last_event_is_empty(client: httpx.Client, files: dict[str,
     """A stream would never end after the last event of an ended job, or after an event that does not exist."""
     job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
     client.post(f"/v1/jobs/{job_id}/cancel")
-    told = client.get(f"/v1/jobs/{job_id}/events").text
-    last = max(int(line.removeprefix("id: ")) for line in told.splitlines() if line.startswith("id: "))
+    stream = client.get(f"/v1/jobs/{job_id}/events").text
+    last = max(int(line.removeprefix("id: ")) for line in stream.splitlines() if line.startswith("id: "))
     for number in (last, last + 1, 10**15):
         answer = client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(number)})
         assert answer.status_code == 204
@@ -782,24 +782,24 @@ def test_metrics_count_attempts_by_outcome(tmp_path: Path, files: dict[str, byte
             store.leases.start(held)
             store.leases.report_progress(held, {"step": step, "seconds": seconds, "total": 100})
         text = client.get("/metrics").text
-        found = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
-        assert found["sgsst_lease_expirations_total"] == "1.0"
-        assert found["sgsst_attempts_total"] == "4.0"
-        assert found['sgsst_attempts_ended_total{outcome="lost"}'] == "1.0"
-        assert found['sgsst_attempts_ended_total{outcome="failed"}'] == "1.0"
-        assert found['sgsst_jobs_finished_total{status="failed"}'] == "1.0"
-        assert found['sgsst_jobs{status="running"}'] == "2.0"
-        assert found["sgsst_queue_wait_seconds_count"] == "4.0"
-        assert float(found["sgsst_queue_wait_seconds_sum"]) >= 2000
+        samples = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+        assert samples["sgsst_lease_expirations_total"] == "1.0"
+        assert samples["sgsst_attempts_total"] == "4.0"
+        assert samples['sgsst_attempts_ended_total{outcome="lost"}'] == "1.0"
+        assert samples['sgsst_attempts_ended_total{outcome="failed"}'] == "1.0"
+        assert samples['sgsst_jobs_finished_total{status="failed"}'] == "1.0"
+        assert samples['sgsst_jobs{status="running"}'] == "2.0"
+        assert samples["sgsst_queue_wait_seconds_count"] == "4.0"
+        assert float(samples["sgsst_queue_wait_seconds_sum"]) >= 2000
         waits = {
             float(name.split('"')[1]): float(number)
-            for name, number in found.items()
+            for name, number in samples.items()
             if name.startswith("sgsst_queue_wait_seconds_bucket")
         }
         # The first waited briefly, the other three (one of them twice) a thousand seconds.
         assert (waits[15.0], waits[900.0], waits[1800.0], waits[float("inf")]) == (1, 1, 4, 4)
-        assert found["sgsst_job_seconds_count"] == found["sgsst_outages_total"] == "0.0"
-        assert found["sgsst_iterations_per_second"] == "5.0"
+        assert samples["sgsst_job_seconds_count"] == samples["sgsst_outages_total"] == "0.0"
+        assert samples["sgsst_iterations_per_second"] == "5.0"
         assert not re.search(r"job_[0-9a-f]{11}", text), "metrics name no job"
         store.close()
 

@@ -43,10 +43,10 @@ def test_compromised_reader_does_not_affect_service(tmp_path: Path) -> None:
         assert (answer.status_code, answer.json()["code"]) == (422, "invalid-scene")
         detail = answer.json()["detail"]
         assert detail.startswith("{"), detail
-        found = json.loads(detail)
-        outcomes = {**found["files"], **found["calls"]}
+        content = json.loads(detail)
+        outcomes = {**content["files"], **content["calls"]}
         assert {name for name, outcome in outcomes.items() if outcome == "done"} == {"read own scene"}, outcomes
-        assert SECRET not in str(found["environment"])
+        assert SECRET not in str(content["environment"])
         assert client.post("/v1/jobs", files={**files, "style": ("t.png", style.read_bytes())}).status_code == 202
         assert service._process.poll() is None
         assert blob.read_bytes() == before

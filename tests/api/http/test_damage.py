@@ -45,8 +45,8 @@ def store(service: Service) -> Iterator[Store]:
 
 @pytest.fixture
 def client(service: Service) -> Iterator[httpx.Client]:
-    with service.client() as made:
-        yield made
+    with service.client() as opened:
+        yield opened
 
 
 def submit(client: httpx.Client, files: dict[str, tuple[str, bytes]]) -> str:

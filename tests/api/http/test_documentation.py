@@ -25,8 +25,8 @@ OPERATIONS: list[tuple[str, dict[str, Any]]] = [
 
 
 def resolved(schema: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = SCHEMAS[schema["$ref"].rsplit("/", 1)[1]] if "$ref" in schema else schema
-    return found
+    target: dict[str, Any] = SCHEMAS[schema["$ref"].rsplit("/", 1)[1]] if "$ref" in schema else schema
+    return target
 
 
 def examples_of(described: dict[str, Any]) -> list[object]:
@@ -39,11 +39,11 @@ def examples_of(described: dict[str, Any]) -> list[object]:
 
 def check(where: str, described: dict[str, Any]) -> None:
     """Fail if there is no example, or if one violates its schema."""
-    found = examples_of(described)
-    assert found, f"{where}: no example"
+    examples = examples_of(described)
+    assert examples, f"{where}: no example"
     schema = {**described["schema"], "components": DOCUMENT["components"]}
     validator = Draft202012Validator(schema, format_checker=FormatChecker())
-    for example in found:
+    for example in examples:
         wrong = [f"{error.json_path}: {error.message}" for error in validator.iter_errors(example)]
         assert not wrong, f"{where}: its example is not as its schema says: {wrong}"
 

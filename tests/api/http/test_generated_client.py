@@ -49,12 +49,12 @@ job = JobFromUploads(scene=scene, style=style, cameras=[cameras], parameters=par
 plan = create_job.sync(client=client, body=job, dry_run=True)
 assert isinstance(plan, PlanView), plan
 assert plan.gaussians == 616
-made = create_job.sync(client=client, body=job)
-assert isinstance(made, JobView), made
-assert get_job.sync(made.id, client=client).status == "queued"
+created = create_job.sync(client=client, body=job)
+assert isinstance(created, JobView), created
+assert get_job.sync(created.id, client=client).status == "queued"
 missing = get_job.sync("job_1a1fe701a104f943e9d4d8cce5b818c", client=client)
 assert isinstance(missing, Problem404), missing
-print(made.name)
+print(created.name)
 """
 
 
@@ -76,9 +76,9 @@ def test_generated_client_uploads_plans_and_submits(commands: Path, tmp_path: Pa
     (tmp_path / "config.yaml").write_text(json.dumps(CONFIG))
     options = ["--path", "openapi.json", "--config", "config.yaml", "--output-path", "generated", "--meta", "none"]
     generate = [str(commands / "openapi-python-client"), "generate", *options, "--fail-on-warning"]
-    made = subprocess.run(generate, cwd=tmp_path, check=False, capture_output=True, text=True)
-    assert made.returncode == 0, made.stdout + made.stderr
-    assert "WARNING" not in made.stdout + made.stderr
+    process = subprocess.run(generate, cwd=tmp_path, check=False, capture_output=True, text=True)
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert "WARNING" not in process.stdout + process.stderr
 
     ply, cameras, style = write_files(tmp_path, wall())
     with Service(tmp_path / "data", alone=True) as service:

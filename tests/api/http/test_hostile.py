@@ -64,14 +64,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 def packed(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """Return the test scene as files in compressed formats."""
     folder, scene = tmp_path_factory.mktemp("packed"), wall()
-    found: Files = {}
+    files: Files = {}
     for format in EXTRA_FORMATS:
         write_scene(folder / format.name, scene, format)
-        found[format.name] = (folder / format.name).read_bytes()
-    found["ksplat"] = ksplat(scene, level=1)
+        files[format.name] = (folder / format.name).read_bytes()
+    files["ksplat"] = ksplat(scene, level=1)
     color = bytes([200, 100, 50, 255, 255, 128, 128, 128])
     rows = [struct.pack("<6f", *mean, 0.16, 0.16, 0.01) + color for mean in scene.means.tolist()]
-    return {**found, "splat": b"".join(rows)}
+    return {**files, "splat": b"".join(rows)}
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +98,8 @@ def service(tmp_path_factory: pytest.TempPathFactory, files: Files) -> Iterator[
 
 @pytest.fixture
 def client(service: Service) -> Iterator[httpx.Client]:
-    with service.client() as made:
-        yield made
+    with service.client() as opened:
+        yield opened
 
 
 @pytest.fixture(scope="module")
@@ -136,9 +136,9 @@ def api_of(service: Service) -> psutil.Process:
 
 def memory_of(process: psutil.Process, field: str) -> int:
     status = Path(f"/proc/{process.pid}/status").read_text()
-    found = re.search(rf"{field}:\s+(\d+) kB", status)
-    assert found
-    return 1024 * int(found[1])
+    match = re.search(rf"{field}:\s+(\d+) kB", status)
+    assert match
+    return 1024 * int(match[1])
 
 
 def form(files: Files, **changed: bytes | tuple[str, bytes] | None) -> list[tuple[str, Any]]:
@@ -594,7 +594,7 @@ def test_camera_files_cannot_read_server_files(
     """If a transforms.json lacks image sizes, the reader opens the image at any path that the file contains."""
     there = tmp_path / "secret.png"
     there.write_bytes(files["style"])
-    told = set()
+    answers = set()
     for path in (there, tmp_path / "nothing.png", Path("/etc/passwd"), Path("../../../../../../etc/passwd")):
         content = json.loads(transforms(file_path=str(path)))
         del content["w"], content["h"]
@@ -602,8 +602,8 @@ def test_camera_files_cannot_read_server_files(
         answer = client.post("/v1/jobs", files=body)
         problem = answer.json() if photos else refused(answer, 422, "invalid-cameras")  # names come with their paths
         assert (answer.status_code, problem["code"]) == (422, "invalid-cameras")
-        told.add(problem["detail"].replace(str(path), "PATH").replace(str(path).lstrip("/"), "PATH"))
-    assert len(told) == 1, f"answers tell what is on the machine: {told}"
+        answers.add(problem["detail"].replace(str(path), "PATH").replace(str(path).lstrip("/"), "PATH"))
+    assert len(answers) == 1, f"answers tell what is on the machine: {answers}"
 
 
 # --- names ---------------------------------------------------------------------------------------------------------
@@ -794,7 +794,7 @@ MAY_BE_0 = {name for name in FIELDS if Ge(0) in OPTIONS[name].limits}
 MAY_BE_NEGATIVE = {"elevation", "style_rotation"}  # angles
 
 
-def told(client: httpx.Client, parameters: str) -> httpx.Response:
+def submit_text(client: httpx.Client, parameters: str) -> httpx.Response:
     """Submit a job with these parameters and files that do not exist, because parameters are validated first."""
     body = f'{{"scene": "upl_00000000000", "style": "upl_00000000000", "parameters": {parameters}}}'
     return post(client, body.encode(), "application/json")
@@ -802,13 +802,13 @@ def told(client: httpx.Client, parameters: str) -> httpx.Response:
 
 @pytest.mark.parametrize("field", FIELDS)
 def test_malformed_numbers_are_rejected(client: httpx.Client, field: str) -> None:
-    refused(told(client, "{}"), 422, "unknown-upload")
+    refused(submit_text(client, "{}"), 422, "unknown-upload")
     for number in NUMBERS:
         if field in MAY_BE_0 | MAY_BE_NEGATIVE and number == "1.5e-400":
             continue  # rounds to 0
         if field in MAY_BE_NEGATIVE and number == "-1":
             continue
-        refused(told(client, f'{{"{field}": {number}}}'), 422, "invalid-request", "invalid-settings")
+        refused(submit_text(client, f'{{"{field}": {number}}}'), 422, "invalid-request", "invalid-settings")
 
 
 TEXTS = [
@@ -843,7 +843,7 @@ TEXTS = [
 
 @pytest.mark.parametrize("text", TEXTS, ids=[text[:25] for text in TEXTS])
 def test_malformed_parameters_are_rejected(client: httpx.Client, files: Files, text: str) -> None:
-    refused(told(client, text), 422, "invalid-request", "invalid-settings")
+    refused(submit_text(client, text), 422, "invalid-request", "invalid-settings")
     answer = post(client, part('Content-Disposition: form-data; name="parameters"', text.encode()) + END)
     refused(answer, 422, "invalid-request", "invalid-settings")
 
@@ -970,8 +970,8 @@ def test_malformed_upload_parts_are_rejected(client: httpx.Client, service: Serv
     assert send(client, where, 0, bytes(100)).status_code == 204
     for offset in (0, 99, 101, 1000, 2**59):
         assert refused(send(client, where, offset, bytes(10)), 409, "conflict")["offset"] == 100
-    for told in ("-1", "x", "1.5", str(2**60), "9" * 5000, "", *NO_DIGITS):
-        refused(send(client, where, told, bytes(10)), 422, "invalid-request")
+    for value in ("-1", "x", "1.5", str(2**60), "9" * 5000, "", *NO_DIGITS):
+        refused(send(client, where, value, bytes(10)), 422, "invalid-request")
     wrong = base64.b64encode(bytes(32)).decode()
     refused(send(client, where, 100, bytes(10), **{"Upload-Checksum": f"sha256 {wrong}"}), 460, "checksum-mismatch")
     refused(send(client, where, 100, bytes(10), **{"Upload-Checksum": "sha256"}), 460, "checksum-mismatch")
@@ -1096,13 +1096,13 @@ def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.
         store.leases.stop(lease)
         lease = store.leases.take("test")
     assert lease is not None
-    made = tmp_path_factory.mktemp("results")
-    (made / "stylized.ply").write_bytes(files["scene"])
-    (made / "log.txt").write_bytes(b"")
-    (made / "report.html").write_text("<script>alert(1)</script>")
+    folder = tmp_path_factory.mktemp("results")
+    (folder / "stylized.ply").write_bytes(files["scene"])
+    (folder / "log.txt").write_bytes(b"")
+    (folder / "report.html").write_text("<script>alert(1)</script>")
     artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
-    published = [artifacts.put(job_id, lease.epoch, path.name, path) for path in sorted(made.iterdir())]
-    published.append(artifacts.put(job_id, lease.epoch, ".checkpoint", made / "log.txt"))
+    published = [artifacts.put(job_id, lease.epoch, path.name, path) for path in sorted(folder.iterdir())]
+    published.append(artifacts.put(job_id, lease.epoch, ".checkpoint", folder / "log.txt"))
     store.leases.start(lease)
     store.leases.publish(lease, published)
     store.leases.succeed(lease, published[:-1], {})
@@ -1220,21 +1220,21 @@ def exchange(service: Service, head: str, body: bytes = b"") -> tuple[bytes, byt
         answer = b""
         while more := connection.recv(65536):
             answer += more
-    found, _, rest = answer.partition(b"\r\n\r\n")
-    return found, rest
+    headers, _, rest = answer.partition(b"\r\n\r\n")
+    return headers, rest
 
 
 def answer_on(connection: socket.socket) -> tuple[bytes, bytes]:
     """Return head and body of the next response, which must have a Content-Length. The connection stays open."""
     connection.settimeout(60)
     answer = connection.recv(65536)
-    while not (found := re.search(rb"content-length: ([0-9]+)\r\n.*?\r\n\r\n", answer, re.DOTALL | re.IGNORECASE)) or (
-        len(answer) < found.end() + int(found[1])
+    while not (match := re.search(rb"content-length: ([0-9]+)\r\n.*?\r\n\r\n", answer, re.DOTALL | re.IGNORECASE)) or (
+        len(answer) < match.end() + int(match[1])
     ):
         more = connection.recv(65536)
         assert more, answer
         answer += more
-    return answer[: found.end()], answer[found.end() :]
+    return answer[: match.end()], answer[match.end() :]
 
 
 def closed(connection: socket.socket) -> bytes:
@@ -1606,8 +1606,8 @@ def test_paths_cannot_inject_log_lines(service: Service, client: httpx.Client) -
     def logged() -> list[str]:
         return [line for line in service.log.read_bytes()[before:].decode().split("\n") if "forged" in line]
 
-    found = wait_for(lambda: logged() if len(logged()) == 5 else None, "the requests in the log")
-    for line in found:
+    lines = wait_for(lambda: logged() if len(logged()) == 5 else None, "the requests in the log")
+    for line in lines:
         assert line.isprintable()
         assert re.fullmatch(r'\S+ info {4}request  method=GET path="/v1/[^"]*forged" status=404 seconds=\S+', line)
 
@@ -1618,5 +1618,5 @@ def test_hostile_requests_leave_no_files(service: Service, client: httpx.Client,
     metrics = client.get("/metrics").text
     assert not re.findall(r'sgsst_requests_total\{[^}]*status="(?!503)5\d\d"\} [1-9]', metrics)
     known = store.inputs.locations()
-    found = {f"{path.parent.name}/{path.name}" for path in (service.data / "blobs").glob("*/*")}
-    assert found == known
+    files = {f"{path.parent.name}/{path.name}" for path in (service.data / "blobs").glob("*/*")}
+    assert files == known

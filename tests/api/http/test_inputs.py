@@ -59,8 +59,8 @@ def store(service: Service) -> Iterator[Store]:
 
 @pytest.fixture(scope="module")
 def client(service: Service) -> Iterator[httpx.Client]:
-    with service.client() as made:
-        yield made
+    with service.client() as opened:
+        yield opened
 
 
 @pytest.fixture(scope="module")
@@ -205,14 +205,14 @@ def test_hostile_file_names_are_sanitized(client: httpx.Client, files: dict[str,
 def test_previews_and_loss_history(client: httpx.Client, files: dict[str, Path], store: Store, tmp_path: Path) -> None:
     job_id = submit(client, files, ["style.png"])
     assert client.get(f"/v1/jobs/{job_id}/progress").json() == {"points": []}
-    picture = tmp_path / "p.jpg"
-    picture.write_bytes(b"\xff\xd8\xff")
+    image_path = tmp_path / "p.jpg"
+    image_path.write_bytes(b"\xff\xd8\xff")
     while (held := store.leases.take("test")) is not None and held.job_id != job_id:
         store.leases.succeed(held, [], {})
     assert held is not None
     artifacts = Artifacts(ServiceSettings(data=Path(store.database.url.database or "").parent).artifacts_url)
     names = ["previews/step_0000000.jpg", "previews/step_0000020.jpg"]
-    store.leases.publish(held, [artifacts.put(job_id, held.epoch, name, picture) for name in names])
+    store.leases.publish(held, [artifacts.put(job_id, held.epoch, name, image_path) for name in names])
     for step in range(1, 31):
         known = {"stage": "sos", "total": 600, "fraction": step / 600, "eta_s": None, "attempt": held.job.attempt}
         known |= {"step": step, "seconds": float(step), "loss": 100.0 / step, "scales": [None, 100.0 / step]}
@@ -221,7 +221,7 @@ def test_previews_and_loss_history(client: httpx.Client, files: dict[str, Path],
     (listed,) = [job for job in client.get("/v1/jobs").json()["jobs"] if job["id"] == job_id]
     shown = client.get(f"/v1/jobs/{job_id}").json()
     assert listed["preview"] == shown["preview"] == names[1]
-    assert client.get(f"/v1/jobs/{job_id}/artifacts/{listed['preview']}").content == picture.read_bytes()
+    assert client.get(f"/v1/jobs/{job_id}/artifacts/{listed['preview']}").content == image_path.read_bytes()
     assert shown["progress"]["scales"] == [None, 100.0 / 30]
     points = client.get(f"/v1/jobs/{job_id}/progress").json()["points"]
     assert len(points) <= MOST_POINTS

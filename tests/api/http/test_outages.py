@@ -96,8 +96,8 @@ def outage(tmp_path_factory: pytest.TempPathFactory, files: dict[str, bytes]) ->
     if not is_installed():
         pytest.skip("PostgreSQL's server is not installed")
     with controlled_server() as postgres:
-        made = open_service(tmp_path_factory.mktemp("outage") / "data", fresh_database(postgres.url), files)
-        for service, key, job_id, upload_id in made:
+        opened = open_service(tmp_path_factory.mktemp("outage") / "data", fresh_database(postgres.url), files)
+        for service, key, job_id, upload_id in opened:
             yield Outage(service, key, job_id, upload_id, postgres)
 
 
@@ -105,28 +105,28 @@ def outage(tmp_path_factory: pytest.TempPathFactory, files: dict[str, bytes]) ->
 def operations() -> list[tuple[str, str]]:
     """Return method and path of every operation that needs the database."""
     document = create_app(ServiceSettings()).openapi()
-    found = [(method, path) for path, methods in document["paths"].items() for method in methods]
-    return [each for each in found if each not in WITHOUT_DATABASE]
+    pairs = [(method, path) for path, methods in document["paths"].items() for method in methods]
+    return [each for each in pairs if each not in WITHOUT_DATABASE]
 
 
 def request(client: httpx.Client, method: str, path: str, outage: Outage, files: dict[str, bytes]) -> httpx.Response:
     """Send a request that would succeed, or be refused for the job's state, if the database were available."""
-    told: dict[str, Any] = {}
+    body: dict[str, Any] = {}
     if (method, path) == ("post", "/v1/jobs"):
-        told = {"files": form(files)}
+        body = {"files": form(files)}
     elif path.startswith("/v1/uploads"):
-        told = {"headers": {**TUS, "Upload-Length": "100"}}
+        body = {"headers": {**TUS, "Upload-Length": "100"}}
     elif path == "/v1/session":
-        told = {"headers": {"Cookie": "sgsst_session=x", "Origin": outage.service.url}}
+        body = {"headers": {"Cookie": "sgsst_session=x", "Origin": outage.service.url}}
     if path == "/v1/session" and method == "post":
-        told["json"] = {"key": outage.key}
+        body["json"] = {"key": outage.key}
     if (method, path) == ("patch", "/v1/jobs/{job_id}"):
-        told["json"] = {"name": "renamed"}
+        body["json"] = {"name": "renamed"}
     elif method == "patch":
-        told["headers"] |= {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
-        told["content"] = b"x" * 10
+        body["headers"] |= {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+        body["content"] = b"x" * 10
     values = {"job_id": outage.job_id, "upload_id": outage.upload_id, "role": "scene", "name": "stylized.ply"}
-    return client.request(method, path.format(**values), **told)
+    return client.request(method, path.format(**values), **body)
 
 
 def check_away(answer: httpx.Response) -> None:
@@ -188,8 +188,8 @@ def test_stream_resumes_when_database_returns(outage: Outage, files: dict[str, b
             with outage.kind("killed"):
                 check_away(other.get(f"/v1/jobs/{job_id}"))
             assert other.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
-            told = [json.loads(line[6:]) for line in lines if line.startswith("data: ")]
-            assert told[-1]["status"] == "canceled"
+            events = [json.loads(line[6:]) for line in lines if line.startswith("data: ")]
+            assert events[-1]["status"] == "canceled"
 
 
 @pytest.mark.parametrize("kind", ["killed", pytest.param("stopped", marks=pytest.mark.slow)])

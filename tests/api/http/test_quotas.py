@@ -96,7 +96,7 @@ def owner_and_key(service: Service, quotas: Quotas) -> tuple[str, str]:
 
 def on_disk(service: Service) -> int:
     """Return the total bytes of stored inputs and unfinished uploads of all owners."""
-    found = {}
+    sizes = {}
     for folder in ("blobs", "incoming", "uploads", "inspections"):
         for path in (service.data / folder).rglob("*"):
             try:
@@ -104,8 +104,8 @@ def on_disk(service: Service) -> int:
             except FileNotFoundError:
                 continue
             if path.is_file():
-                found[status.st_ino] = status.st_size
-    return sum(found.values())
+                sizes[status.st_ino] = status.st_size
+    return sum(sizes.values())
 
 
 def test_quotas_of_jobs_bytes_and_requests(service: Service, files: dict[str, bytes]) -> None:
@@ -178,13 +178,13 @@ def test_dry_runs_and_full_queues_release_quota(tmp_path: Path, files: dict[str,
             assert "estimated_seconds" in answer.text
             assert on_disk(service) == 0, accept
         assert client.post("/v1/jobs", files=form(files)).status_code == 202
-        kept = on_disk(service)
-        assert kept == sum(len(content) for content in files.values())
+        before = on_disk(service)
+        assert before == sum(len(content) for content in files.values())
         refused(client.post("/v1/jobs", files=form(files)), 429, "queue-full")
-        assert on_disk(service) == kept, "the job still needs the same files"
+        assert on_disk(service) == before, "the job still needs the same files"
         other = {**files, "cameras": files["cameras"] + b"\n"}
         refused(client.post("/v1/jobs", files=form(other)), 429, "queue-full")
-        assert on_disk(service) == kept
+        assert on_disk(service) == before
         job_id = client.get("/v1/jobs").json()["jobs"][0]["id"]
         client.post(f"/v1/jobs/{job_id}/cancel")
         assert client.delete(f"/v1/jobs/{job_id}").status_code == 204

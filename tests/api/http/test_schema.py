@@ -61,8 +61,8 @@ def checks() -> list[Any]:
         "negative_data_rejection": refuses_what_is_wrong,
         "missing_required_header": refuses_what_lacks_a_header,
     }
-    found = [own.get(check.__name__, check) for check in CHECKS.get_all()]
-    return [check for check in found if check is not None]
+    chosen = [own.get(check.__name__, check) for check in CHECKS.get_all()]
+    return [check for check in chosen if check is not None]
 
 
 @pytest.fixture(scope="module")
@@ -133,22 +133,22 @@ class Uploaded:
 
     def document(self) -> dict[str, Any]:
         """Return the OpenAPI document with these files' ids in all jobs: schemas cannot express which ids exist."""
-        found = copy.deepcopy(DOCUMENT)
+        changed = copy.deepcopy(DOCUMENT)
         scene, style, cameras = self._ids
         seed = {"type": "integer", "minimum": 0, "maximum": 9}
-        found["components"]["schemas"]["JobFromUploads"]["properties"] = {
+        changed["components"]["schemas"]["JobFromUploads"]["properties"] = {
             "scene": {"const": scene},
             "style": {"const": style},
             "cameras": {"const": [cameras]},
             "parameters": {"type": "object", "additionalProperties": False, "properties": {"seed": seed}},
         }
-        found["components"]["schemas"]["JobFromUploads"]["required"] = ["scene", "style", "cameras"]
-        del found["paths"]["/v1/jobs"]["post"]["requestBody"]["content"]["multipart/form-data"]
-        for operations in found["paths"].values():
+        changed["components"]["schemas"]["JobFromUploads"]["required"] = ["scene", "style", "cameras"]
+        del changed["paths"]["/v1/jobs"]["post"]["requestBody"]["content"]["multipart/form-data"]
+        for operations in changed["paths"].values():
             for operation in operations.values():
                 for parameter in operation.get("parameters", []):
                     parameter["schema"] = RIGHT.get(parameter["name"], parameter["schema"])
-        return found
+        return changed
 
     def finish_jobs(self) -> None:
         """Finish all queued jobs with results, in place of a dispatcher (`test_service` runs a real one)."""
@@ -227,7 +227,7 @@ def _upload(client: httpx.Client, path: Path) -> str:
     name = base64.b64encode(path.name.encode()).decode()
     tus = {"Tus-Resumable": "1.0.0"}
     headers = {**tus, "Upload-Length": str(path.stat().st_size), "Upload-Metadata": f"filename {name}"}
-    made = client.post("/v1/uploads", headers=headers).json()
+    upload = client.post("/v1/uploads", headers=headers).json()
     headers = {**tus, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
-    client.patch(f"/v1/uploads/{made['id']}", content=path.read_bytes(), headers=headers)
-    return str(made["id"])
+    client.patch(f"/v1/uploads/{upload['id']}", content=path.read_bytes(), headers=headers)
+    return str(upload["id"])

@@ -41,9 +41,9 @@ def store(service: Service) -> Iterator[Store]:
 @pytest.fixture
 def browser(service: Service) -> Iterator[httpx.Client]:
     """Return a client that stores cookies and sends `Origin`, as browsers do."""
-    with service.client() as made:
-        made.headers["Origin"] = service.url
-        yield made
+    with service.client() as opened:
+        opened.headers["Origin"] = service.url
+        yield opened
 
 
 @pytest.fixture
@@ -56,8 +56,8 @@ def sign_in(browser: httpx.Client, key: str, **headers: str) -> httpx.Response:
 
 
 def cookie_of(answer: httpx.Response) -> Morsel[str]:
-    found: SimpleCookie = SimpleCookie(answer.headers["set-cookie"])
-    return found[COOKIE]
+    cookies: SimpleCookie = SimpleCookie(answer.headers["set-cookie"])
+    return cookies[COOKIE]
 
 
 def refused(answer: httpx.Response, status: int, code: str) -> None:
@@ -335,9 +335,9 @@ def test_session_expires(tmp_path: Path) -> None:
     row, _ = store.keys.create("jan")
     text = store.sessions.create(row.id)
     now += 86_399
-    found = store.sessions.find(text)
-    assert found is not None
-    assert found.id == row.id
+    session = store.sessions.find(text)
+    assert session is not None
+    assert session.id == row.id
     now += 1
     assert store.sessions.find(text) is None
     store.sessions.create(row.id)

@@ -23,8 +23,8 @@ BUNDLE = "vendor/swagger-ui/swagger-ui-bundle.js"
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     data = tmp_path_factory.mktemp("static") / "data"
-    with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as running, running.client() as made:
-        yield made
+    with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as running, running.client() as opened:
+        yield opened
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +70,9 @@ def test_files_are_cached_by_digest(client: httpx.Client, files: StaticFiles) ->
 
 def test_page_knows_the_registered_scene_formats(client: httpx.Client, files: StaticFiles) -> None:
     module = client.get(f"/static/{files.digest}/scene_formats.js").text
-    found = re.search(r"sceneFormats = .*\((\[.*\])\);", module)
-    assert found
-    assert [entry["suffix"] for entry in json.loads(found[1])] == [format.suffix for format in FORMATS]
+    match = re.search(r"sceneFormats = .*\((\[.*\])\);", module)
+    assert match
+    assert [entry["suffix"] for entry in json.loads(match[1])] == [format.suffix for format in FORMATS]
 
 
 def test_page_knows_the_states_of_jobs(client: httpx.Client, files: StaticFiles) -> None:

@@ -91,8 +91,8 @@ class Watched:
     def check(self, *allowed: str) -> None:
         """Fail on any error, except for console errors that contain one of the allowed texts."""
         violations = self.page.evaluate("() => window.violations")
-        found = [text for text in self.wrong if not any(part in text for part in allowed)]
-        assert not found, found
+        messages = [text for text in self.wrong if not any(part in text for part in allowed)]
+        assert not messages, messages
         assert not violations, violations
 
     def settled(self) -> None:
@@ -111,22 +111,22 @@ class Watched:
         self.settled()
         with self.page.expect_download() as download:
             self.page.get_by_role("button", name="Save image").click()
-        with Image.open(download.value.path()) as picture:
-            return np.asarray(picture.convert("RGB"), dtype=np.float64)
+        with Image.open(download.value.path()) as image:
+            return np.asarray(image.convert("RGB"), dtype=np.float64)
 
 
 def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
     """Render a scene file with `sgsst render`, [h, w, 3], 0 to 255."""
-    found = read_scene(scene).scene
-    colors = view_colors(found.sh_dc, rest_colors(found.sh_rest, found.means, camera))
-    image = make_rasterizer("cpu", found).render(colors, camera)
+    loaded = read_scene(scene).scene
+    colors = view_colors(loaded.sh_dc, rest_colors(loaded.sh_rest, loaded.means, camera))
+    image = make_rasterizer("cpu", loaded).render(colors, camera)
     return (image.double().clamp(0, 1) * 255).round().numpy()
 
 
-def psnr(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
+def psnr(actual: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:
     """Return the peak signal-to-noise ratio in decibels between images [h, w, 3] with values from 0 to 255."""
-    assert found.shape == wanted.shape, (found.shape, wanted.shape)
-    return float(10 * np.log10(255**2 / max(float(((found - wanted) ** 2).mean()), 1e-9)))
+    assert actual.shape == wanted.shape, (actual.shape, wanted.shape)
+    return float(10 * np.log10(255**2 / max(float(((actual - wanted) ** 2).mean()), 1e-9)))
 
 
 #: Script that shows a scene with the page's own modules. It takes `[base, scene, cameras, name, width, height]`, and

@@ -19,8 +19,8 @@ def browser() -> Iterator[Any]:
     reason = missing()
     if reason:
         pytest.skip(reason)
-    with open_browser() as found:
-        yield found
+    with open_browser() as opened:
+        yield opened
 
 
 @pytest.fixture(scope="module")

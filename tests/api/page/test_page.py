@@ -178,9 +178,9 @@ def test_refusals_stand_beside_their_field(visit: Visit, files: dict[str, Path],
     set_options(watched, steps_sos=10)
     page.get_by_role("button", name="Start").click()
     page.locator(".slot", has_text="Scene").get_by_text("Choose a scene.").wait_for()
-    picture = tmp_path / "style.png"
-    picture.write_bytes(b"this is no picture")
-    choose(watched, files | {"style": picture})
+    image_path = tmp_path / "style.png"
+    image_path.write_bytes(b"this is no picture")
+    choose(watched, files | {"style": image_path})
     page.get_by_role("button", name="Estimate time").click()
     page.locator(".slot", has_text="Style").get_by_text("not an image").wait_for()
     page.get_by_role("button", name="Remove style.png").click()
@@ -296,8 +296,8 @@ def test_requested_render_mode_is_shown(visit: Visit, service: Service, files: d
     wanted = rendered(result, camera)
     classic = read_scene(result).rendered("classic", None).scene
     other = make_rasterizer("cpu", classic).render(scene_colors(classic, camera), camera).clamp(0, 1).numpy() * 255
-    found = frame_of(watched, wanted)
-    assert psnr(found, wanted) > psnr(found, other) + 6
+    frame = frame_of(watched, wanted)
+    assert psnr(frame, wanted) > psnr(frame, other) + 6
     watched.check()
 
 
@@ -355,8 +355,8 @@ def test_accessible_and_never_too_wide(
             page.locator(".tile").first.wait_for()
         if name == "job":
             watched.settled()
-        found = Axe().run(page)
-        assert found.violations_count == 0, f"{name}: {found.generate_report()}"
+        violations = Axe().run(page)
+        assert violations.violations_count == 0, f"{name}: {violations.generate_report()}"
         assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth"), name
     watched.check()
 
@@ -423,8 +423,8 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
 
 def _new_key(service: Service, name: str) -> str:
     command = [sys.executable, "-m", "api.cli", "keys", "create", name]
-    made = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
-    return made.stdout.split()[-1]
+    process = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
+    return process.stdout.split()[-1]
 
 
 def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
@@ -448,8 +448,8 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
     job_id = page.url.rsplit("/", 1)[1]
     parameters = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["parameters"]
     assert parameters["style_weights"] == [3.0, 1.0]
-    (kept,) = parameters["regions"]
-    assert (kept["name"], kept["select"], kept["freeze"]) == ("left", "half-space=1,0,0,0", True)
+    (own_region,) = parameters["regions"]
+    assert (own_region["name"], own_region["select"], own_region["freeze"]) == ("left", "half-space=1,0,0,0", True)
     result = tmp_path / "stylized.ply"
     result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     before, after = read_scene(files["scene"]).scene, read_scene(result).scene

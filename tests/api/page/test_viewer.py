@@ -63,8 +63,8 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
     write_files(tmp_path, scene, views)
     watched = visit("/#/jobs")
     for camera in views:
-        found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
-        assert psnr(found, rendered(tmp_path / "scene.ply", camera)) >= FAITHFUL, camera.name
+        pixels = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
+        assert psnr(pixels, rendered(tmp_path / "scene.ply", camera)) >= FAITHFUL, camera.name
     watched.check()
 
 
@@ -89,8 +89,8 @@ def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path
         (tmp_path / f"scene.{form}").rename(ply)
     watched = visit("/#/jobs")
     for camera in views[:2]:
-        found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
-        assert psnr(found, rendered(ply, camera)) >= FAITHFUL, camera.name
+        pixels = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
+        assert psnr(pixels, rendered(ply, camera)) >= FAITHFUL, camera.name
     watched.check()
 
 
@@ -129,12 +129,12 @@ def dust() -> Scene:
 def assert_shown_like(watched: Watched, folder: Path, scene: Path, *, differs: bool) -> None:
     """Assert that the page shows a scene like `sgsst render`, and whether a classic render differs clearly."""
     camera = cameras(2, 120, 90)[0]
-    found = decoded(shown(watched, folder, camera.name, (camera.width, camera.height)))
-    assert psnr(found, rendered(scene, camera)) >= FAITHFUL
+    pixels = decoded(shown(watched, folder, camera.name, (camera.width, camera.height)))
+    assert psnr(pixels, rendered(scene, camera)) >= FAITHFUL
     classic = read_scene(scene).rendered("classic", None).scene
     image = make_rasterizer("cpu", classic).render(scene_colors(classic, camera), camera)
     expected = np.rint(image.clamp(0, 1).double().numpy() * 255)
-    assert (psnr(found, expected) < 35) == differs
+    assert (psnr(pixels, expected) < 35) == differs
     watched.check()
 
 
@@ -157,8 +157,8 @@ def test_old_spz_is_shown(visit: Visit, tmp_path: Path, version: int, stated: bo
     ply, _, _ = write_files(tmp_path, scene)
     ply.write_bytes(old_spz(scene, version, stated))
     watched, camera = visit("/#/jobs"), cameras()[0]
-    found = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
-    assert psnr(found, rendered(ply, camera)) >= FAITHFUL
+    pixels = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
+    assert psnr(pixels, rendered(ply, camera)) >= FAITHFUL
     watched.check()
 
 
@@ -269,11 +269,11 @@ def test_halves_are_rounded_to_nearest(visit: Visit, tmp_path: Path) -> None:
       return Array.from(new Uint32Array(new Float32Array(VALUES).buffer), halfOf);
     }""".replace("VALUES", json.dumps(values.tolist()))
     write_files(tmp_path, wall())
-    found = np.array(shown(visit("/#/jobs"), tmp_path, "view_1", (64, 48), steps), dtype=np.uint16).view(np.float16)
+    halves = np.array(shown(visit("/#/jobs"), tmp_path, "view_1", (64, 48), steps), dtype=np.uint16).view(np.float16)
     wanted = values.astype(np.float32).clip(-65504, 65504)
     below = np.abs(wanted).clip(max=32767).astype(np.float16)
     spacing = np.where(np.abs(wanted) > 32767, 32.0, np.spacing(below).astype(np.float64))
-    assert (np.abs(found.astype(np.float64) - wanted) <= spacing / 2 * (1 + 1e-6)).all()
+    assert (np.abs(halves.astype(np.float64) - wanted) <= spacing / 2 * (1 + 1e-6)).all()
 
 
 def test_lost_graphics_device_comes_back(visit: Visit, tmp_path: Path) -> None:

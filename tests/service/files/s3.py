@@ -112,8 +112,8 @@ class FaultyS3:
             threading.Event().wait(20)
             handler.close_connection = True
         else:
-            kept = {name: value for name, value in handler.headers.items() if name.lower() != "connection"}
-            request = client.build_request(handler.command, handler.path, headers=kept, content=body)
+            headers = {name: value for name, value in handler.headers.items() if name.lower() != "connection"}
+            request = client.build_request(handler.command, handler.path, headers=headers, content=body)
             answer = client.send(request)
             self._send(handler, answer.status_code, dict(answer.headers), answer.content, cut=fault == "cut-off")
 

@@ -53,23 +53,23 @@ def test_file_is_fetched_once(cache: FileCache, tmp_path: Path) -> None:
 
 
 def test_least_recently_used_files_are_evicted_unless_in_use(cache: FileCache, tmp_path: Path) -> None:
-    found = [content(number) for number in range(5)]
+    paths = [content(number) for number in range(5)]
     for number in (0, 1):
-        cache.link(found[number][1], 1000, tmp_path / str(number), Source(found[number][0]))
+        cache.link(paths[number][1], 1000, tmp_path / str(number), Source(paths[number][0]))
     (tmp_path / "0").unlink()
     (tmp_path / "1").unlink()
-    again = Source(found[0][0])
-    cache.link(found[0][1], 1000, tmp_path / "0", again)  # used again and released, so the other one is now older
+    again = Source(paths[0][0])
+    cache.link(paths[0][1], 1000, tmp_path / "0", again)  # used again and released, so the other one is now older
     (tmp_path / "0").unlink()
     assert again.fetched == 0
-    cache.link(found[2][1], 1000, tmp_path / "2", Source(found[2][0]))
-    assert files(tmp_path) == {found[0][1], found[2][1]}
-    cache.link(found[3][1], 1000, tmp_path / "3", Source(found[3][0]))
-    cache.link(found[4][1], 1000, tmp_path / "4", Source(found[4][0]))
-    assert files(tmp_path) == {found[number][1] for number in (2, 3, 4)}, "all of them are in use"
+    cache.link(paths[2][1], 1000, tmp_path / "2", Source(paths[2][0]))
+    assert files(tmp_path) == {paths[0][1], paths[2][1]}
+    cache.link(paths[3][1], 1000, tmp_path / "3", Source(paths[3][0]))
+    cache.link(paths[4][1], 1000, tmp_path / "4", Source(paths[4][0]))
+    assert files(tmp_path) == {paths[number][1] for number in (2, 3, 4)}, "all of them are in use"
     (tmp_path / "2").unlink()
     cache.evict()
-    assert files(tmp_path) == {found[3][1], found[4][1]}
+    assert files(tmp_path) == {paths[3][1], paths[4][1]}
 
 
 def test_transfer_error_is_fetched_again(cache: FileCache, tmp_path: Path) -> None:

@@ -80,17 +80,17 @@ def test_object_names_are_never_reused(artifacts: Artifacts, tmp_path: Path) -> 
 
 def test_objects_without_rows_are_swept(artifacts: Artifacts, tmp_path: Path) -> None:
     source = write(tmp_path, 10)
-    kept, lost = (artifacts.put("job_1", epoch, "stylized.ply", source) for epoch in (2, 1))
+    referenced, lost = (artifacts.put("job_1", epoch, "stylized.ply", source) for epoch in (2, 1))
     other = artifacts.put("job_10", 1, "stylized.ply", source)
-    artifacts.sweep("job_1", 9, {kept.location})
-    assert b"".join(artifacts.read(kept.location, 0, 10)) == source.read_bytes()
+    artifacts.sweep("job_1", 9, {referenced.location})
+    assert b"".join(artifacts.read(referenced.location, 0, 10)) == source.read_bytes()
     with pytest.raises(FileNotFoundError):
         list(artifacts.read(lost.location, 0, 10))
     artifacts.remove_job("job_1")
     with pytest.raises(FileNotFoundError):
-        list(artifacts.read(kept.location, 0, 10))
+        list(artifacts.read(referenced.location, 0, 10))
     assert b"".join(artifacts.read(other.location, 0, 10)) == source.read_bytes()
-    artifacts.remove(kept.location)
+    artifacts.remove(referenced.location)
     artifacts.remove_job("job_1")
 
 
@@ -150,8 +150,8 @@ def test_api_and_dispatcher_share_a_bucket_and_no_folder(
             return client.get(where).json()["status"] in ("succeeded", "failed")
 
         wait_for(ended, "the job's end", service.said)
-        found = client.get(where).json()
-        assert found["status"] == "succeeded", found["error"]
+        job = client.get(where).json()
+        assert job["status"] == "succeeded", job["error"]
         result = client.get(f"{where}/artifacts/stylized.ply")
         assert result.content == expected
         tail = client.get(f"{where}/artifacts/stylized.ply", headers={"Range": "bytes=-100"})

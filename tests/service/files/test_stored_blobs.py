@@ -205,7 +205,7 @@ def test_one_of_two_concurrent_writers_gets_a_conflict(fleet: Fleet) -> None:
 
 def test_cache_is_evicted_for_incoming_files(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     host = fleet.host("one")
-    used, kept = (fleet.take(host, os.urandom(size)) for size in (3000, 5000))
+    used, newest = (fleet.take(host, os.urandom(size)) for size in (3000, 5000))
     folder = fleet.folder / "one" / "cache" / "files"
 
     def free(_: Path) -> SimpleNamespace:
@@ -214,7 +214,7 @@ def test_cache_is_evicted_for_incoming_files(fleet: Fleet, monkeypatch: pytest.M
     monkeypatch.setattr("service.files.blobs.shutil.disk_usage", free)
     with host.local_files(fleet.store.inputs.blobs([used])):
         host.ensure_space(2000)
-        assert (folder / kept[:2] / kept).exists()
+        assert (folder / newest[:2] / newest).exists()
         host.ensure_space(7000)
         assert {path.name for path in folder.glob("*/*")} == {used}, "it is in use"
         with pytest.raises(NoSpaceError):
@@ -227,9 +227,9 @@ def test_disk_without_inodes_rejects_files(fleet: Fleet, monkeypatch: pytest.Mon
     disk = os.statvfs(host.incoming)
 
     def inodes(files: int, left: int) -> None:
-        found = SimpleNamespace(f_files=files, f_favail=left, f_bavail=disk.f_bavail, f_frsize=disk.f_frsize)
-        found.f_blocks, found.f_bfree = disk.f_blocks, disk.f_bfree
-        monkeypatch.setattr("service.files.blobs.os.statvfs", lambda _: found)
+        statistics = SimpleNamespace(f_files=files, f_favail=left, f_bavail=disk.f_bavail, f_frsize=disk.f_frsize)
+        statistics.f_blocks, statistics.f_bfree = disk.f_blocks, disk.f_bfree
+        monkeypatch.setattr("service.files.blobs.os.statvfs", lambda _: statistics)
 
     host.ensure_space(0)
     inodes(10_000, 999)

@@ -50,8 +50,8 @@ def fork() -> None:
 
 
 def connect(port: int) -> None:
-    with socket.socket() as made:
-        made.connect(("127.0.0.1", port))
+    with socket.socket() as client:
+        client.connect(("127.0.0.1", port))
 
 
 def signal_by_pipe(process: int) -> None:

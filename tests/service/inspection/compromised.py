@@ -21,9 +21,9 @@ def taken_over(path: Path) -> Any:
     _, mark, code = path.read_bytes().partition(b"# attack\n")
     if not mark:
         return read_scene_header(path)
-    told: dict[str, Any] = {"__name__": "attack"}
-    exec(code, told)
-    raise SceneError(json.dumps(told["told"]))
+    namespace: dict[str, Any] = {"__name__": "attack"}
+    exec(code, namespace)
+    raise SceneError(json.dumps(namespace["reached"]))
 
 
 setattr(process, "read_scene_header", taken_over)  # noqa: B010 (it is another module's)

@@ -62,8 +62,8 @@ def large(path: Path, side: int) -> Path:
 
 def test_limits_grow_with_the_size_of_a_scene(files: dict[str, Path], tmp_path: Path) -> None:
     files["scene"] = large(tmp_path / "large.ply", 300)
-    found = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
-    assert (found["gaussians"], found["sh_degree"]) == (90_000, 3)
+    findings = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
+    assert (findings["gaussians"], findings["sh_degree"]) == (90_000, 3)
 
 
 def test_small_file_that_expands_exceeds_the_memory_limit(files: dict[str, Path], tmp_path: Path) -> None:
@@ -78,5 +78,5 @@ def test_small_file_that_expands_exceeds_the_memory_limit(files: dict[str, Path]
 def test_large_scene_is_read_within_its_memory_limit(files: dict[str, Path], tmp_path: Path) -> None:
     files["scene"] = large(tmp_path / "large.ply", 1010)
     assert files["scene"].stat().st_size > 250_000_000
-    found = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
-    assert found["gaussians"] == 1010**2
+    findings = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
+    assert findings["gaussians"] == 1010**2

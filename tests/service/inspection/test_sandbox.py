@@ -62,17 +62,17 @@ def attacked(
 ) -> dict[str, Any]:
     """Run the attack in a reader, and return the outcomes that it reports."""
     monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED), *lacking))
-    code = f"# attack\n{source.getsource(attack)}\ntold = attack({target!r})\n".encode()
+    code = f"# attack\n{source.getsource(attack)}\nreached = attack({target!r})\n".encode()
     scene = folder / "attack" / "scene.ply"
     scene.parent.mkdir()
     scene.write_bytes(code)
     with pytest.raises(RefusedInputError) as caught:
         inspect(folder, {**files, "scene": scene})
-    found: dict[str, Any] = json.loads(str(caught.value))
+    reached: dict[str, Any] = json.loads(str(caught.value))
     assert scene.read_bytes() == code
     assert "landlock" in lacking or (Path(target["outside"]) / "there").read_text() == "there"
     assert inspect(folder, files)["gaussians"] == 616, "others' files are checked as before"
-    return found
+    return reached
 
 
 def allowed(outcomes: dict[str, str]) -> set[str]:
@@ -82,14 +82,14 @@ def allowed(outcomes: dict[str, str]) -> set[str]:
 def test_compromised_reader_reaches_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
-    found = attacked(monkeypatch, tmp_path, files, target)
-    assert allowed(found["files"]) == {"read own scene"}, found["files"]
-    assert allowed(found["calls"]) == set(), found["calls"]
-    assert set(found["files"].values()) | set(found["calls"].values()) <= {"done", "EACCES", "EPERM", "EXDEV"}
-    assert "secret" not in found["environment"].values()
-    assert found["environment"].keys() <= {*inspector._ENVIRONMENT, *ADDED}
-    assert found["log"] == "/dev/null"
-    assert len(found["descriptors"]) == 4, "nothing, three times, and the pipe that its answer goes through"
+    reached = attacked(monkeypatch, tmp_path, files, target)
+    assert allowed(reached["files"]) == {"read own scene"}, reached["files"]
+    assert allowed(reached["calls"]) == set(), reached["calls"]
+    assert set(reached["files"].values()) | set(reached["calls"].values()) <= {"done", "EACCES", "EPERM", "EXDEV"}
+    assert "secret" not in reached["environment"].values()
+    assert reached["environment"].keys() <= {*inspector._ENVIRONMENT, *ADDED}
+    assert reached["log"] == "/dev/null"
+    assert len(reached["descriptors"]) == 4, "nothing, three times, and the pipe that its answer goes through"
     assert sorted(path.name for path in Path(target["outside"]).iterdir()) == ["there"]
 
 
@@ -97,23 +97,23 @@ def test_seccomp_alone_blocks_network_and_processes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
     target["data"] = target["outside"]  # whatever can be written to is worthless and grows by at most one byte
-    found = attacked(monkeypatch, tmp_path, files, target, "landlock")
-    assert allowed(found["calls"]) == set(), found["calls"]
+    reached = attacked(monkeypatch, tmp_path, files, target, "landlock")
+    assert allowed(reached["calls"]) == set(), reached["calls"]
     for name in ("write a huge file", "write outside", "write to own scene"):
-        assert found["files"][name] == "EFBIG", found["files"]
-    assert "secret" not in found["environment"].values()
+        assert reached["files"][name] == "EFBIG", reached["files"]
+    assert "secret" not in reached["environment"].values()
 
 
 def test_landlock_alone_blocks_files_and_signals(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
-    found = attacked(monkeypatch, tmp_path, files, target, "seccomp")
-    assert allowed(found["files"]) == {"read own scene"}, found["files"]
+    reached = attacked(monkeypatch, tmp_path, files, target, "seccomp")
+    assert allowed(reached["files"]) == {"read own scene"}, reached["files"]
     refused = {"trace the parent", "trace the API", "memory that is a file"}
     refused |= {"connect"} if sandbox._landlock_version() >= 4 else set()
     refused |= {"signal the parent", "signal the API"} if sandbox._landlock_version() >= 6 else set()
-    assert not allowed(found["calls"]) & refused, found["calls"]
-    assert "secret" not in found["environment"].values()
+    assert not allowed(reached["calls"]) & refused, reached["calls"]
+    assert "secret" not in reached["environment"].values()
 
 
 @pytest.mark.parametrize(

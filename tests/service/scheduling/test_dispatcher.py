@@ -37,10 +37,10 @@ def settings(tmp_path: Path) -> ServiceSettings:
 
 @pytest.fixture
 def store(settings: ServiceSettings) -> Iterator[Store]:
-    made = open_store(settings)
-    made.inputs.add_blob(SHA, "aa/blob", 3)
-    yield made
-    made.close()
+    opened = open_store(settings)
+    opened.inputs.add_blob(SHA, "aa/blob", 3)
+    yield opened
+    opened.close()
 
 
 @contextmanager
@@ -59,15 +59,15 @@ def at_work(settings: ServiceSettings, store: Store) -> Iterator[Dispatcher]:
 def leased(store: Store, dispatcher: str) -> Lease:
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    found = store.leases.take(dispatcher)
-    assert found is not None
-    return found
+    lease = store.leases.take(dispatcher)
+    assert lease is not None
+    return lease
 
 
 def test_running_dispatcher_is_registered(settings: ServiceSettings, store: Store) -> None:
     with at_work(settings, store) as dispatcher:
-        found = wait_for(store.operations.dispatchers, "the dispatcher to be known")
-        assert [(row.name, row.places, row.free) for row in found] == [(dispatcher.name, 2, 2)]
+        dispatchers = wait_for(store.operations.dispatchers, "the dispatcher to be known")
+        assert [(row.name, row.places, row.free) for row in dispatchers] == [(dispatcher.name, 2, 2)]
     assert store.operations.dispatchers() == []
 
 

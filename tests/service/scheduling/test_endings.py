@@ -41,9 +41,9 @@ def test_finished_attempt_beats_stop_request(requested: StopRequest | None) -> N
 
 @pytest.mark.parametrize("requested", REQUESTS)
 def test_finished_attempt_without_a_result_fails(requested: StopRequest | None) -> None:
-    found = ending(requested, DONE, has_result=False)
-    assert (found.outcome, found.permanent) == (AttemptOutcome.FAILED, False)
-    assert found.error == {"code": "internal", "message": "The job ended without a result."}
+    outcome = ending(requested, DONE, has_result=False)
+    assert (outcome.outcome, outcome.permanent) == (AttemptOutcome.FAILED, False)
+    assert outcome.error == {"code": "internal", "message": "The job ended without a result."}
 
 
 @pytest.mark.parametrize(
@@ -57,9 +57,9 @@ def test_requested_stop_is_not_a_failure(requested: StopRequest, outcome: str, l
 
 def test_process_ended_by_ray_is_an_outage() -> None:
     """When the cluster's head dies, Ray terminates connected processes with exit code 1 and without a message."""
-    found = ending(None, None, 1, "raylet has died", cluster=True)
-    assert (found.outcome, found.error, found.permanent) == (AttemptOutcome.FAILED, OUTAGE, False)
-    assert found.detail == "The process that ran the job ended with code 1.\nraylet has died"
+    outcome = ending(None, None, 1, "raylet has died", cluster=True)
+    assert (outcome.outcome, outcome.error, outcome.permanent) == (AttemptOutcome.FAILED, OUTAGE, False)
+    assert outcome.detail == "The process that ran the job ended with code 1.\nraylet has died"
     for other in (ending(None, None, 1), ending(None, None, -signal.SIGKILL, cluster=True)):
         assert other.error is not None
         assert other.error["code"] == "crashed"
@@ -83,9 +83,9 @@ def test_reported_failure_is_recorded_unchanged(permanent: bool) -> None:
     ],
 )
 def test_process_without_a_final_message_has_crashed(last: Message | None, code: int, text: str) -> None:
-    found = ending(None, last, code)
-    assert (found.outcome, found.permanent) == (AttemptOutcome.FAILED, False)
-    error: dict[str, Any] = found.error or {}
+    outcome = ending(None, last, code)
+    assert (outcome.outcome, outcome.permanent) == (AttemptOutcome.FAILED, False)
+    error: dict[str, Any] = outcome.error or {}
     assert (error["code"], error["log"]) == ("crashed", "the log")
     assert text in error["message"]
     assert "log" not in (ending(None, last, code, None).error or {})
@@ -111,6 +111,6 @@ def test_machine_failures_are_reported_as_outages(error: Exception, outage: bool
     message = failure(error)
     assert (message["error"] == OUTAGE) == outage
     assert (str(error) in message.get("detail", "")) == outage, "for the operator"
-    found = ending(None, message)
-    assert (found.outcome, found.detail) == (AttemptOutcome.FAILED, message.get("detail"))
-    assert not (outage and found.permanent)
+    outcome = ending(None, message)
+    assert (outcome.outcome, outcome.detail) == (AttemptOutcome.FAILED, message.get("detail"))
+    assert not (outage and outcome.permanent)

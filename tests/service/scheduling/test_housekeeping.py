@@ -19,9 +19,9 @@ SHA = "a" * 64
 def lease(store: Store) -> Lease:
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    found = store.leases.take("one")
-    assert found is not None
-    return found
+    taken = store.leases.take("one")
+    assert taken is not None
+    return taken
 
 
 def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -35,18 +35,18 @@ def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         return artifacts.put(job_id, epoch, "plan.json", source)
 
     done, running = lease(store), lease(store)
-    kept = put(done.job_id, 1)
-    store.leases.succeed(done, [kept], {})
+    referenced = put(done.job_id, 1)
+    store.leases.succeed(done, [referenced], {})
     late, unknown = put(done.job_id, 1), put("job_0123456789", 1)
     store.leases.release(running)
     again = store.leases.take("two")
     assert again is not None
     assert again.epoch == 2
     before, own = put(running.job_id, 1), put(running.job_id, 2)
-    everything = {file.location for file in (kept, late, unknown, before, own)}
+    everything = {file.location for file in (referenced, late, unknown, before, own)}
     assert set(artifacts.objects.below("")) == everything
     assert housekeeping.remove_strays(store, artifacts) == 0, "rows may still be on their way"
     monkeypatch.setattr(housekeeping, "_STRAY_SECONDS", -60.0)
     assert housekeeping.remove_strays(store, artifacts) == 3
-    assert set(artifacts.objects.below("")) == {kept.location, own.location}
+    assert set(artifacts.objects.below("")) == {referenced.location, own.location}
     store.close()

@@ -29,15 +29,15 @@ def test_estimated_seconds_agree_with_the_forecast(name: str, precision: str) ->
 
 
 def test_estimated_gaussians_do_not_depend_on_the_format() -> None:
-    found = size_of(248_000_000).gaussians
-    assert found == 1e6
+    gaussians = size_of(248_000_000).gaussians
+    assert gaussians == 1e6
     for name, scene in (
         ("s.compressed.ply", 61_000_000),
         ("s.SPZ", 25_000_000),
         ("s.splat", 32_000_000),
         ("x", 248_000_000),
     ):
-        assert size_of(scene, name).gaussians == found
+        assert size_of(scene, name).gaussians == gaussians
 
 
 def test_view_size_follows_the_resolution_or_the_photos() -> None:

@@ -62,31 +62,31 @@ def look(service: Service, job_id: str) -> dict[str, Any]:
 
     answer = wait_for(ask, "an answer", service.said)
     assert answer.status_code == 200, f"an accepted job is not there: {answer.text}"
-    found: dict[str, Any] = answer.json()
-    return found
+    content: dict[str, Any] = answer.json()
+    return content
 
 
 def ended(service: Service, job_id: str) -> dict[str, Any]:
     """Wait until the job has ended, and return its status; fail if it has not succeeded."""
 
     def there() -> dict[str, Any] | None:
-        found = look(service, job_id)
-        return found if found["status"] in ("succeeded", "failed", "canceled") else None
+        job = look(service, job_id)
+        return job if job["status"] in ("succeeded", "failed", "canceled") else None
 
-    found: dict[str, Any] = wait_for(there, f"the end of {job_id}", service.said)
-    assert found["status"] == "succeeded", found["error"]
-    return found
+    job: dict[str, Any] = wait_for(there, f"the end of {job_id}", service.said)
+    assert job["status"] == "succeeded", job["error"]
+    return job
 
 
 def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
     """Wait until an attempt has reached a step, or until the job has ended."""
 
     def there() -> bool:
-        found = look(service, job_id)
-        progress = found["progress"] or {}
+        job = look(service, job_id)
+        progress = job["progress"] or {}
         stepping = progress.get("stage") not in ("planning", "starting")
         there = stepping and progress.get("attempt", 0) >= attempt and progress.get("step", 0) >= step
-        return found["status"] == "succeeded" or there
+        return job["status"] == "succeeded" or there
 
     wait_for(there, f"step {step} of attempt {attempt}", service.said)
 
@@ -120,8 +120,8 @@ def test_job_survives_kills_of_all_its_processes(service: Service, files: dict[s
     # the result is stored, and the row that makes it visible is being written or has just been written
     wait_for(lambda: any(folder.rglob("stylized.ply")), "the result's file", service.said, every=0.002)
     service.kill(DISPATCHER)
-    found = ended(service, job_id)
-    outcomes = [attempt["outcome"] for attempt in found["attempts"]]
+    job = ended(service, job_id)
+    outcomes = [attempt["outcome"] for attempt in job["attempts"]]
     assert outcomes[:3] == ["lost", "failed", "lost"]
     assert outcomes[-1] == "succeeded"
     assert check_published_once(service, job_id) == expected.read_bytes()
@@ -154,8 +154,8 @@ def test_job_survives_kills_of_its_ranks(service: Service, files: dict[str, Path
     # the plan may leave out a rank, so every participant is killed
     for process in service.processes("ray::RankProcess"):
         process.kill()
-    found = ended(service, job_id)
-    assert found["result"]["steps"] == STEPS
+    job = ended(service, job_id)
+    assert job["result"]["steps"] == STEPS
     log = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/log.txt", timeout=60).text
     assert "Resuming from step" in log
     (service.data / "two.ply").write_bytes(check_published_once(service, job_id))

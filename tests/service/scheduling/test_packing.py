@@ -63,8 +63,8 @@ class Queue:
     def start(self) -> list[str]:
         """Start the jobs that fit, as the dispatcher does; return their ids in order."""
         started = []
-        while (found := self.selector.lease_next_job(self.holdings())) is not None:
-            lease, grant = found
+        while (leased := self.selector.lease_next_job(self.holdings())) is not None:
+            lease, grant = leased
             self.held[lease.job_id] = grant
             started.append(lease.job_id)
         taken = [gpu for grant in self.held.values() for gpu in grant.gpus]
@@ -95,8 +95,8 @@ def test_single_job_gets_all_gpus_and_releases_unused_ones(eight: Queue) -> None
     assert eight.ranks() == [8]
     second = eight.add()
     assert eight.start() == []
-    kept = eight.held[big].gpus[:3]
-    eight.held[big] = replace(eight.held[big], ranks=3, gpus=kept)
+    used = eight.held[big].gpus[:3]
+    eight.held[big] = replace(eight.held[big], ranks=3, gpus=used)
     assert eight.start() == [second]
     assert eight.ranks() == [3, 5]
 
@@ -267,9 +267,9 @@ def test_dispatchers_share_the_queue(eight: Queue) -> None:
     for name in ("here", "there"):
         eight.store.operations.record_heartbeat(name, 8, 8)
     first, _ = eight.add(), eight.add()
-    found = eight.selector.lease_next_job([])
-    assert found is not None
-    assert (found[0].job_id, found[1].ranks) == (first, 8), "the other job is for the other dispatcher"
+    lease = eight.selector.lease_next_job([])
+    assert lease is not None
+    assert (lease[0].job_id, lease[1].ranks) == (first, 8), "the other job is for the other dispatcher"
 
 
 def test_number_of_jobs_is_limited_by_parallel_jobs(tmp_path: Path) -> None:
@@ -370,8 +370,8 @@ def test_machine_lists_its_own_gpus_or_those_of_the_cluster(monkeypatch: pytest.
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert Machine.find(ServiceSettings()).gpus == ()
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
-    found = Machine.find(ServiceSettings(cluster_gpus=3))
-    assert (len(found.gpus), found.cluster) == (3, True)
+    machine = Machine.find(ServiceSettings(cluster_gpus=3))
+    assert (len(machine.gpus), machine.cluster) == (3, True)
 
 
 def test_waiting_counts_jobs_that_can_be_leased_now(eight: Queue) -> None:
@@ -380,10 +380,10 @@ def test_waiting_counts_jobs_that_can_be_leased_now(eight: Queue) -> None:
     eight.add()
     second = eight.add()
     assert store.leases.waiting() == 2
-    found = store.leases.take("one")
-    assert found is not None
+    lease = store.leases.take("one")
+    assert lease is not None
     assert store.leases.waiting() == 1
-    store.leases.fail(found, {"code": "x", "message": "x"}, permanent=False)
+    store.leases.fail(lease, {"code": "x", "message": "x"}, permanent=False)
     assert store.leases.waiting() == 1, "the other one has to wait for its second attempt"
     store.jobs.cancel(second, "local")
     assert store.leases.waiting() == 0

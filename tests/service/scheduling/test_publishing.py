@@ -26,19 +26,19 @@ def settings(tmp_path: Path) -> ServiceSettings:
 
 @pytest.fixture
 def store(settings: ServiceSettings) -> Iterator[Store]:
-    made = open_store(settings)
-    made.inputs.add_blob(SHA, "aa/blob", 3)
-    yield made
-    made.close()
+    opened = open_store(settings)
+    opened.inputs.add_blob(SHA, "aa/blob", 3)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture
 def lease(store: Store) -> Lease:
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    found = store.leases.take("one")
-    assert found is not None
-    return found
+    taken = store.leases.take("one")
+    assert taken is not None
+    return taken
 
 
 @pytest.fixture

@@ -169,8 +169,8 @@ def job_by_job(queue: list[QueuedJob], state: Snapshot) -> tuple[str | None, Gra
             assert decision.forecast is not None
             assert state.pace is not None
             for other in queue[position + 1 :]:
-                found = backfill([other], decision.forecast, state.pace, state)
-                if found.grant is not None:
-                    return found.job_id, found.grant, first.id
+                chosen = backfill([other], decision.forecast, state.pace, state)
+                if chosen.grant is not None:
+                    return chosen.job_id, chosen.grant, first.id
         return None, None, first.id
     return None, None, None

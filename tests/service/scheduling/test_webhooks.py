@@ -120,9 +120,9 @@ def clock() -> Clock:
 
 @pytest.fixture
 def store(tmp_path: Path, clock: Clock) -> Iterator[Store]:
-    made = open_store(_settings(tmp_path), clock)
-    yield made
-    made.close()
+    opened = open_store(_settings(tmp_path), clock)
+    yield opened
+    opened.close()
 
 
 def _settings(folder: Path, **values: Any) -> ServiceSettings:
@@ -282,13 +282,13 @@ def test_deadline_includes_lookup_and_tls(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The receivers are a host name whose lookup hangs, and a server that accepts connections, but never responds."""
-    release, found = threading.Event(), socket.getaddrinfo
+    release, getaddrinfo = threading.Event(), socket.getaddrinfo
 
     def slow(host: Any, *arguments: Any, **named: Any) -> Any:
         if host == "receiver.example":
             release.wait(PATIENCE)
             host = "127.0.0.1"
-        return found(host, *arguments, **named)
+        return getaddrinfo(host, *arguments, **named)
 
     monkeypatch.setattr(socket, "getaddrinfo", slow)
     monkeypatch.setattr(webhooks, "_DEADLINE", 0.5)
@@ -406,13 +406,13 @@ def test_connection_uses_the_checked_address(
     tmp_path: Path, store: Store, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A second DNS lookup would return another address, so there must not be one."""
-    looked_up, found = [], socket.getaddrinfo
+    looked_up, getaddrinfo = [], socket.getaddrinfo
 
     def resolve(host: Any, *arguments: Any, **named: Any) -> Any:
         if host != "receiver.example":
-            return found(host, *arguments, **named)
+            return getaddrinfo(host, *arguments, **named)
         looked_up.append(host)
-        return found("127.0.0.1" if len(looked_up) == 1 else "127.0.0.2", *arguments, **named)
+        return getaddrinfo("127.0.0.1" if len(looked_up) == 1 else "127.0.0.2", *arguments, **named)
 
     monkeypatch.setattr(socket, "getaddrinfo", resolve)
     _end_job(store, f"http://receiver.example:{receiver.port}/hook")

@@ -49,19 +49,19 @@ def settings(request: pytest.FixtureRequest, tmp_path: Path) -> ServiceSettings:
 
 @pytest.fixture
 def store(settings: ServiceSettings) -> Iterator[Store]:
-    made = open_store(settings)
-    made.inputs.add_blob(SHA, "aa/blob", 3)
-    yield made
-    made.close()
+    opened = open_store(settings)
+    opened.inputs.add_blob(SHA, "aa/blob", 3)
+    yield opened
+    opened.close()
 
 
 def leased(store: Store, dispatcher: str) -> Lease:
     """Return the lease of a new job."""
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=100)
-    found = store.leases.take(dispatcher)
-    assert found is not None
-    return found
+    lease = store.leases.take(dispatcher)
+    assert lease is not None
+    return lease
 
 
 def heartbeats(store: Store) -> dict[str, float]:
@@ -73,17 +73,17 @@ def heartbeats(store: Store) -> dict[str, float]:
 @contextmanager
 def healthy(store: Store, held: Lease) -> Iterator[list[object]]:
     """Renew a lease and send heartbeats, like a dispatcher with a correct clock; yield the list of lease statuses."""
-    stop, found = threading.Event(), list[object]()
+    stop, problems = threading.Event(), list[object]()
 
     def work() -> None:
         while not stop.wait(0.2):
             store.operations.record_heartbeat(held.dispatcher, 1, 0)
-            found.append(store.leases.renew([held])[held.job_id])
+            problems.append(store.leases.renew([held])[held.job_id])
 
     thread = threading.Thread(target=work)
     thread.start()
     try:
-        yield found
+        yield problems
     finally:
         stop.set()
         thread.join()
@@ -214,9 +214,9 @@ def test_times_written_by_a_fast_clock_delay_nothing(settings: ServiceSettings, 
         assert again.job_id == lost.job_id
         scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
         queued, _ = ahead.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=100)
-        found = right.leases.take("right", is_lost=watch.is_lost)
-        assert found is not None
-        assert found.job_id == queued.id
+        lease = right.leases.take("right", is_lost=watch.is_lost)
+        assert lease is not None
+        assert lease.job_id == queued.id
 
 
 def test_overdue_data_are_deleted_gradually(settings: ServiceSettings) -> None:

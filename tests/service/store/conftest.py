@@ -34,7 +34,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def store(database: str | None, tmp_path: Path, clock: Clock) -> Iterator[Store]:
-    made = open_store(store_settings(tmp_path, database), clock)
-    made.inputs.add_blob(SHA, "aa/blob", 3)
-    yield made
-    made.close()
+    opened = open_store(store_settings(tmp_path, database), clock)
+    opened.inputs.add_blob(SHA, "aa/blob", 3)
+    yield opened
+    opened.close()

@@ -45,6 +45,6 @@ def queue(store: Store, owner: str = "local", priority: int = 0) -> str:
 
 
 def lease(store: Store, dispatcher: str = "one") -> Lease:
-    found = store.leases.take(dispatcher)
-    assert found is not None
-    return found
+    taken = store.leases.take(dispatcher)
+    assert taken is not None
+    return taken

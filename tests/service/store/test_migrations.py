@@ -24,8 +24,10 @@ VERSIONS = sorted(path.name[:4] for path in (MIGRATIONS / "versions").glob("[0-9
 
 def columns(engine: Engine) -> dict[tuple[str, str], Any]:
     """Return the columns of all tables by table and column name."""
-    found = inspect(engine)
-    return {(table, each["name"]): each for table in found.get_table_names() for each in found.get_columns(table)}
+    inspector = inspect(engine)
+    return {
+        (table, each["name"]): each for table in inspector.get_table_names() for each in inspector.get_columns(table)
+    }
 
 
 def test_migrations_only_add(tmp_path: Path) -> None:

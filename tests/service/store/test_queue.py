@@ -30,18 +30,18 @@ def test_queue_order_equals_a_plain_sort(store: Store, clock: Clock, seed: int) 
         for _ in range(chance.randrange(4)):
             queue(store, chance.choice("abcdef"), chance.choice([0, 0, 0, 1]))
         expected = sorted_queue(store.jobs.page(None, limit=1000), served, clock.now)
-        found = store.leases.take("one")
-        assert (found and found.job_id) == (expected and expected.id)
-        if found is None:
+        lease = store.leases.take("one")
+        assert (lease and lease.job_id) == (expected and expected.id)
+        if lease is None:
             continue
-        served[found.job.owner] = turn
+        served[lease.job.owner] = turn
         ending = chance.randrange(4)
         if ending == 0:
-            store.leases.fail(found, {"code": "infrastructure", "message": "x"}, permanent=False)
+            store.leases.fail(lease, {"code": "infrastructure", "message": "x"}, permanent=False)
         elif ending == 1:
-            store.leases.release(found)
+            store.leases.release(lease)
         elif ending == 2:
-            store.leases.succeed(found, [], {})  # in the fourth case the job is lost
+            store.leases.succeed(lease, [], {})  # in the fourth case the job is lost
 
 
 def test_reserving_dispatcher_takes_no_other_job(store: Store, clock: Clock) -> None:
@@ -66,9 +66,9 @@ def test_job_without_a_reservation_is_skipped(store: Store, clock: Clock) -> Non
     clock.now += 1
     small = queue(store, "b")
     clock.now += 1
-    found = store.leases.take("one", lambda job: job.id == small, should_reserve=lambda job: False)
-    assert found is not None
-    assert found.job_id == small
+    lease = store.leases.take("one", lambda job: job.id == small, should_reserve=lambda job: False)
+    assert lease is not None
+    assert lease.job_id == small
     assert store.leases.take("one", lambda job: False, should_reserve=lambda job: False) is None
     queue(store, "c")
     assert store.leases.take("one", lambda job: job.id != big) is None, "and now it is kept"
@@ -92,9 +92,9 @@ def test_harmless_jobs_run_before_the_reserved_job(store: Store, clock: Clock) -
     taken = [held.job_id for _ in range(4) if (held := store.leases.take("one", full, backfills=before))]
     assert taken == [others[0], others[3], others[2]], "in turns, but for the one that is in the way"
     assert reserved == [big] * 4
-    found = store.leases.take("two", full, backfills=before)
-    assert found is not None
-    assert found.job_id == others[1], "only the first dispatcher has a reservation"
+    leased = store.leases.take("two", full, backfills=before)
+    assert leased is not None
+    assert leased.job_id == others[1], "only the first dispatcher has a reservation"
     assert store.leases.take("two", full, backfills=before) is None
     assert lease(store, "one").job_id == big
 
@@ -118,13 +118,13 @@ def test_reservation_of_a_dead_dispatcher_expires(store: Store, clock: Clock) ->
         return job.id != big
 
     assert store.leases.take("dead", full) is None
-    found = store.leases.take("two", full)
-    assert found is not None
-    assert found.job_id == small
+    lease = store.leases.take("two", full)
+    assert lease is not None
+    assert lease.job_id == small
     clock.now += LEASE + 1
     assert store.leases.take("two", full) is None, "it keeps its own room from now on"
-    found = store.leases.take("three", full)
-    assert found is not None
+    lease = store.leases.take("three", full)
+    assert lease is not None
 
 
 def test_higher_priority_runs_before_the_reserved_job(store: Store, clock: Clock) -> None:

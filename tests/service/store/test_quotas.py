@@ -175,8 +175,8 @@ def test_concurrent_requests_exceed_no_limit(store: Store) -> None:
     for job_id in canceled:
         store.jobs.cancel(job_id, "g")
     assert at_once(lambda: store.jobs.retry(canceled.pop(), "g", limit=3), 8) == 3
-    for owner, kept in (("c", 8), ("d", 8), ("f", 8)):
-        assert store.usage.of(owner).stored_bytes == kept
+    for owner, stored in (("c", 8), ("d", 8), ("f", 8)):
+        assert store.usage.of(owner).stored_bytes == stored
 
 
 def test_quota_errors_name_the_quota(store: Store) -> None:
@@ -270,8 +270,8 @@ def test_quotas_of_a_key_are_stored(store: Store) -> None:
     quotas = Quotas(jobs_a_day=3, requests_a_second=0.5)
     _, text = store.keys.create("alice", quotas=quotas)
     _, plain = store.keys.create("bob")
-    found, other = store.keys.find(text), store.keys.find(plain)
-    assert found is not None
+    limited, other = store.keys.find(text), store.keys.find(plain)
+    assert limited is not None
     assert other is not None
-    assert NO_QUOTAS.with_own(found.quotas) == quotas
+    assert NO_QUOTAS.with_own(limited.quotas) == quotas
     assert NO_QUOTAS.with_own(other.quotas) == NO_QUOTAS

@@ -30,14 +30,14 @@ def test_failures_count_only_without_progress(before: FailureCount, saved: int |
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST, AttemptOutcome.RELEASED])
 @pytest.mark.parametrize("permanent", [False, True])
 def test_canceling_job_is_stopped(outcome: AttemptOutcome, permanent: bool) -> None:
-    found = POLICY.after_attempt(outcome, JobStatus.CANCELING, FailureCount(2, 3), 3, permanent=permanent)
-    assert found == Verdict(Transition.STOP, FailureCount(2, 3))
+    decision = POLICY.after_attempt(outcome, JobStatus.CANCELING, FailureCount(2, 3), 3, permanent=permanent)
+    assert decision == Verdict(Transition.STOP, FailureCount(2, 3))
 
 
 @pytest.mark.parametrize("status", [JobStatus.STARTING, JobStatus.RUNNING])
 def test_released_job_is_requeued_without_a_failure(status: JobStatus) -> None:
-    found = POLICY.after_attempt(AttemptOutcome.RELEASED, status, FailureCount(2, 3), 9)
-    assert found == Verdict(Transition.REQUEUE, FailureCount(2, 3), 0.0)
+    decision = POLICY.after_attempt(AttemptOutcome.RELEASED, status, FailureCount(2, 3), 9)
+    assert decision == Verdict(Transition.REQUEUE, FailureCount(2, 3), 0.0)
 
 
 def test_retry_delay_doubles_up_to_its_maximum() -> None:
@@ -52,28 +52,28 @@ def test_retry_delay_doubles_up_to_its_maximum() -> None:
 
 
 def test_progress_resets_the_retry_delay() -> None:
-    found = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, FailureCount(2, 10), 20)
-    assert found == Verdict(Transition.REQUEUE, FailureCount(0, 20), POLICY.retry_seconds)
+    decision = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, FailureCount(2, 10), 20)
+    assert decision == Verdict(Transition.REQUEUE, FailureCount(0, 20), POLICY.retry_seconds)
 
 
 def test_lost_attempt_is_retried_without_delay() -> None:
-    found = POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.RUNNING, FailureCount(1, None), None)
-    assert found == Verdict(Transition.REQUEUE, FailureCount(2, None), 0.0)
+    decision = POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.RUNNING, FailureCount(1, None), None)
+    assert decision == Verdict(Transition.REQUEUE, FailureCount(2, None), 0.0)
 
 
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST])
 def test_attempts_without_progress_are_limited(outcome: AttemptOutcome) -> None:
-    count, found = FRESH, []
+    count, delays = FRESH, []
     for _ in range(POLICY.max_attempts):
         verdict = POLICY.after_attempt(outcome, JobStatus.STARTING, count, None)
-        found.append(verdict.transition)
+        delays.append(verdict.transition)
         count = verdict.count
-    assert found == [Transition.REQUEUE, Transition.REQUEUE, Transition.FAIL]
+    assert delays == [Transition.REQUEUE, Transition.REQUEUE, Transition.FAIL]
 
 
 def test_permanent_failure_is_not_retried() -> None:
-    found = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, FRESH, 50, permanent=True)
-    assert found.transition == Transition.FAIL
+    decision = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, FRESH, 50, permanent=True)
+    assert decision.transition == Transition.FAIL
 
 
 @pytest.mark.parametrize("status", [JobStatus.STARTING, JobStatus.RUNNING, JobStatus.CANCELING])

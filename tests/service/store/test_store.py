@@ -40,11 +40,11 @@ from tests.service.store.helpers import (
 
 
 def test_migrations_create_the_tables_of_the_models(store: Store, tmp_path: Path) -> None:
-    found = inspect(store.database.engine)
+    inspector = inspect(store.database.engine)
     for table in Base.metadata.sorted_tables:
-        columns = {column["name"]: column["nullable"] for column in found.get_columns(table.name)}
+        columns = {column["name"]: column["nullable"] for column in inspector.get_columns(table.name)}
         assert columns == {column.name: column.nullable for column in table.columns}, table.name
-        indexes = {index["name"] for index in found.get_indexes(table.name) if not index["unique"]}
+        indexes = {index["name"] for index in inspector.get_indexes(table.name) if not index["unique"]}
         assert indexes == {index.name for index in table.indexes}, table.name
     Base.metadata.create_all(store.database.engine)  # finds that all tables exist
 
@@ -76,37 +76,37 @@ def test_queue_positions_match_the_order_of_leases(store: Store, clock: Clock) -
     for number, priority in enumerate([0, 5, 0, 5, -1, 0]):
         clock.now += number % 2  # two jobs at a time
         ids.append(queue(store, priority=priority))
-    found = {store.jobs.detail(job_id, "local")[1]: job_id for job_id in ids}
-    assert {store.jobs.queue_position(store.jobs.get(job_id, None)): job_id for job_id in ids} == found
-    assert [lease(store).job_id for _ in ids] == [found[place] for place in range(1, len(ids) + 1)]
+    by_position = {store.jobs.detail(job_id, "local")[1]: job_id for job_id in ids}
+    assert {store.jobs.queue_position(store.jobs.get(job_id, None)): job_id for job_id in ids} == by_position
+    assert [lease(store).job_id for _ in ids] == [by_position[place] for place in range(1, len(ids) + 1)]
     assert store.jobs.detail(ids[0], "local")[1] is None
 
 
 def test_concurrent_requests_with_one_idempotency_key_create_one_job(store: Store) -> None:
-    found: list[tuple[str, bool]] = []
+    outcomes: list[tuple[str, bool]] = []
 
     def create() -> None:
         job, created = store.jobs.create(new_job(), limit=100, idempotency=Idempotency("k", "f" * 64))
-        found.append((job.id, created))
+        outcomes.append((job.id, created))
 
     _at_once(create, 8)
-    assert len({job_id for job_id, _ in found}) == 1
-    assert sum(created for _, created in found) == 1
+    assert len({job_id for job_id, _ in outcomes}) == 1
+    assert sum(created for _, created in outcomes) == 1
 
 
 def test_concurrent_dispatchers_lease_every_job_once(store: Store) -> None:
     expected = {queue(store) for _ in range(12)}
-    found: list[str] = []
+    leased: list[str] = []
 
     def work() -> None:
         while (held := store.leases.take(threading.current_thread().name)) is not None:
-            found.append(held.job_id)
+            leased.append(held.job_id)
 
     _at_once(work, 4)
     # with PostgreSQL, a dispatcher may find nothing while another one holds the next row
     while (held := store.leases.take("last")) is not None:
-        found.append(held.job_id)
-    assert sorted(found) == sorted(expected)
+        leased.append(held.job_id)
+    assert sorted(leased) == sorted(expected)
 
 
 def _at_once(work: Callable[[], None], count: int) -> None:
@@ -385,14 +385,14 @@ def test_loss_history_covers_the_whole_job(store: Store, clock: Clock) -> None:
     clock.now += 5000
     store.leases.report_progress(held, step_of(held, 5000, 4500.0, stage="measuring"))
     job = store.jobs.get(job_id, None)
-    found = store.jobs.loss_history(job, 10_000)
-    assert [point.step for point in found[:5]] == [1, 2, 3, 4, 5]
-    assert (found[-1].step, found[-1].stage, found[-1].updated_at) == (5000, "measuring", clock.now)
-    assert (found[9].loss, found[9].scales, found[9].seconds) == (1e5, [1.0, None], 9.0)
-    ratios = [later.seconds / point.seconds for point, later in itertools.pairwise(found[:-1])]
+    points = store.jobs.loss_history(job, 10_000)
+    assert [point.step for point in points[:5]] == [1, 2, 3, 4, 5]
+    assert (points[-1].step, points[-1].stage, points[-1].updated_at) == (5000, "measuring", clock.now)
+    assert (points[9].loss, points[9].scales, points[9].seconds) == (1e5, [1.0, None], 9.0)
+    ratios = [later.seconds / point.seconds for point, later in itertools.pairwise(points[:-1])]
     assert all(ratio >= GROWTH for ratio in ratios)
     assert all(ratio < GROWTH + 0.01 for ratio in ratios[100:]), "no gaps"
-    assert len(found) < 550
+    assert len(points) < 550
     few = store.jobs.loss_history(job, 64)
     assert len(few) == 64
     assert (few[0].step, few[-1].step) == (1, 5000)
@@ -408,8 +408,8 @@ def test_loss_history_continues_across_attempts(store: Store, clock: Clock) -> N
     again = lease(store)
     for step, seconds in ((3, 3.0), (3, 3.0), (2, 2.0), (5, 5.0)):  # from a checkpoint of step 2; ranks were lost once
         store.leases.report_progress(again, step_of(again, step, seconds))
-    found = [(point.attempt, point.step) for point in store.jobs.loss_history(store.jobs.get(job_id, None), 100)]
-    assert found == [(1, 1), (1, 2), (1, 3), (1, 4), (2, 3), (2, 5)]
+    points = [(point.attempt, point.step) for point in store.jobs.loss_history(store.jobs.get(job_id, None), 100)]
+    assert points == [(1, 1), (1, 2), (1, 3), (1, 4), (2, 3), (2, 5)]
     store.leases.fail(again, {"code": "x", "message": "x"}, permanent=True)
     store.jobs.retry(job_id, None, limit=10)
     job = store.jobs.get(job_id, None)
@@ -429,10 +429,10 @@ def test_long_loss_history_is_thinned(store: Store, monkeypatch: pytest.MonkeyPa
         for step in range(1, 21):
             store.leases.report_progress(held, step_of(held, step, float(step)))
         store.leases.release(held)
-    found = store.jobs.loss_history(store.jobs.get(job_id, None), 1000)
-    assert len(found) <= 40 + 20
-    assert (found[0].attempt, found[0].step) == (1, 1)
-    assert (found[-1].attempt, found[-1].step) == (12, 20)
+    points = store.jobs.loss_history(store.jobs.get(job_id, None), 1000)
+    assert len(points) <= 40 + 20
+    assert (points[0].attempt, points[0].step) == (1, 1)
+    assert (points[-1].attempt, points[-1].step) == (12, 20)
 
 
 def test_newest_preview_of_each_job(store: Store) -> None:
@@ -549,15 +549,15 @@ class StoreMachine(RuleBasedStateMachine):
     @rule(dispatcher=st.sampled_from(["one", "two"]))
     def take(self, dispatcher: str) -> None:
         live = {job_id for job_id, (_, until) in self.held.items() if until >= self.clock.now}
-        found = self.store.leases.take(dispatcher)
+        lease = self.store.leases.take(dispatcher)
         self._see_settled()
-        if found is None:
+        if lease is None:
             return
-        assert found.job_id not in live
-        if found.job_id in self.held:
-            self.old.append(self.held.pop(found.job_id)[0])
-        self.held[found.job_id] = (found, self.clock.now + LEASE)
-        self.status[found.job_id] = "starting"
+        assert lease.job_id not in live
+        if lease.job_id in self.held:
+            self.old.append(self.held.pop(lease.job_id)[0])
+        self.held[lease.job_id] = (lease, self.clock.now + LEASE)
+        self.status[lease.job_id] = "starting"
 
     def _see_settled(self) -> None:
         """Update the model for jobs that may have ended because their leases had expired."""

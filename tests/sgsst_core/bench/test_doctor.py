@@ -25,11 +25,11 @@ SMALL = CheckSizes(100, 32, 24, 2, 16)
 
 
 def test_this_machine_works(tiny_installed: Path) -> None:
-    found = list(examine(limit=400.0))
-    assert [finding for finding in found if finding.state == "problem"] == []
-    topics = [finding.topic for finding in found]
+    findings = list(examine(limit=400.0))
+    assert [finding for finding in findings if finding.state == "problem"] == []
+    topics = [finding.topic for finding in findings]
     assert topics == ["weights", "cache", "program", "GPU", "memory", "rasterizer", "precision", "results"]
-    assert "7 checks agree" in found[-1].text
+    assert "7 checks agree" in findings[-1].text
 
 
 def test_missing_weights_are_a_problem(
@@ -37,10 +37,10 @@ def test_missing_weights_are_a_problem(
 ) -> None:
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "cache"))
     assert main(["doctor", "--json"]) == 1
-    found = json.loads(capsys.readouterr().out)
-    assert found[0]["topic"] == "weights"
-    assert found[0]["state"] == "problem"
-    assert "sgsst weights fetch" in found[0]["text"]
+    findings = json.loads(capsys.readouterr().out)
+    assert findings[0]["topic"] == "weights"
+    assert findings[0]["state"] == "problem"
+    assert "sgsst weights fetch" in findings[0]["text"]
 
 
 def test_unwritable_folders_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -48,8 +48,8 @@ def test_unwritable_folders_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_pa
     file.touch()
     monkeypatch.setenv("SGSST_CACHE", str(file))
     monkeypatch.setenv("TRITON_CACHE_DIR", str(file / "triton"))
-    found = [(finding.state, finding.text.split("Set ")[-1]) for finding in doctor._caches()]
-    assert found == [("warning", "SGSST_CACHE."), ("warning", "TRITON_CACHE_DIR.")]
+    states = [(finding.state, finding.text.split("Set ")[-1]) for finding in doctor._caches()]
+    assert states == [("warning", "SGSST_CACHE."), ("warning", "TRITON_CACHE_DIR.")]
 
 
 def test_wrong_images_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,9 +57,9 @@ def test_wrong_images_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CpuRasterizer, "_render", lambda *arguments: 1.001 * render(*arguments))
     checks = {check.name: check for check in check_device("cpu", CPU, SMALL)}
     assert [name for name, check in checks.items() if not check.passed] == ["image"]
-    (found,) = doctor._results("cpu", CPU)
-    assert found.state == "problem"
-    assert found.text.startswith("wrong image: 0.00")
+    (finding,) = doctor._results("cpu", CPU)
+    assert finding.state == "problem"
+    assert finding.text.startswith("wrong image: 0.00")
 
 
 def test_results_that_depend_on_free_memory_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,17 +83,17 @@ def test_results_that_depend_on_free_memory_are_detected(monkeypatch: pytest.Mon
 
 
 def test_freed_blocks_contain_nan(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Tensor] = []
+    freed: list[Tensor] = []
     full = torch.full
 
     def record_block(*arguments: Any, **options: Any) -> Tensor:
-        made.append(full(*arguments, **options))
-        return made[-1]
+        freed.append(full(*arguments, **options))
+        return freed[-1]
 
     monkeypatch.setattr(torch, "full", record_block)
     leave_nan(CPU)
-    assert {tensor.nbytes for tensor in made} == {1 << 12, 1 << 16, 1 << 20}
-    assert all(bool(tensor.isnan().all()) for tensor in made)
+    assert {tensor.nbytes for tensor in freed} == {1 << 12, 1 << 16, 1 << 20}
+    assert all(bool(tensor.isnan().all()) for tensor in freed)
 
 
 @pytest.mark.parametrize(("error", "passed"), [(0.5, True), (1.0, True), (1.5, False), (float("nan"), False)])
@@ -112,9 +112,9 @@ def test_hanging_or_crashed_examination_is_a_finding(monkeypatch: pytest.MonkeyP
     crashed = Finding("program", "problem", "the examination ended with status 4: no driver")
     assert list(examine()) == [first, crashed]
     program.write_text(program.read_text().replace("exit 4", "exec sleep 100"))
-    found = list(examine(limit=1.0))
-    assert found[0] == first
-    assert (found[1].topic, found[1].state) == ("time", "warning")
+    findings = list(examine(limit=1.0))
+    assert findings[0] == first
+    assert (findings[1].topic, findings[1].state) == ("time", "warning")
 
 
 @pytest.mark.parametrize(

@@ -53,20 +53,20 @@ def test_all_variants_are_evaluated_with_the_papers_loss(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Variants are evaluated with the paper's loss, even if all of them optimize another one."""
-    found: list[Evaluation] = []
+    evaluations: list[Evaluation] = []
     evaluate = Float32Reference.evaluate
 
     def record_evaluation(self: Float32Reference, indices: list[int], sh_dc: Tensor) -> Evaluation:
-        found.append(evaluate(self, indices, sh_dc))
-        return found[-1]
+        evaluations.append(evaluate(self, indices, sh_dc))
+        return evaluations[-1]
 
     monkeypatch.setattr(Float32Reference, "evaluate", record_evaluation)
     scene, views, variants = wall(), cameras(2, 48, 36), choose_variants(["nnfm", "mixed"])
     for style_loss in ("sos", "nnfm"):
         curves = error_time(scene, views, style(), variants, 1.0, weights=tiny_weights, style_loss=style_loss)
         assert all(len(curve.points) == 6 for curve in curves)
-    assert len(found) == 2 * (1 + 2 * 6)
-    assert all(terms["nearest"] == 0 < terms["gram"] for evaluation in found for terms in evaluation.values())
+    assert len(evaluations) == 2 * (1 + 2 * 6)
+    assert all(terms["nearest"] == 0 < terms["gram"] for evaluation in evaluations for terms in evaluation.values())
 
 
 def test_pareto_front_contains_undominated_points() -> None:

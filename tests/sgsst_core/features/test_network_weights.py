@@ -152,11 +152,11 @@ def test_torchvision_vgg16_can_be_installed_from_a_file(tmp_path: Path) -> None:
 
 
 def test_other_channel_counts_are_preserved(tiny_weights: BackboneWeights, tiny_cache: Path) -> None:
-    found = load_network_weights("vgg16", tiny_cache)
+    weights = load_network_weights("vgg16", tiny_cache)
     for layer, (weight, bias) in tiny_weights.convolutions.items():
-        assert torch.equal(found.convolutions[layer][0], weight)
-        assert torch.equal(found.convolutions[layer][1], bias)
-    network = FeatureNetwork(found, ("relu1_1", "relu5_1"))
+        assert torch.equal(weights.convolutions[layer][0], weight)
+        assert torch.equal(weights.convolutions[layer][1], bias)
+    network = FeatureNetwork(weights, ("relu1_1", "relu5_1"))
     assert [network.channels(layer) for layer in network.layers] == [16, 16]
     for pixels in (16, 8):  # the smaller one is too small for relu5_1
         features = network.forward(torch.zeros(pixels, pixels, 3)).features
@@ -219,10 +219,10 @@ def test_unknown_names_are_refused(tmp_path: Path) -> None:
         fetch_network_weights("resnet", folder=tmp_path)
 
 
-@pytest.mark.parametrize("kept", [0, 7, 8, 5_000, 30_000_000, -1])
-def test_truncated_file_is_refused(kept: int, vgg16_folder: Path) -> None:
+@pytest.mark.parametrize("remaining", [0, 7, 8, 5_000, 30_000_000, -1])
+def test_truncated_file_is_refused(remaining: int, vgg16_folder: Path) -> None:
     file = vgg16_folder / "vgg16.safetensors"
-    file.write_bytes(file.read_bytes()[:kept])
+    file.write_bytes(file.read_bytes()[:remaining])
     with pytest.raises(WeightsError, match=r"vgg16\.safetensors.*sgsst weights fetch vgg16"):
         load_network_weights("vgg16", vgg16_folder)
 

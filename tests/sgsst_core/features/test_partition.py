@@ -97,12 +97,12 @@ def test_tile_size_ignores_pixels_outside_the_region():
 @pytest.mark.parametrize("working", [0.0, 0.4])
 def test_cached_tiles_fit_and_leave_no_space_for_another(held, working):
     areas = [40, 100, 60, 100]
-    kept = cached_tiles(areas, held, working)
-    total = sum(area for area, flag in zip(areas, kept, strict=True) if flag)
-    others = [area for area, flag in zip(areas, kept, strict=True) if not flag]
+    cached = cached_tiles(areas, held, working)
+    total = sum(area for area, flag in zip(areas, cached, strict=True) if flag)
+    others = [area for area, flag in zip(areas, cached, strict=True) if not flag]
     assert total == 0 or total + working * max(areas) <= held
     assert all(total + area + working * max(areas) > held for area in others)
-    assert computed_twice(areas, kept) == sum(areas) - total
+    assert computed_twice(areas, cached) == sum(areas) - total
 
 
 def test_view_that_just_fits_is_cached_whole():

@@ -38,9 +38,9 @@ def test_max_pool_and_backward_pass_match_pytorch(size: tuple[int, int], dtype: 
     assert torch.equal(pooled, torch.nn.functional.max_pool2d(source, 2))
     gradient = torch.randn(pooled.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64).to(dtype)
     gradient = gradient.contiguous(memory_format=torch.channels_last)
-    found = max_pool_backward(gradient, source)
-    assert found.is_contiguous(memory_format=torch.channels_last)
-    assert torch.equal(found, max_pool_backward_reference(gradient, source))
+    result = max_pool_backward(gradient, source)
+    assert result.is_contiguous(memory_format=torch.channels_last)
+    assert torch.equal(result, max_pool_backward_reference(gradient, source))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -48,8 +48,8 @@ def test_negative_zeros_and_infinities_are_compared_as_numbers(dtype: torch.dtyp
     window = torch.tensor([[-0.0, 0.0], [torch.inf, 1.0]], dtype=dtype)
     source = torch.stack([window, -torch.zeros_like(window)])[None].contiguous(memory_format=torch.channels_last)
     assert torch.equal(max_pool(source), torch.tensor([torch.inf, 0.0], dtype=dtype).view(1, 2, 1, 1))
-    found = max_pool_backward(torch.ones((1, 2, 1, 1), dtype=dtype), source)
-    assert found.flatten().tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
+    result = max_pool_backward(torch.ones((1, 2, 1, 1), dtype=dtype), source)
+    assert result.flatten().tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -74,6 +74,6 @@ def test_relu_backward_works_in_place() -> None:
     gradient = torch.randn(output.shape, generator=torch.Generator().manual_seed(6))
     gradient = gradient.contiguous(memory_format=torch.channels_last)
     expected = torch.where(output > 0, gradient, 0.0)
-    found = relu_backward(gradient, output)
-    assert torch.equal(found, expected)
-    assert found.data_ptr() == gradient.data_ptr()
+    actual = relu_backward(gradient, output)
+    assert torch.equal(actual, expected)
+    assert actual.data_ptr() == gradient.data_ptr()

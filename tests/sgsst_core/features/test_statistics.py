@@ -23,11 +23,11 @@ def features(height=40, width=50, channels=24, *, ratio=1.0, dtype=torch.float64
     return (noise + ratio).to(dtype)
 
 
-def assert_equal(found: LayerStatistics, expected: LayerStatistics, tolerance: float):
-    torch.testing.assert_close(found.count, expected.count, rtol=tolerance, atol=0)
-    torch.testing.assert_close(found.mean, expected.mean, rtol=tolerance, atol=tolerance)
-    torch.testing.assert_close(found.std(), expected.std(), rtol=tolerance, atol=0)
-    torch.testing.assert_close(found.gram(), expected.gram(), rtol=tolerance, atol=tolerance)
+def assert_equal(actual: LayerStatistics, expected: LayerStatistics, tolerance: float):
+    torch.testing.assert_close(actual.count, expected.count, rtol=tolerance, atol=0)
+    torch.testing.assert_close(actual.mean, expected.mean, rtol=tolerance, atol=tolerance)
+    torch.testing.assert_close(actual.std(), expected.std(), rtol=tolerance, atol=0)
+    torch.testing.assert_close(actual.gram(), expected.gram(), rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
@@ -51,8 +51,8 @@ def test_merge_does_not_depend_on_the_division(cuts, weighted):
 def test_standard_deviation_survives_large_means():
     x = features(ratio=1e4, dtype=torch.float32)
     expected = layer_statistics_reference(x).std()
-    found = layer_statistics(x).std()
-    assert ((found - expected).abs() / expected).max() < 1e-5
+    actual = layer_statistics(x).std()
+    assert ((actual - expected).abs() / expected).max() < 1e-5
     flat = x.reshape(-1, x.shape[-1])
     one_pass = ((flat.T @ flat).diagonal() / flat.shape[0] - flat.mean(0).square()).sqrt()
     lost = ((one_pass.double() - expected).abs() / expected).nan_to_num(nan=torch.inf).max()
@@ -100,8 +100,8 @@ def test_shift_comes_from_covered_features(height):
     covered = torch.zeros(x.shape[:2])
     covered[7:9, 11:14] = 0.5
     x[covered == 0] += 1e5
-    found, expected = layer_statistics(x, covered), layer_statistics_reference(x, covered)
-    assert_equal(found, expected, 1e-5)
+    actual, expected = layer_statistics(x, covered), layer_statistics_reference(x, covered)
+    assert_equal(actual, expected, 1e-5)
 
 
 def test_constant_channels_have_exact_mean_and_zero_deviation():
@@ -109,9 +109,9 @@ def test_constant_channels_have_exact_mean_and_zero_deviation():
     x = (torch.rand((1, 1, 64), generator=generator) * 10 ** torch.arange(-20, 12, 0.5)).expand(130, 70, 64)
     some = torch.rand((130, 70), generator=generator)
     for weights in (None, some, (some > 0.99).float()):
-        found = layer_statistics(x, weights)
-        assert not found.std().any()
-        torch.testing.assert_close(found.mean, x[0, 0].double(), rtol=0, atol=0)
+        statistics = layer_statistics(x, weights)
+        assert not statistics.std().any()
+        torch.testing.assert_close(statistics.mean, x[0, 0].double(), rtol=0, atol=0)
 
 
 def test_tiny_weights_do_not_vanish():
@@ -131,6 +131,6 @@ def test_blocks_and_strips_of_any_shape_agree_with_reference(channels, width):
 
 def test_statistics_of_a_slice_match_its_copy():
     x = features(60, 70, 24, dtype=torch.float32)[5:50, 3:40]
-    found, expected = layer_statistics(x), layer_statistics(x.clone())
-    assert torch.equal(found.centered, expected.centered)
-    assert torch.equal(found.mean, expected.mean)
+    actual, expected = layer_statistics(x), layer_statistics(x.clone())
+    assert torch.equal(actual.centered, expected.centered)
+    assert torch.equal(actual.mean, expected.mean)

@@ -270,17 +270,17 @@ def test_algorithms_that_read_their_output_are_not_fused(
 
 def test_reused_memory_contains_nan() -> None:
     """Check the trial's premise on an allocator that returns the last freed block of a size, as CUDA's does."""
-    kept: list[Tensor] = []
+    alive: list[Tensor] = []
 
     class Keep(TorchDispatchMode):
         def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-            kept.append(func(*args, **(kwargs or {})))
-            return kept[-1]
+            alive.append(func(*args, **(kwargs or {})))
+            return alive[-1]
 
     with Keep():
         vgg._leave_nan(torch.zeros((1, 2, 3, 4)))
-    assert kept[-1].shape == (1, 2, 3, 4)
-    assert bool(kept[-1].isnan().all())
+    assert alive[-1].shape == (1, 2, 3, 4)
+    assert bool(alive[-1].isnan().all())
 
 
 def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,9 +317,9 @@ def test_gpu_passes_have_the_expected_launches(tiny_weights: BackboneWeights, mo
         fuse(network)
         network.forward(image)  # tries the convolutions at this size
         with Launches() as forward:
-            kept = network.forward(image)
+            activations = network.forward(image)
         with Launches() as backward:
-            network.backward(kept, lambda *_: None)
+            network.backward(activations, lambda *_: None)
     assert forward.names == {
         "cudnn_convolution_relu": convolved,
         "max_pool2d_with_indices": pools,

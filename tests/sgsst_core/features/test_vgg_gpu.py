@@ -31,8 +31,8 @@ def difference(weights: BackboneWeights, dtype: torch.dtype = torch.float32, *, 
     use_whole_float32()
     image = synthetic_image(*SIZE)
     exact = FeatureNetwork(weights, dtype=torch.float64)
-    found = FeatureNetwork(weights, dtype=dtype, device="cuda", tf32=tf32)
-    gradients = [network.backward(network.forward(image), add).cpu().double() for network in (found, exact)]
+    tested = FeatureNetwork(weights, dtype=dtype, device="cuda", tf32=tf32)
+    gradients = [network.backward(network.forward(image), add).cpu().double() for network in (tested, exact)]
     return Difference.of(*gradients)
 
 
@@ -44,9 +44,9 @@ def test_gpu_float32_is_not_rounded_to_tf32(vgg16_weights: BackboneWeights) -> N
 def test_lower_precisions_differ_by_their_rounding(vgg16_weights: BackboneWeights, tf32: bool) -> None:
     if tf32 and not has_tf32("cuda"):
         pytest.skip("this GPU has no TF32")
-    found = difference(vgg16_weights, torch.float32 if tf32 else torch.bfloat16, tf32=tf32)
-    print(found)
-    assert 1e-3 < found.relative_error < (0.2 if tf32 else 0.8)
+    error = difference(vgg16_weights, torch.float32 if tf32 else torch.bfloat16, tf32=tf32)
+    print(error)
+    assert 1e-3 < error.relative_error < (0.2 if tf32 else 0.8)
 
 
 def test_tf32_is_enabled_only_within_the_block() -> None:
@@ -60,10 +60,10 @@ def test_tf32_is_enabled_only_within_the_block() -> None:
     for block in (True, False):
         if block:
             with convolutions(image.device, tf32=True):
-                found = F.conv2d(image, kernel, padding=1)
+                actual = F.conv2d(image, kernel, padding=1)
         else:
-            found = F.conv2d(image, kernel, padding=1)
-        errors.append(Difference.of(found.double(), exact).relative_error)
+            actual = F.conv2d(image, kernel, padding=1)
+        errors.append(Difference.of(actual.double(), exact).relative_error)
     assert 1e-5 < errors[0] < 1e-2
     assert errors[1] < 2e-6
 
@@ -71,9 +71,9 @@ def test_tf32_is_enabled_only_within_the_block() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_fused_convolutions_have_channels_last(vgg16_weights: BackboneWeights, dtype: torch.dtype) -> None:
     network = FeatureNetwork(vgg16_weights, dtype=dtype, device="cuda")
-    kept = network.forward(synthetic_image(*SIZE))
+    activations = network.forward(synthetic_image(*SIZE))
     print({step.layer: step.fused for step in network._steps if isinstance(step, vgg._Convolution)})
-    held = [output for output in kept.outputs if output.numel()]
+    held = [output for output in activations.outputs if output.numel()]
     assert all(output.is_contiguous(memory_format=torch.channels_last) for output in held)
 
 

@@ -88,9 +88,9 @@ def test_damaged_files_are_named_with_a_repair_command(folder: Path, tiny_cache:
         path = folder / f"{name}.safetensors"
         flip(path, path.stat().st_size // 2)
         path.touch()
-    found = damaged_weights(folder)
-    assert len(found) == 2
-    for name, damage in zip(("vgg16", "lpips_vgg16"), found, strict=True):
+    damaged = damaged_weights(folder)
+    assert len(damaged) == 2
+    for name, damage in zip(("vgg16", "lpips_vgg16"), damaged, strict=True):
         assert damage.startswith(f"{folder / name}.safetensors")
         assert "sgsst weights fetch vgg16" in damage
         assert "--from FILE" in damage

@@ -88,9 +88,9 @@ def test_every_format_is_blended(tmp_path: Path, format: SceneFormat) -> None:
     files = written(tmp_path, scene, recolored(scene, 1), format=format)
     blend = blend_scenes(files, [1, 3])
     save(tmp_path / f"blend{format.suffix}", blend)
-    found = read_scene(tmp_path / f"blend{format.suffix}")
-    assert found.format == format.name
-    assert (found.scene.sh_dc - blend.scene.sh_dc).abs().max() < 0.2  # SPZ stores colors in steps of 0.026
+    loaded = read_scene(tmp_path / f"blend{format.suffix}")
+    assert loaded.format == format.name
+    assert (loaded.scene.sh_dc - blend.scene.sh_dc).abs().max() < 0.2  # SPZ stores colors in steps of 0.026
 
 
 def test_extreme_colors_stay_finite(tmp_path: Path) -> None:

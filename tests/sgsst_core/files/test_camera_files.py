@@ -148,9 +148,9 @@ def test_nerfstudio_frame_lenses_override_the_files(tmp_path: Path) -> None:
     content["frames"][1] |= {"camera_model": "OPENCV_FISHEYE", "k4": 0.002}
     content["frames"][2] |= {"camera_model": "PINHOLE", "k1": 0, "k2": 0, "k3": 0, "p1": 0}
     content["frames"][3] |= {"camera_model": "FISHEYE624"}
-    found = read_cameras(save(tmp_path / "t.json", content))
-    assert_same(found, views(4), lambda name: f"images/{name}")
-    first, fisheye, pinhole, other = (view.lens for view in found)
+    cameras = read_cameras(save(tmp_path / "t.json", content))
+    assert_same(cameras, views(4), lambda name: f"images/{name}")
+    first, fisheye, pinhole, other = (view.lens for view in cameras)
     assert first
     assert fisheye
     assert other
@@ -237,9 +237,9 @@ def test_distorted_colmap_cameras_are_pinholes_with_a_lens(tmp_path: Path, text:
     else:
         packed = struct.pack(f"<QIiQQ{len(values)}d", 1, 1, number, WIDTH, HEIGHT, *values)
         (folder / "cameras.bin").write_bytes(packed)
-    found = read_cameras(folder)
-    assert_same(found, views())
-    lenses = {view.lens for view in found}
+    cameras = read_cameras(folder)
+    assert_same(cameras, views())
+    lenses = {view.lens for view in cameras}
     if name in ("SIMPLE_PINHOLE", "PINHOLE"):
         assert lenses == {None}
         return
@@ -307,13 +307,13 @@ def test_rig_poses_come_from_the_images(tmp_path: Path, text: bool) -> None:
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 3, 4
     options.camera_model_id, options.camera_params = pycolmap.CameraModelId.PINHOLE, [500.0, 510.0, 320.0, 240.0]
     options.sensor_from_rig_translation_stddev, options.sensor_from_rig_rotation_stddev = 0.3, 10.0
-    made = pycolmap.synthesize_dataset(options)
-    (made.write_text if text else made.write_binary)(tmp_path)
+    dataset = pycolmap.synthesize_dataset(options)
+    (dataset.write_text if text else dataset.write_binary)(tmp_path)
     assert {path.stem for path in tmp_path.iterdir()} == {"cameras", "images", "points3D", "rigs", "frames"}
-    expected = {image.name: image.cam_from_world().matrix() for image in made.images.values()}
-    found = read_cameras(tmp_path)
-    assert len(found) == len(expected) == 24
-    for view in found:
+    expected = {image.name: image.cam_from_world().matrix() for image in dataset.images.values()}
+    cameras = read_cameras(tmp_path)
+    assert len(cameras) == len(expected) == 24
+    for view in cameras:
         assert np.allclose(view.world_to_camera.numpy()[:3], expected[view.name], rtol=0, atol=1e-14)
 
 

@@ -29,10 +29,10 @@ CAPTURES = Path(__file__).parent / "captures"
 NERFSTUDIO = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
 
 
-def assert_close(found: list[Camera], expected: list[Camera], world: torch.Tensor | None = None) -> None:
+def assert_close(actual: list[Camera], expected: list[Camera], world: torch.Tensor | None = None) -> None:
     """Compare cameras, in a world that is rotated by a matrix [3, 3]."""
-    assert len(found) == len(expected)
-    for a, b in zip(found, expected, strict=True):
+    assert len(actual) == len(expected)
+    for a, b in zip(actual, expected, strict=True):
         assert (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == pytest.approx((b.width, b.height, b.fx, b.fy, b.cx, b.cy))
         pose = b.world_to_camera.clone()
         if world is not None:
@@ -55,15 +55,15 @@ def assert_close(found: list[Camera], expected: list[Camera], world: torch.Tenso
     ],
 )
 def test_folders_of_many_tools_give_the_same_cameras(tool: str, models: list[str | None]) -> None:
-    found = read_cameras(CAPTURES / tool)
-    assert_close(found, views())
-    assert [view.lens and view.lens.model for view in found] == models
+    cameras = read_cameras(CAPTURES / tool)
+    assert_close(cameras, views())
+    assert [view.lens and view.lens.model for view in cameras] == models
 
 
 def test_nerfstudio_cameras_have_nerfstudio_axes() -> None:
-    found = read_cameras(CAPTURES / "nerfstudio")
-    assert_close(found, views(), NERFSTUDIO)
-    assert {view.lens and view.lens.coefficients[:4] for view in found} == {(0.05, -0.01, 0.001, -0.0005)}
+    cameras = read_cameras(CAPTURES / "nerfstudio")
+    assert_close(cameras, views(), NERFSTUDIO)
+    assert {view.lens and view.lens.coefficients[:4] for view in cameras} == {(0.05, -0.01, 0.001, -0.0005)}
 
 
 def test_nerfstudio_training_cameras_match_the_trained_scene() -> None:
@@ -124,8 +124,8 @@ def test_half_size_photos_match_full_size_cameras(tmp_path: Path) -> None:
     for capture in ("frames", "metashape"):
         cameras = read_cameras(CAPTURES / capture)
         for folder in (tmp_path, tmp_path / "images_2"):
-            found = check_photos(folder, cameras)
-            assert [photo and photo.size for photo in found] == [(WIDTH // 2, HEIGHT // 2)] * 3
+            photos = check_photos(folder, cameras)
+            assert [photo and photo.size for photo in photos] == [(WIDTH // 2, HEIGHT // 2)] * 3
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse/1", "sparse", "colmap/sparse/0", "."])

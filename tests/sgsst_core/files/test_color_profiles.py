@@ -105,8 +105,8 @@ def test_transparent_and_palette_images_are_converted_before_compositing(tmp_pat
     assert torch.equal(image[12:], opaque[12:])
     assert torch.equal(image[:12], torch.tensor([0.0, 1.0, 0.0]).expand(12, 36, 3))
     palette = Image.fromarray(colors()).quantize(16)
-    found = load_image(save(tmp_path / "c.png", palette, profile))
-    assert torch.equal(found, load_image(save(tmp_path / "d.png", palette.convert("RGB"), profile)))
+    pixels = load_image(save(tmp_path / "c.png", palette, profile))
+    assert torch.equal(pixels, load_image(save(tmp_path / "d.png", palette.convert("RGB"), profile)))
 
 
 def camera(name: str) -> Camera:
@@ -233,6 +233,6 @@ def test_colors_match_imagemagick(tmp_path: Path, name: str) -> None:
     (tmp_path / "srgb.icc").write_bytes(BUILT_IN_SRGB)
     command = [program, str(path), "-profile", str(tmp_path / "srgb.icc"), "-background", "white", "-flatten"]
     command += ["-type", "TrueColor", "-depth", "16", "-endian", "LSB", "RGB:-"]
-    found = subprocess.run(command, check=True, capture_output=True, timeout=60).stdout
-    expected = np.frombuffer(found, "<u2").reshape(24, 36, 3) / 65535
+    output = subprocess.run(command, check=True, capture_output=True, timeout=60).stdout
+    expected = np.frombuffer(output, "<u2").reshape(24, 36, 3) / 65535
     assert np.abs(load_image(path).numpy() - expected).max() <= 1 / 255

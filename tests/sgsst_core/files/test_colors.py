@@ -23,17 +23,17 @@ def test_colors_round_trip_within_the_error_bound(tmp_path: Path, monkeypatch: p
     path = tmp_path / "colors.f16"
     write_colors(path, sh_dc)
     assert path.stat().st_size == 6 * 1003
-    found = np.fromfile(path, "<f2").reshape(-1, 3).astype(np.float64)
+    actual = np.fromfile(path, "<f2").reshape(-1, 3).astype(np.float64)
     exact = sh_dc.double().clamp(-65504, 65504).numpy()
-    assert (np.abs(found - exact) <= np.maximum(2.0**-11 * np.abs(exact), 2.0**-25)).all()
-    assert found[0].tolist() == [65504, -65504, 65504]
+    assert (np.abs(actual - exact) <= np.maximum(2.0**-11 * np.abs(exact), 2.0**-25)).all()
+    assert actual[0].tolist() == [65504, -65504, 65504]
 
 
 def test_colors_between_black_and_white_keep_their_gray_level(tmp_path: Path) -> None:
     levels = torch.linspace(0, 1, 3 * 10_001, dtype=torch.float64).reshape(-1, 3)
     write_colors(tmp_path / "c", ((levels - 0.5) / SH_C0).float())
-    found = 0.5 + SH_C0 * np.fromfile(tmp_path / "c", "<f2").astype(np.float64).reshape(-1, 3)
-    assert 255 * np.abs(found - levels.numpy()).max() < 0.04
+    colors = 0.5 + SH_C0 * np.fromfile(tmp_path / "c", "<f2").astype(np.float64).reshape(-1, 3)
+    assert 255 * np.abs(colors - levels.numpy()).max() < 0.04
 
 
 def test_empty_scene_is_written_and_missing_folder_is_an_error(tmp_path: Path) -> None:

@@ -105,14 +105,14 @@ def test_filters_of_any_size_are_exact() -> None:
     scales = np.array([[-80.0, -80, -80], [80, 80, 80], [0, 0, 0], [0, 0, 0], [-5, 0, 5]], np.float32)
     logits = np.array([np.inf, 90, -90, 3, 3], np.float32)
     filters = np.array([1e-30, 1e-30, 1.0, 0.0, -1.0])
-    found, opacities = scales.copy(), logits.copy()
-    apply_filter(found, opacities, filters)
-    assert found[0] == pytest.approx(np.log(1e-30), rel=1e-6)
-    assert np.array_equal(found[[1, 3]], scales[[1, 3]])
+    filtered, opacities = scales.copy(), logits.copy()
+    apply_filter(filtered, opacities, filters)
+    assert filtered[0] == pytest.approx(np.log(1e-30), rel=1e-6)
+    assert np.array_equal(filtered[[1, 3]], scales[[1, 3]])
     assert opacities[[1, 3]].tolist() == [90, 3]
     assert opacities[0] == pytest.approx(3 * (-80 - np.log(1e-30)), rel=1e-5)  # a logit of -33 is the logarithm
     assert opacities[2] == pytest.approx(-90 - 1.5 * np.log(2), rel=1e-6)
-    assert found[4] == pytest.approx(np.log(np.exp(2 * scales[4].astype(np.float64)) + 1) / 2, rel=1e-6)
+    assert filtered[4] == pytest.approx(np.log(np.exp(2 * scales[4].astype(np.float64)) + 1) / 2, rel=1e-6)
 
 
 def test_invalid_filters_are_reported(tmp_path: Path) -> None:

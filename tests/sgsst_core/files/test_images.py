@@ -117,8 +117,8 @@ def test_non_finite_float_pixels_are_refused(tmp_path: Path) -> None:
 
 
 def test_cmyk_becomes_rgb(tmp_path: Path) -> None:
-    picture = Image.new("CMYK", (8, 8), (255, 0, 0, 0))
-    image = load_image(save(tmp_path / "a.tif", picture))
+    cmyk = Image.new("CMYK", (8, 8), (255, 0, 0, 0))
+    image = load_image(save(tmp_path / "a.tif", cmyk))
     assert image[3, 3].tolist() == pytest.approx([0, 1, 1], abs=0.02)
 
 

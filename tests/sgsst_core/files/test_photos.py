@@ -26,9 +26,9 @@ def save(path: Path, image: Image.Image, **options: Any) -> Path:
     return path
 
 
-def paths(found: list[Photo | None]) -> list[Path]:
-    assert all(found)
-    return [photo.path for photo in found if photo]
+def paths(matches: list[Photo | None]) -> list[Path]:
+    assert all(matches)
+    return [photo.path for photo in matches if photo]
 
 
 @pytest.mark.parametrize(
@@ -56,8 +56,8 @@ def test_rig_photos_are_matched_by_folder_and_extension(tmp_path: Path) -> None:
     for name in ("cam0/a.png", "cam1/a.png", "cam1/a.jpg", "b.png", "old/b.png"):
         save(tmp_path / name, Image.new("RGB", (90, 60)))
     names = ["cam1/a.png", "images/cam0/a", "cam1/a.jpg", "b.png"]
-    found = paths(check_photos(tmp_path, [camera(name) for name in names]))
-    assert [str(path.relative_to(tmp_path)) for path in found] == ["cam1/a.png", "cam0/a.png", "cam1/a.jpg", "b.png"]
+    matched = paths(check_photos(tmp_path, [camera(name) for name in names]))
+    assert [str(path.relative_to(tmp_path)) for path in matched] == ["cam1/a.png", "cam0/a.png", "cam1/a.jpg", "b.png"]
     with pytest.raises(ImageError, match="more than one photo for 2 of 3 views: a, cam1/a"):
         check_photos(tmp_path, [camera("a"), camera("b"), camera("cam1/a")])
 
@@ -67,8 +67,8 @@ def test_missing_photos_are_named(tmp_path: Path) -> None:
     cameras = [camera(f"v{i:02d}") for i in range(15)]
     with pytest.raises(ImageError, match=r"no photo for 14 of 15 views: v00, v01, v02, v04, .*v10, \.\.\."):
         check_photos(tmp_path, cameras)
-    found = check_photos(tmp_path, [cameras[0], cameras[3]])
-    assert [photo and photo.path.name for photo in found] == [None, "v03.png"]
+    matches = check_photos(tmp_path, [cameras[0], cameras[3]])
+    assert [photo and photo.path.name for photo in matches] == [None, "v03.png"]
     with pytest.raises(ImageError, match="not a folder"):
         check_photos(tmp_path / "v03.png", cameras)
 
@@ -143,7 +143,7 @@ def test_photos_are_resized_to_the_camera_without_aliasing(tmp_path: Path) -> No
 def test_real_photos_match_their_cameras(shared_data: Path) -> None:
     photos = shared_data / "photos" / "snowmiku_plush"
     cameras = read_cameras(photos / "cameras.json")
-    found = check_photos(photos / "images", cameras)
-    assert [path.stem for path in paths(found)] == [view.name for view in cameras]
-    small = load_photo(Photo(paths(found)[5], (990, 742)), resized(cameras[5], 256))
+    matches = check_photos(photos / "images", cameras)
+    assert [path.stem for path in paths(matches)] == [view.name for view in cameras]
+    small = load_photo(Photo(paths(matches)[5], (990, 742)), resized(cameras[5], 256))
     assert small.shape == (192, 256, 3)

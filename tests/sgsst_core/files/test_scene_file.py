@@ -232,23 +232,23 @@ def test_children_of_split_gaussians_inherit_all_properties(
     source = read_scene(save(tmp_path, file.to_bytes() + behind), drop_invalid=dropped)
     pieces = torch.ones(len(source.scene), 3, dtype=torch.uint8)
     pieces[-1], pieces[0, 1] = torch.tensor([3, 4, 1]), 5
-    made = Refinement(pieces, 2, int(piece_counts(pieces).sum()))
-    refined = source.refined(made)
+    refinement = Refinement(pieces, 2, int(piece_counts(pieces).sum()))
+    refined = source.refined(refinement)
     assert source.refined(None) is source
     assert refined.dropped == int(dropped)
     colors = torch.rand(len(refined.scene), 3)
     write_stylized(refined, tmp_path / "out.ply", colors)
     written = (tmp_path / "out.ply").read_bytes()
     assert written.endswith(behind)
-    found = read_scene(tmp_path / "out.ply").scene
+    loaded = read_scene(tmp_path / "out.ply").scene
     for name in ("means", "quats", "scales", "opacities", "sh_rest"):
-        assert torch.equal(getattr(found, name), getattr(refined.scene, name)), name
-    assert torch.equal(found.sh_dc, colors)
-    kept = [row for i, row in enumerate(rows) if not (dropped and i == 1)]
-    parents = [kept[parent] for parent in parents_of(pieces).tolist()]
+        assert torch.equal(getattr(loaded, name), getattr(refined.scene, name)), name
+    assert torch.equal(loaded.sh_dc, colors)
+    remaining = [row for i, row in enumerate(rows) if not (dropped and i == 1)]
+    parents = [remaining[parent] for parent in parents_of(pieces).tolist()]
     for row, parent in zip(second_reader(written.removesuffix(behind))[1]["vertex"], parents, strict=True):
         assert row["label"] == parent["label"]
-        if parent not in (kept[0], kept[-1]):
+        if parent not in (remaining[0], remaining[-1]):
             assert row["y"] == parent["y"], "what is not cut keeps its double precision"
 
 

@@ -63,15 +63,15 @@ def test_file_contains_the_attenuated_coefficients(tmp_path: Path, form: str, at
     wanted = source.scene.attenuated(attenuation)
     colors = source.scene.sh_dc + 1
     write_stylized(source, tmp_path / "out.ply", colors, sh_attenuation=attenuation)
-    found = read_scene(tmp_path / "out.ply").scene
-    rest = torch.zeros_like(held(found.sh_rest)) if attenuation == 1 else held(wanted.sh_rest)
-    assert torch.equal(held(found.sh_rest), rest)
+    loaded = read_scene(tmp_path / "out.ply").scene
+    rest = torch.zeros_like(held(loaded.sh_rest)) if attenuation == 1 else held(wanted.sh_rest)
+    assert torch.equal(held(loaded.sh_rest), rest)
     if attenuation == 1:
         assert wanted.sh_degree == 0
-        assert not torch.signbit(held(found.sh_rest)).any()
-    assert torch.equal(found.sh_dc, colors)
+        assert not torch.signbit(held(loaded.sh_rest)).any()
+    assert torch.equal(loaded.sh_dc, colors)
     for name in ("means", "quats", "scales", "opacities"):
-        assert torch.equal(getattr(found, name), getattr(source.scene, name))
+        assert torch.equal(getattr(loaded, name), getattr(source.scene, name))
     before, after = (PlyData.read(each)["vertex"].data for each in (path, tmp_path / "out.ply"))
     assert before.dtype == after.dtype
     for name in set(before.dtype.names) - {"f_dc_0", "f_dc_1", "f_dc_2"}:
@@ -97,11 +97,11 @@ def test_stored_coefficients_match_those_in_memory(tmp_path: Path, attenuation: 
         return
     assert isinstance(stored.sh_rest, StoredHarmonics)
     rows = torch.arange(0, 60, 3)
-    for found in (stored.sh_rest, pickle.loads(pickle.dumps(stored.sh_rest))):
-        assert torch.equal(found.tensor(), plain.sh_rest)
-        assert torch.equal(held(found[rows]), plain.sh_rest[rows])
-        assert torch.equal(found.first(8).tensor(), plain.sh_rest[:, :8])
-        assert torch.equal(found.largest(), plain.sh_rest.abs().amax((1, 2)))
+    for harmonics in (stored.sh_rest, pickle.loads(pickle.dumps(stored.sh_rest))):
+        assert torch.equal(harmonics.tensor(), plain.sh_rest)
+        assert torch.equal(held(harmonics[rows]), plain.sh_rest[rows])
+        assert torch.equal(harmonics.first(8).tensor(), plain.sh_rest[:, :8])
+        assert torch.equal(harmonics.largest(), plain.sh_rest.abs().amax((1, 2)))
     assert stored.used_degree() == 3
 
 
@@ -111,9 +111,9 @@ def test_dropped_rows_are_absent_and_others_are_attenuated(tmp_path: Path) -> No
     write_scene(tmp_path / "scene.ply", scene)
     source = read_scene(tmp_path / "scene.ply", drop_invalid=True)
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
-    found = read_scene(tmp_path / "out.ply").scene
-    assert len(found) == 59
-    assert torch.equal(held(found.sh_rest), held(source.scene.sh_rest) * 0.5)
+    loaded = read_scene(tmp_path / "out.ply").scene
+    assert len(loaded) == 59
+    assert torch.equal(held(loaded.sh_rest), held(source.scene.sh_rest) * 0.5)
 
 
 def test_attenuation_ignores_scenes_of_degree_0(tmp_path: Path) -> None:

@@ -46,10 +46,10 @@ def load_all(path: Path) -> Any:
 @pytest.mark.parametrize("write", [write_gsplat, write_nerfstudio])
 def test_only_colors_of_a_checkpoint_change(tmp_path: Path, write: Any) -> None:
     path, scene = write(tmp_path / "given.ckpt", wall(sh_degree=3)), wall(sh_degree=3)
-    found = load_scene(path)
-    assert isinstance(found, TrainerCheckpoint)
-    assert same(found.scene, scene)
-    result = found.stylized(replace(scene, sh_dc=scene.sh_dc + 1), None, 0.0)
+    loaded = load_scene(path)
+    assert isinstance(loaded, TrainerCheckpoint)
+    assert same(loaded.scene, scene)
+    result = loaded.stylized(replace(scene, sh_dc=scene.sh_dc + 1), None, 0.0)
     save(tmp_path / "out.pt", result)
     before, after = load_all(path), load_all(tmp_path / "out.pt")
     name = "splats" if write is write_gsplat else "pipeline"
@@ -61,15 +61,19 @@ def test_only_colors_of_a_checkpoint_change(tmp_path: Path, write: Any) -> None:
 
 
 def test_checkpoint_can_be_saved_as_a_scene_file(tmp_path: Path) -> None:
-    found = load_scene(write_nerfstudio(tmp_path / "given.ckpt", wall(sh_degree=1)))
-    save(tmp_path / "out.ply", found)
+    loaded = load_scene(write_nerfstudio(tmp_path / "given.ckpt", wall(sh_degree=1)))
+    save(tmp_path / "out.ply", loaded)
     assert same(read_scene(tmp_path / "out.ply").scene, wall(sh_degree=1))
-    for path, form in ((tmp_path / "out.json", found), (tmp_path / "out.pt", found.scene), (tmp_path / "out", found)):
+    for path, form in (
+        (tmp_path / "out.json", loaded),
+        (tmp_path / "out.pt", loaded.scene),
+        (tmp_path / "out", loaded),
+    ):
         with pytest.raises(OutputError, match="no suffix that a scene can be written with"):
             save(path, form)
-    os.utime(found.path, ns=(0, 0))
+    os.utime(loaded.path, ns=(0, 0))
     with pytest.raises(SceneError, match="was changed after it was read"):
-        save(tmp_path / "other.pt", found)
+        save(tmp_path / "other.pt", loaded)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["given.ckpt", "out.ply"]
 
 
@@ -145,9 +149,9 @@ def test_unusable_checkpoints_are_refused(
 def test_activated_values_are_detected() -> None:
     scene = wall(sh_degree=1)
     assert same(scene_of_splats(splats_of(scene)), scene)
-    found = scene_of_splats(splats_of(scene, activated=True))
-    torch.testing.assert_close(found.scales, scene.scales)
-    torch.testing.assert_close(found.opacities, scene.opacities, rtol=1e-4, atol=0)
+    loaded = scene_of_splats(splats_of(scene, activated=True))
+    torch.testing.assert_close(loaded.scales, scene.scales)
+    torch.testing.assert_close(loaded.opacities, scene.opacities, rtol=1e-4, atol=0)
     opaque = {**splats_of(scene, activated=True), "opacities": torch.ones(len(scene))}
     flat = {**opaque, "scales": torch.tensor([0.1, 0.1, 0.0]).repeat(len(scene), 1)}
     assert float(scene_of_splats(flat).opacities.max()) == pytest.approx(float(OPACITY_LOGITS[-1]))

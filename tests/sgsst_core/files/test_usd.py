@@ -44,9 +44,9 @@ def test_written_values_match_the_scene(tmp_path: Path, suffix: str, degree: int
     np.testing.assert_array_equal(harmonics[:, 1:], held(scene.sh_rest).numpy() * signs)
     quats = scene.quats.double().numpy()
     w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    for index, found in enumerate(splats.GetOrientationsAttr().Get()):
+    for index, actual in enumerate(splats.GetOrientationsAttr().Get()):
         expected = (-z[index], -y[index], x[index], w[index])  # a rotation by 180 degrees about z comes first
-        assert (found.GetReal(), *found.GetImaginary()) == pytest.approx(expected, abs=1e-6)
+        assert (actual.GetReal(), *actual.GetImaginary()) == pytest.approx(expected, abs=1e-6)
     low, high = splats.GetExtentAttr().Get()
     assert bool((np.array(low) < values("positions")).all() and (np.array(high) > values("positions")).all())
 

@@ -11,7 +11,7 @@ from sgsst_core.loss.difference import Difference
 
 
 @pytest.mark.parametrize(
-    ("found", "exact", "error", "cosine"),
+    ("actual", "exact", "error", "cosine"),
     [
         ([3.0, 4.0], [3.0, 4.0], 0.0, 1.0),
         ([6.0, 8.0], [3.0, 4.0], 1.0, 1.0),
@@ -27,7 +27,7 @@ from sgsst_core.loss.difference import Difference
     ],
 )
 def test_difference_has_relative_error_and_cosine(
-    found: list[float], exact: list[float], error: float, cosine: float
+    actual: list[float], exact: list[float], error: float, cosine: float
 ) -> None:
-    difference = Difference.of(torch.tensor(found), torch.tensor(exact))
+    difference = Difference.of(torch.tensor(actual), torch.tensor(exact))
     assert (difference.relative_error, difference.cosine) == (pytest.approx(error), pytest.approx(cosine, abs=1e-12))

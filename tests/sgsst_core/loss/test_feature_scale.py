@@ -30,15 +30,15 @@ def renormalized(tiny_weights: BackboneWeights) -> BackboneWeights:
     return replace(tiny_weights, input_scale=torch.tensor([250.0, 255.0, 260.0]))
 
 
-def features(weights: BackboneWeights, picture: torch.Tensor) -> dict[str, torch.Tensor]:
+def features(weights: BackboneWeights, image: torch.Tensor) -> dict[str, torch.Tensor]:
     network = FeatureNetwork(weights, LAYERS, torch.float64)
-    return network.forward(picture.double(), cache=False).features
+    return network.forward(image.double(), cache=False).features
 
 
 def test_features_of_each_layer_are_scaled_by_its_factor(tiny_weights: BackboneWeights) -> None:
     scales = dict(zip(LAYERS, (1.3, 0.25, 7.0, 3.0, 1e-3, 40.0), strict=True))
-    picture = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0))
-    before, after = features(tiny_weights, picture), features(with_scales(tiny_weights, scales), picture)
+    image = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0))
+    before, after = features(tiny_weights, image), features(with_scales(tiny_weights, scales), image)
     for layer in LAYERS:
         wanted = before[layer] * scales[layer]
         torch.testing.assert_close(after[layer], wanted, rtol=0, atol=1e-5 * float(wanted.amax()))
@@ -49,15 +49,15 @@ def test_paper_scales_give_the_published_statistics(renormalized: BackboneWeight
     """Statistics agree to 22 %, because the factors have two digits."""
     with Image.open(STARRY_NIGHT) as painting:
         small = painting.resize((512, 405), Image.Resampling.LANCZOS)
-    picture = torch.from_numpy(np.array(small)).double() / 255
-    nothing = (torch.tensor([123.68, 116.779, 103.939]) / 255).expand(picture.shape)
+    image = torch.from_numpy(np.array(small)).double() / 255
+    nothing = (torch.tensor([123.68, 116.779, 103.939]) / 255).expand(image.shape)
     scaled = at_scale(renormalized, "paper")
-    found, of_nothing = features(scaled, picture), features(scaled, nothing)
+    own_features, of_nothing = features(scaled, image), features(scaled, nothing)
     for layer in STYLE_LAYERS:
-        grams = [values[layer].flatten(0, 1).T @ values[layer].flatten(0, 1) for values in (found, of_nothing)]
-        statistic = ((grams[0] - grams[1]) / found[layer].numel()).square().mean()
+        grams = [values[layer].flatten(0, 1).T @ values[layer].flatten(0, 1) for values in (own_features, of_nothing)]
+        statistic = ((grams[0] - grams[1]) / own_features[layer].numel()).square().mean()
         assert float(statistic) == pytest.approx(PUBLISHED[layer], rel=0.25)
-    difference = (found[CONTENT_LAYER] - of_nothing[CONTENT_LAYER]).square().mean()
+    difference = (own_features[CONTENT_LAYER] - of_nothing[CONTENT_LAYER]).square().mean()
     assert float(difference) == pytest.approx(PUBLISHED[CONTENT_LAYER], rel=0.12)
 
 
@@ -71,8 +71,8 @@ def test_even_scales_differ_only_in_the_color_layers(renormalized: BackboneWeigh
     assert scaled.scales["relu1_1"] == EVEN_COLOR_SCALE
     assert scaled.scales[PIXELS] == EVEN_PIXEL_SCALE
     assert {factor for layer, factor in scaled.scales.items() if layer not in ("relu1_1", PIXELS)} == {EVEN_SCALE}
-    picture = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))
-    before, after = features(renormalized, picture), features(scaled, picture)
+    image = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))
+    before, after = features(renormalized, image), features(scaled, image)
     for layer in LAYERS:  # exact, because factors are powers of two
         torch.testing.assert_close(after[layer], before[layer] * scaled.scales[layer], rtol=0, atol=0)
 

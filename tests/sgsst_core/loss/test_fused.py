@@ -49,7 +49,7 @@ def on_cpu(statistics: LayerStatistics) -> LayerStatistics:
 
 def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tuple[Tensor, Tensor]:
     """Return terms [4] and gradient [h, w, c]. Check that the gradient is added, and only within the crop."""
-    found, *maps = fused_style_loss(
+    terms, *maps = fused_style_loss(
         fused_statistics(x, weights), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23
     )
     around = torch.zeros((x.shape[0] + 2, x.shape[1] + 2, x.shape[2]), dtype=x.dtype, device=x.device)
@@ -60,7 +60,7 @@ def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tu
     assert torch.equal(gradient, 2 * once)
     gradient.zero_()
     assert not around.any()
-    return found.cpu(), once.cpu()
+    return terms.cpu(), once.cpu()
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -71,11 +71,11 @@ def test_agrees_with_float64(channels: int, height: int, width: int, weighted: b
     """With 64 channels, this size is summed in several spans."""
     x = features(height, width, channels, seed=1)
     a = position_weights(height, width) if weighted else None
-    found, exact = on_cpu(fused_statistics(x, a)), layer_statistics_reference(x.cpu(), None if a is None else a.cpu())
-    assert float(found.count) == pytest.approx(float(exact.count), rel=1e-6)
-    assert relative_error(found.mean, exact.mean) < 1e-6
-    assert relative_error(found.centered, exact.centered) < 3e-6
-    assert torch.equal(found.centered, found.centered.T)
+    actual, exact = on_cpu(fused_statistics(x, a)), layer_statistics_reference(x.cpu(), None if a is None else a.cpu())
+    assert float(actual.count) == pytest.approx(float(exact.count), rel=1e-6)
+    assert relative_error(actual.mean, exact.mean) < 1e-6
+    assert relative_error(actual.centered, exact.centered) < 3e-6
+    assert torch.equal(actual.centered, actual.centered.T)
     target = target_of(channels)
     terms_, gradient = fused_gradient(x, a, target)
     exact_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
@@ -96,12 +96,12 @@ def test_survives_a_large_mean_to_sigma_ratio() -> None:
     target = LayerTarget(reference.gram(), reference.mean, reference.std())
     _, expected = style_loss(exact, target)
     on_device = LayerTarget(*(part.to(DEVICE) for part in (target.gram, target.mean, target.std)))
-    found, *maps = fused_style_loss(
+    actual, *maps = fused_style_loss(
         fused_statistics(x.to(DEVICE)), (on_device.gram, on_device.mean, on_device.std), WEIGHTS, 2.0**-23
     )
     gradient = torch.zeros_like(x, device=DEVICE)
     fused_add_style_gradient(gradient, x.to(DEVICE), maps[0], maps[1], maps[2])
-    assert torch.isfinite(found).all()
+    assert torch.isfinite(actual).all()
     assert relative_error(gradient.cpu(), expected.apply(x.double())) < 1e-4
 
 
@@ -143,10 +143,10 @@ def test_dead_and_constant_channels_give_finite_gradients(dead_in: str) -> None:
 def test_zero_weights_give_zero_terms_and_maps(shape: tuple[int, int]) -> None:
     x = features(*shape, 16, seed=1) if shape[0] else torch.zeros((*shape, 16), device=DEVICE)
     a = torch.zeros(shape, device=DEVICE)
-    found = on_cpu(fused_statistics(x, a))
-    assert found.empty
-    assert not found.mean.any()
-    assert not found.centered.any()
+    statistics = on_cpu(fused_statistics(x, a))
+    assert statistics.empty
+    assert not statistics.mean.any()
+    assert not statistics.centered.any()
     target = target_of(16)
     terms_, *maps = fused_style_loss(fused_statistics(x, a), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)
     assert not terms_.any()
@@ -156,9 +156,9 @@ def test_zero_weights_give_zero_terms_and_maps(shape: tuple[int, int]) -> None:
 def test_bfloat16_features_are_summed_in_float32() -> None:
     x = features(40, 60, 32, seed=3).bfloat16()
     exact = layer_statistics_reference(x.cpu())
-    found = on_cpu(fused_statistics(x))
+    actual = on_cpu(fused_statistics(x))
     # Products use TF32, whose inputs are rounded to 11 bits. Truncated inputs would be off by 8e-4.
-    assert relative_error(found.centered, exact.centered) < 4e-4
+    assert relative_error(actual.centered, exact.centered) < 4e-4
     target = target_of(32)
     _, gradient = fused_gradient(x, None, target)
     cpu_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
@@ -176,7 +176,7 @@ def test_tensor_functions_apply_maps_made_by_kernels() -> None:
     """They are needed for features in another memory layout."""
     x, target = features(12, 14, 16, seed=5), target_of(16)
     _, *maps = fused_style_loss(fused_statistics(x), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)
-    found = StyleGradient(maps[0].cpu(), maps[1].cpu(), maps[2].cpu()).apply(x.cpu())
+    applied = StyleGradient(maps[0].cpu(), maps[1].cpu(), maps[2].cpu()).apply(x.cpu())
     gradient = torch.zeros_like(x)
     fused_add_style_gradient(gradient, x, maps[0], maps[1], maps[2])
-    assert relative_error(gradient.cpu(), found.double()) < 1e-5
+    assert relative_error(gradient.cpu(), applied.double()) < 1e-5

@@ -36,8 +36,8 @@ SCALES = [0, 1]
 
 @pytest.fixture
 def counts() -> Iterator[Counts]:
-    with pretend_cuda() as found:
-        yield found
+    with pretend_cuda() as counts:
+        yield counts
 
 
 @pytest.fixture
@@ -63,13 +63,13 @@ def view_of(loss: SosLoss, seed: int, *, weighted: bool = False) -> ViewTarget:
     return loss.targets.of_view(image(seed + 100), coverage)
 
 
-def assert_same(found: SosResult, expected: SosResult) -> None:
-    assert found.scales == expected.scales
-    assert found.image_gradient is not None
+def assert_same(actual: SosResult, expected: SosResult) -> None:
+    assert actual.scales == expected.scales
+    assert actual.image_gradient is not None
     assert expected.image_gradient is not None
     assert expected.image_gradient.cpu().abs().amax() > 0
-    assert found.image_gradient.cpu().equal(expected.image_gradient.cpu())
-    assert found.values.cpu().equal(expected.values.cpu())
+    assert actual.image_gradient.cpu().equal(expected.image_gradient.cpu())
+    assert actual.values.cpu().equal(expected.values.cpu())
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -85,14 +85,14 @@ def test_graph_is_bit_identical_to_eager_mode_for_every_view(
         pixels, view = image(step), views[step % 2]
         expected = loss.evaluate(pixels, style, view, SCALES)
         counts.clear()
-        found = graphs.evaluate(pixels, style, view, SCALES)
+        actual = graphs.evaluate(pixels, style, view, SCALES)
         assert graphs.captured == (step + 1 >= FIRST_VISITS)
         if step >= FIRST_VISITS:
             assert not counts.waits
             assert not counts.copies
             assert counts.launches.total() < 15  # one graph; copies of image, content and coverage; the results
-        assert_same(found, expected)
-        results.append((found.values, expected.values))
+        assert_same(actual, expected)
+        results.append((actual.values, expected.values))
     for values, expected_values in results:  # later evaluations must not change them
         assert values.cpu().equal(expected_values.cpu())
     assert graphs.problem is None
@@ -111,11 +111,11 @@ def test_graphs_include_feature_matching(
         pixels = image(step)
         expected = loss.evaluate(pixels, style, view, SCALES)
         counts.clear()
-        found = graphs.evaluate(pixels, style, view, SCALES)
+        actual = graphs.evaluate(pixels, style, view, SCALES)
         if step >= FIRST_VISITS:
             assert not counts.waits
             assert not counts.copies
-        assert_same(found, expected)
+        assert_same(actual, expected)
     assert graphs.problem is None
     assert graphs.captured == 1
     assert all(terms["nearest"] > 0 for terms in expected.terms.values())
@@ -140,8 +140,8 @@ def test_each_kind_of_evaluation_has_its_own_graph(tiny_weights: BackboneWeights
     for step in range(3):
         for style, scales in ((whole, SCALES), (whole, [1]), (other, [1])):
             expected = loss.evaluate(image(step), style, view(scales), scales)
-            found = graphs.evaluate(image(step), style, view(scales), scales)
-            assert_same(found, expected)
+            actual = graphs.evaluate(image(step), style, view(scales), scales)
+            assert_same(actual, expected)
     assert graphs.captured == 3
 
 

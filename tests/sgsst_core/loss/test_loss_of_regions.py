@@ -60,9 +60,9 @@ def test_float64_agrees_with_autograd(tiny_weights, case, tile_size, style_loss,
     expected, gradient = sos_reference(tiny_weights, image, parts, content, coarsest=60, style_loss=style_loss)
     layers = layers_of(style_loss, tiny_weights, content=True)
     network = FeatureNetwork(tiny_weights, layers, torch.float64)
-    found = evaluate(network, *case, tile_size=tile_size, style_loss=style_loss)
-    assert found.loss == pytest.approx(expected, rel=1e-9)
-    assert relative_error(found.image_gradient, gradient) < 1e-9
+    actual = evaluate(network, *case, tile_size=tile_size, style_loss=style_loss)
+    assert actual.loss == pytest.approx(expected, rel=1e-9)
+    assert relative_error(actual.image_gradient, gradient) < 1e-9
 
 
 def test_float32_tiles_agree_with_untiled_float64(tiny_weights, case):
@@ -75,12 +75,12 @@ def test_float32_tiles_agree_with_untiled_float64(tiny_weights, case):
 def test_order_of_regions_does_not_matter(tiny_weights, case):
     image, content, *parts = case
     network = FeatureNetwork(tiny_weights, dtype=torch.float64)
-    found = [
+    results = [
         evaluate(network, image, content, *([part[i] for i in order] for part in parts))
         for order in ([0, 1, 2], [2, 0, 1])
     ]
-    assert found[1].loss == pytest.approx(found[0].loss, rel=1e-13)
-    assert relative_error(found[1].image_gradient, found[0].image_gradient) < 1e-12
+    assert results[1].loss == pytest.approx(results[0].loss, rel=1e-13)
+    assert relative_error(results[1].image_gradient, results[0].image_gradient) < 1e-12
 
 
 def test_single_region_is_bit_identical_to_no_regions(tiny_weights, case):
@@ -94,9 +94,9 @@ def test_single_region_is_bit_identical_to_no_regions(tiny_weights, case):
     )
     view = loss.targets.of_view(content, maps[2])
     view.regions = [loss.targets.position_weights(maps[2])]
-    found = loss.evaluate(image.float(), targets_of(loss, styles[:1], [1.0]), view)
-    assert torch.equal(found.values, plain.values)
-    assert torch.equal(found.image_gradient, plain.image_gradient)
+    result = loss.evaluate(image.float(), targets_of(loss, styles[:1], [1.0]), view)
+    assert torch.equal(result.values, plain.values)
+    assert torch.equal(result.image_gradient, plain.image_gradient)
 
 
 def test_region_outside_the_view_adds_nothing(tiny_weights, case):
@@ -104,9 +104,9 @@ def test_region_outside_the_view_adds_nothing(tiny_weights, case):
     network = FeatureNetwork(tiny_weights, dtype=torch.float64)
     without = evaluate(network, image, content, styles[:2], maps[:2], weights[:2])
     blind = [*maps[:2], torch.zeros(SIZE)]
-    found = evaluate(network, image, content, styles, blind, weights)
-    assert torch.equal(found.values, without.values)
-    assert torch.equal(found.image_gradient, without.image_gradient)
+    result = evaluate(network, image, content, styles, blind, weights)
+    assert torch.equal(result.values, without.values)
+    assert torch.equal(result.image_gradient, without.image_gradient)
 
 
 def test_weights_scale_only_the_style_terms(tiny_weights, case):
@@ -138,28 +138,28 @@ def regions(labels, **frozen):
 
 
 def test_regions_outside_all_views_join_the_rest():
-    found = regions([0, 1, 2, 2]).resolved(torch.tensor([1.0, 0, 0, 2]))
-    assert found.labels.tolist() == [0, 0, 2, 2]
-    assert found.active == (0, 2)
-    assert found.mapped
+    resolved = regions([0, 1, 2, 2]).resolved(torch.tensor([1.0, 0, 0, 2]))
+    assert resolved.labels.tolist() == [0, 0, 2, 2]
+    assert resolved.active == (0, 2)
+    assert resolved.mapped
 
 
 def test_frozen_regions_outside_all_views_stay_frozen():
-    found = regions([0, 1, 2, 2], a=True).resolved(torch.tensor([1.0, 0, 1, 2]))
-    assert found.frozen.tolist() == [False, True, False, False]
-    assert not found.frozen_in_view
+    resolved = regions([0, 1, 2, 2], a=True).resolved(torch.tensor([1.0, 0, 1, 2]))
+    assert resolved.frozen.tolist() == [False, True, False, False]
+    assert not resolved.frozen_in_view
 
 
 def test_region_of_all_seen_gaussians_needs_no_map():
-    found = regions([0, 1, 1]).resolved(torch.tensor([0.0, 1, 1]))
-    assert found.active == (1,)
-    assert not found.mapped
+    resolved = regions([0, 1, 1]).resolved(torch.tensor([0.0, 1, 1]))
+    assert resolved.active == (1,)
+    assert not resolved.mapped
 
 
 def test_freezing_everything_is_an_error():
-    kept = regions([1, 1, 2], a=True, b=True)
+    all_frozen = regions([1, 1, 2], a=True, b=True)
     with pytest.raises(SettingsError, match=r"Every Gaussian is frozen \(a, b\)"):
-        check_regions(kept)
+        check_regions(all_frozen)
     partly = regions([0, 1, 2], a=True, b=True)
     check_regions(partly)
     with pytest.raises(SettingsError, match=r"--sh-attenuation 0\.5 changes the Gaussians of every region"):

@@ -124,10 +124,10 @@ def test_real_network_agrees_with_untiled_autograd(vgg16_weights: BackboneWeight
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
 def test_lower_precisions_agree_with_float64(vgg16_weights: BackboneWeights, dtype: torch.dtype) -> None:
     case = setting(84, 100)
-    exact, found = (evaluate(loss_of(vgg16_weights, "nnfm", each), case) for each in (torch.float64, dtype))
+    exact, actual = (evaluate(loss_of(vgg16_weights, "nnfm", each), case) for each in (torch.float64, dtype))
     loss, gradient = (1e-5, 1e-2) if dtype == torch.float32 else (1e-2, 0.5)
-    assert found.loss == pytest.approx(exact.loss, rel=loss)
-    assert relative_error(gradient_of(found), gradient_of(exact)) < gradient
+    assert actual.loss == pytest.approx(exact.loss, rel=loss)
+    assert relative_error(gradient_of(actual), gradient_of(exact)) < gradient
 
 
 @pytest.mark.parametrize("style_loss", MATCHED)
@@ -140,10 +140,10 @@ def test_recomputed_tiles_are_matched_once(
         searched.append(len(units))
         return search(units, style)
 
-    kept = evaluate(loss_of(tiny_weights, style_loss, tile_size=48), case)
+    cached = evaluate(loss_of(tiny_weights, style_loss, tile_size=48), case)
     monkeypatch.setattr(nearest, "search", counted)
     twice = evaluate(loss_of(tiny_weights, style_loss, tile_size=48, cache_activations=False), case)
-    assert torch.equal(gradient_of(twice), gradient_of(kept))
+    assert torch.equal(gradient_of(twice), gradient_of(cached))
     assert sum(searched) == 24 * 32
 
 
@@ -159,11 +159,11 @@ def test_block_size_does_not_change_matches(
     expected = nearest_reference(list(leaves.values()), list(style.values()), a)
     wanted = dict(zip(own, torch.autograd.grad(expected, list(leaves.values())), strict=True))
     vectors, count = vectors_of(style), torch.tensor(99.0, dtype=torch.float64) if a is None else a.sum()
-    found = Matches.of(own, vectors, EPS, a)
-    assert float(found.distance(a) / count) == pytest.approx(expected.item(), rel=1e-12)
+    actual = Matches.of(own, vectors, EPS, a)
+    assert float(actual.distance(a) / count) == pytest.approx(expected.item(), rel=1e-12)
     for layer, part in own.items():
         gradient = torch.ones_like(part)  # the gradient is added
-        found.add_gradient(gradient, part, layer, vectors, 1 / count, a)
+        actual.add_gradient(gradient, part, layer, vectors, 1 / count, a)
         assert relative_error(gradient - 1, wanted[layer]) < 1e-12
 
 
@@ -183,12 +183,12 @@ def test_zero_vectors_match_nothing() -> None:
         part[0] = 0
         part[1] *= 1e-17
     vectors = vectors_of(style)
-    found = Matches.of(own, vectors, EPS)
-    away = 1 - found.cosine
+    matches = Matches.of(own, vectors, EPS)
+    away = 1 - matches.cosine
     assert torch.equal(away[:2], torch.ones_like(away[:2]))
     assert (away[2] < 0.9).all()
     gradient = torch.zeros_like(own["relu3_1"])
-    found.add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
+    matches.add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
     assert gradient[:2].abs().max() == 0
     assert torch.isfinite(gradient).all()
     assert gradient[2].abs().max() > 0
@@ -197,10 +197,10 @@ def test_zero_vectors_match_nothing() -> None:
 def test_zero_style_vectors_give_no_gradient() -> None:
     own = features((3, 4), (6,), 1)
     vectors = vectors_of({"relu3_1": torch.zeros((2, 2, 6), dtype=torch.float64)})
-    found = Matches.of(own, vectors, EPS)
+    matches = Matches.of(own, vectors, EPS)
     gradient = torch.zeros_like(own["relu3_1"])
-    found.add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
-    assert float(found.distance()) == 12
+    matches.add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
+    assert float(matches.distance()) == 12
     assert gradient.abs().max() == 0
 
 
@@ -275,8 +275,8 @@ def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
     loss = loss_of(tiny_weights, "nnfm", tile_size=tile_size)
     vectors = loss.targets.of_style(Style.of(style), (130, 201))[0][0].vectors
     assert vectors is not None
-    found = loss.network.forward(style, cache=False).features
-    whole = torch.cat([found[layer] for layer in nearest_layers("nnfm", "vgg16")], dim=2).flatten(0, 1)
+    features = loss.network.forward(style, cache=False).features
+    whole = torch.cat([features[layer] for layer in nearest_layers("nnfm", "vgg16")], dim=2).flatten(0, 1)
     expected = whole[chosen_positions(32 * 50, 200)]
     assert relative_error(vectors.units, expected / expected.norm(dim=1, keepdim=True)) < 1e-12
 

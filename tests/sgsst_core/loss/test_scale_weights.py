@@ -57,10 +57,10 @@ def test_float64_agrees_with_the_definition(
     expected, gradient = sos_reference(
         tiny_weights, image, painting, content, coverage=coverage, coarsest=COARSEST, scales=values
     )
-    found, _ = evaluate(tiny_weights, values, tile_size)
-    assert found.loss == pytest.approx(expected, rel=1e-9)
-    assert found.image_gradient is not None
-    assert relative_error(found.image_gradient, gradient) < 1e-9
+    actual, _ = evaluate(tiny_weights, values, tile_size)
+    assert actual.loss == pytest.approx(expected, rel=1e-9)
+    assert actual.image_gradient is not None
+    assert relative_error(actual.image_gradient, gradient) < 1e-9
 
 
 def test_scales_without_weight_are_not_computed(tiny_weights: BackboneWeights) -> None:
@@ -72,16 +72,16 @@ def test_scales_without_weight_are_not_computed(tiny_weights: BackboneWeights) -
 
 @pytest.mark.parametrize("values", [(1.0, 1.0, 1.0), (7.0, 7.0, 7.0)])
 def test_equal_weights_are_bit_identical_to_none(tiny_weights: BackboneWeights, values: tuple[float, ...]) -> None:
-    found, _ = evaluate(tiny_weights, values, dtype=torch.float32)
+    actual, _ = evaluate(tiny_weights, values, dtype=torch.float32)
     expected, _ = evaluate(tiny_weights, (), dtype=torch.float32)
-    assert found.image_gradient is not None
+    assert actual.image_gradient is not None
     assert expected.image_gradient is not None
-    assert torch.equal(found.values, expected.values)
+    assert torch.equal(actual.values, expected.values)
     if values[0] == 1:
-        assert found.loss == expected.loss
-        assert torch.equal(found.image_gradient, expected.image_gradient)
+        assert actual.loss == expected.loss
+        assert torch.equal(actual.image_gradient, expected.image_gradient)
     else:
-        torch.testing.assert_close(found.image_gradient, expected.image_gradient)
+        torch.testing.assert_close(actual.image_gradient, expected.image_gradient)
 
 
 def test_fractions_sum_to_one_and_need_a_weighted_scale() -> None:

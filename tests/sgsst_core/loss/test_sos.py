@@ -68,18 +68,18 @@ def test_compared_pixels_are_the_first_layer_without_gram_matrix(tiny_weights):
         scale: (StyleTarget({PIXELS: own[0].layers[PIXELS]}),)
         for scale, own in loss.targets.of_style(Style.of(style), (40, 56)).items()
     }
-    found = loss.evaluate(image, only, loss.targets.of_view(image))
+    result = loss.evaluate(image, only, loss.targets.of_view(image))
     values = [(256 * part.double()).flatten(0, 1) for part in (image, style)]
     means, deviations = (
         [own(part) for part in values] for own in (lambda x: x.mean(0), lambda x: x.std(0, correction=0))
     )
-    assert found.terms[0]["gram"] == 0
-    assert found.terms[0]["mean"] == pytest.approx(9e4 * float((means[0] - means[1]).square().mean()), rel=1e-5)
-    assert found.terms[0]["std"] == pytest.approx(
+    assert result.terms[0]["gram"] == 0
+    assert result.terms[0]["mean"] == pytest.approx(9e4 * float((means[0] - means[1]).square().mean()), rel=1e-5)
+    assert result.terms[0]["std"] == pytest.approx(
         9e4 * float((deviations[0] - deviations[1]).square().mean()), rel=1e-5
     )
     matched = loss.evaluate(style, only, loss.targets.of_view(style))
-    assert matched.loss < 1e-9 * found.loss
+    assert matched.loss < 1e-9 * result.loss
 
 
 def test_real_network_agrees_with_untiled_autograd(vgg16_weights):
@@ -143,10 +143,10 @@ def test_float32_differs_from_float64_mostly_by_flips(vgg16_weights):
     image, style, content, _ = case
     _, exact = sos_reference(vgg16_weights, image, style, content)
     network = FeatureNetwork(vgg16_weights)
-    found = evaluate(network, case, None).image_gradient
+    actual = evaluate(network, case, None).image_gradient
     same_decisions = DecisionsOf(vgg16_weights, network)
     expected = evaluate(same_decisions, case, None).image_gradient
-    with_flips, without = relative_error(found, exact), relative_error(found, expected)
+    with_flips, without = relative_error(actual, exact), relative_error(actual, expected)
     flipped = same_decisions.flips / same_decisions.decisions
     print(f"float32 against float64: {with_flips:.1e}, of it without flips {without:.1e}; {flipped:.1e} flipped")
     assert without < 1e-5
@@ -170,11 +170,11 @@ def test_cached_and_recomputed_content_agree(tiny_weights):
     image, style, content, _ = (None if t is None else t.float() for t in setting((200, 300)))
     loss = SosLoss(network)
     targets = loss.targets.of_style(Style.of(style), (200, 300))
-    kept = loss.evaluate(image, targets, loss.targets.of_view(content))
+    cached = loss.evaluate(image, targets, loss.targets.of_view(content))
     again = loss.evaluate(image, targets, loss.targets.of_view(content, cache_content=False))
-    assert kept.loss == again.loss
-    assert torch.equal(kept.image_gradient, again.image_gradient)
-    assert kept.terms[0]["content"] > 0
+    assert cached.loss == again.loss
+    assert torch.equal(cached.image_gradient, again.image_gradient)
+    assert cached.terms[0]["content"] > 0
 
 
 def test_unneeded_content_and_layers_are_not_computed(tiny_weights):

@@ -84,11 +84,11 @@ def test_content_gradient_agrees_with_autograd(weighted):
     x, content = make_features(9, 11, 6, 1).requires_grad_(), make_features(9, 11, 6, 2)
     a = torch.rand((9, 11), dtype=torch.float64) if weighted else torch.ones((9, 11), dtype=torch.float64)
     expected = 0.7 * (a[:, :, None] * (x - content) ** 2).sum() / (a.sum() * 6)
-    found = ContentDifference.of(
+    actual = ContentDifference.of(
         x.detach(), content, content_factor(a.sum(), x.shape[-1], 0.7), a if weighted else None
     )
-    assert float(found.loss()) == pytest.approx(expected.item(), rel=1e-12)
-    torch.testing.assert_close(found.gradient(), torch.autograd.grad(expected, x)[0], rtol=1e-12, atol=0)
+    assert float(actual.loss()) == pytest.approx(expected.item(), rel=1e-12)
+    torch.testing.assert_close(actual.gradient(), torch.autograd.grad(expected, x)[0], rtol=1e-12, atol=0)
 
 
 def test_loss_and_gradient_are_zero_without_positions():
@@ -144,11 +144,11 @@ def test_style_gradient_is_added_block_by_block(dtype, weighted, columns):
     random = torch.randn((42, 40), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     gradient = StyleGradient(random[:40], 3 * random[40], random[41])
     before = make_features(90, 130, 40, 2).to(dtype)
-    found, expected, own = before.clone(), before.double(), (slice(5, 80), columns)
-    gradient.add_to(found[own], x[own], None if a is None else a[own])
+    actual, expected, own = before.clone(), before.double(), (slice(5, 80), columns)
+    gradient.add_to(actual[own], x[own], None if a is None else a[own])
     weights = 1 if a is None else a[own][:, :, None].double()
     expected[own] += weights * ((x[own].double() - gradient.mean) @ gradient.matrix + gradient.offset)
     tolerance = {torch.float64: 1e-13, torch.float32: 1e-6, torch.bfloat16: 4e-3}[dtype]
-    assert relative_error(found, expected) < tolerance
-    assert torch.equal(found[:5], before[:5])
-    assert torch.equal(found[80:], before[80:])
+    assert relative_error(actual, expected) < tolerance
+    assert torch.equal(actual[:5], before[:5])
+    assert torch.equal(actual[80:], before[80:])

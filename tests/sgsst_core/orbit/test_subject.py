@@ -51,8 +51,8 @@ def test_stray_gaussians_do_not_change_the_subject(name: str) -> None:
 def test_connected_thin_part_belongs_to_the_subject() -> None:
     rod = torch.zeros(60, 3)
     rod[:, 1] = torch.linspace(-3.0, -1.5, 60)
-    found = extent(joined(OBJECT, scene_of(rod, 0.01)))
-    assert float(found[0, 1]) < -3.0
+    subject = extent(joined(OBJECT, scene_of(rod, 0.01)))
+    assert float(subject[0, 1]) < -3.0
 
 
 def test_two_separate_objects_both_belong_to_the_subject() -> None:

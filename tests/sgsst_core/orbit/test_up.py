@@ -20,7 +20,7 @@ ROTATIONS = [
 ]
 
 
-def found(scene: Scene) -> Up:
+def up_of(scene: Scene) -> Up:
     return find_up(find_subject(scene))
 
 
@@ -38,7 +38,7 @@ def lamp() -> Scene:
 
 @pytest.mark.parametrize("rotation", ROTATIONS)
 def test_up_follows_from_the_ground_for_any_rotation(rotation: Rotation) -> None:
-    up = found(moved(lamp(), rotation, 3.0, (5, -2, 7)))
+    up = up_of(moved(lamp(), rotation, 3.0, (5, -2, 7)))
     assert degrees(up, rotation) < 1.5
     assert up.ground
     assert up.sure
@@ -47,7 +47,7 @@ def test_up_follows_from_the_ground_for_any_rotation(rotation: Rotation) -> None
 
 @pytest.mark.parametrize("rotation", ROTATIONS)
 def test_standing_subject_has_its_foot_below(rotation: Rotation) -> None:
-    up = found(moved(figure(), rotation, 0.2))
+    up = up_of(moved(figure(), rotation, 0.2))
     assert degrees(up, rotation) < 5
     assert up.sure
     assert not up.ground
@@ -57,7 +57,7 @@ def test_standing_subject_has_its_foot_below(rotation: Rotation) -> None:
 def test_long_subject_on_wheels_lies_instead_of_standing() -> None:
     wheels = [box((x, -0.3, z), (x + 0.6, 0.0, z + 0.2), 300) for x in (-1.9, 1.3) for z in (-0.8, 0.6)]
     body = ball((0, 0, 0), 1.0, 3000) * torch.tensor([2.2, 0.5, 0.8]) + torch.tensor([0.0, -0.7, 0.0])
-    up = found(scene_of(torch.cat([*wheels, body])))
+    up = up_of(scene_of(torch.cat([*wheels, body])))
     assert up.name == "-y"
     assert "rests" in up.reason
 
@@ -74,7 +74,7 @@ def test_long_subject_on_wheels_lies_instead_of_standing() -> None:
     ],
 )
 def test_up_is_conventional_without_evidence(scene: Scene) -> None:
-    up = found(scene)
+    up = up_of(scene)
     assert up.name == "-y"
     assert not up.sure
     assert "most captures" in up.reason
@@ -84,14 +84,14 @@ def test_up_is_conventional_without_evidence(scene: Scene) -> None:
 def test_stick_stands_along_its_axis_in_the_conventional_sense(along: int, name: str) -> None:
     points = torch.zeros(400, 3)
     points[:, along] = torch.linspace(-1, 1, 400)
-    up = found(scene_of(points))
+    up = up_of(scene_of(points))
     assert up.name == name
     assert not up.sure
     assert "both ends are alike" in up.reason
 
 
 def test_up_snaps_to_a_close_world_axis_only() -> None:
-    assert found(moved(figure(), Rotation.from_euler("x", 6, degrees=True))).name == "-y"
-    slanted = found(moved(figure(), Rotation.from_euler("x", 30, degrees=True)))
+    assert up_of(moved(figure(), Rotation.from_euler("x", 6, degrees=True))).name == "-y"
+    slanted = up_of(moved(figure(), Rotation.from_euler("x", 30, degrees=True)))
     assert slanted.name.startswith("(")
     assert float(slanted.direction.norm()) == pytest.approx(1)

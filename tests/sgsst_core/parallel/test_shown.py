@@ -13,8 +13,8 @@ from sgsst_core.parallel.shown import DENSE_FRACTION, ShownGaussians, gaussians_
 def test_set_contains_the_gaussians_of_its_mask(gaussians: int, share: float) -> None:
     mask = torch.rand(gaussians, generator=torch.Generator().manual_seed(gaussians)) < share
     shown = ShownGaussians(mask)
-    for found in (shown.indices(), shown._device_indices()):
-        assert torch.equal(found, mask.nonzero()[:, 0])
+    for indices in (shown.indices(), shown._device_indices()):
+        assert torch.equal(indices, mask.nonzero()[:, 0])
     assert (shown.count, shown.total) == (int(mask.sum()), gaussians)
     assert shown._bits.nbytes == ShownGaussians.nbytes(gaussians)
 

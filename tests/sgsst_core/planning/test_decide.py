@@ -61,8 +61,8 @@ def probe(**changes: Any) -> Probe:
     )
 
 
-def plan_of(found: Probe, **values: Any) -> Plan:
-    return decide(found, make_settings(**{"steps_coarse": 40, "steps_sos": 40, **values}))
+def plan_of(measurements: Probe, **values: Any) -> Plan:
+    return decide(measurements, make_settings(**{"steps_coarse": 40, "steps_sos": 40, **values}))
 
 
 def line(plan: Plan, item: str) -> Decision | None:
@@ -70,9 +70,9 @@ def line(plan: Plan, item: str) -> Decision | None:
 
 
 def text_of(plan: Plan, item: str) -> str:
-    found = line(plan, item)
-    assert found is not None, [decision.item for decision in plan.decisions]
-    return f"{found.decision}: {found.reason}"
+    planned = line(plan, item)
+    assert planned is not None, [decision.item for decision in plan.decisions]
+    return f"{planned.decision}: {planned.reason}"
 
 
 # --- the scene -----------------------------------------------------------------------------------------------------
@@ -150,11 +150,11 @@ def test_training_background_and_start_follow_coverage_and_settings(
     assert (plan.training_background, plan.warm_start) == (training_background, warm)
     behind, start = line(plan, "training_background"), line(plan, "start")
     assert (behind is not None, start is not None) == (training_background != "background", warm)
-    for found, setting in ((behind, "training_background"), (start, "warm_start")):
-        if found:
-            assert ("requested" in found.reason) is (setting in values)
+    for value, setting in ((behind, "training_background"), (start, "warm_start")):
+        if value:
+            assert ("requested" in value.reason) is (setting in values)
             scan = uncovered == 0.5 and "position_weights" not in values
-            assert ("50.0% of the views' pixels are uncovered" in found.reason) is (setting not in values and scan)
+            assert ("50.0% of the views' pixels are uncovered" in value.reason) is (setting not in values and scan)
 
 
 def test_random_background_costs_a_content_pass_and_disables_early_stop() -> None:
@@ -222,21 +222,21 @@ def test_prediction_includes_time_and_memory_of_feature_matching() -> None:
     pairs = sum(count * min(count, MOST_VECTORS) for count in positions)
     matching = probe(rate=replace(rate, search=search), vector_channels=channels, deepest="relu4_2")
     for ranks in (1, 2):
-        plain, found = (
+        plain, matched = (
             plan_of(replace(each, machine=replace(each.machine, ranks=ranks)), keep=("ranks",), style_loss=style_loss)
             for each, style_loss in ((probe(), "sos"), (matching, "nnfm"))
         )
         assert plain.prediction is not None
-        assert found.prediction is not None
-        assert found.prediction.seconds - plain.prediction.seconds == pytest.approx(search * pairs / ranks)
+        assert matched.prediction is not None
+        assert matched.prediction.seconds - plain.prediction.seconds == pytest.approx(search * pairs / ranks)
         vectors = 4 * channels * sum(min(count, MOST_VECTORS) for count in positions)
-        more = found.prediction.peak_bytes - plain.prediction.peak_bytes
+        more = matched.prediction.peak_bytes - plain.prediction.peak_bytes
         assert vectors + 16 * sum(positions) < more < vectors + 16 * sum(positions) + (16 << 20)
         assert line(plain, "style loss") is None
-        assert text_of(found, "style loss").startswith(
+        assert text_of(matched, "style loss").startswith(
             "the distance of relu3 features to the nearest of at most 8,192 style"
         )
-        assert text_of(found, "network layers").startswith("up to relu4_2")
+        assert text_of(matched, "network layers").startswith("up to relu4_2")
 
 
 def test_content_is_left_out_without_weight() -> None:
@@ -290,8 +290,8 @@ def test_lower_precision_is_used_if_requested_and_faster(
     ],
 )
 def test_cudnn_benchmarks_algorithms_if_sizes_recur_often(device: str, weights: str, steps: int, search: bool) -> None:
-    found = probe(device=device, raster=RasterCost(0.01))
-    plan = plan_of(found, steps_coarse=0, steps_sos=steps, position_weights=weights)
+    measurements = probe(device=device, raster=RasterCost(0.01))
+    plan = plan_of(measurements, steps_coarse=0, steps_sos=steps, position_weights=weights)
     assert plan.search is search
     decision = line(plan, "convolutions")
     assert (decision is not None) is (device == "cuda")
@@ -349,8 +349,8 @@ CAPTURED = LaunchCost(seconds=0.010, replayed=0.006, capture=0.040)
 def test_loss_is_captured_as_a_graph_if_that_saves_time(
     changes: dict[str, Any], values: dict[str, Any], reason: str | None
 ) -> None:
-    found = probe(**{"device": "cuda", "raster": RasterCost(0.01), "launches": CAPTURED, **changes})
-    plan = plan_of(found, **{"steps_coarse": 0, "position_weights": "off", **values})
+    measurements = probe(**{"device": "cuda", "raster": RasterCost(0.01), "launches": CAPTURED, **changes})
+    plan = plan_of(measurements, **{"steps_coarse": 0, "position_weights": "off", **values})
     decision = line(plan, "launches")
     assert decision is not None
     assert plan.graphs is (reason is None)
@@ -372,8 +372,8 @@ def test_no_graph_is_captured_or_mentioned_on_a_cpu() -> None:
 
 def test_graph_needs_memory_in_addition() -> None:
     """Its activations add to those of the same work without a graph."""
-    found = probe(device="cuda", raster=RasterCost(0.01), launches=CAPTURED)
-    plans = [plan_of(found, steps_coarse=0, steps_sos=400, keep=keep) for keep in ((), ("launches",))]
+    measurements = probe(device="cuda", raster=RasterCost(0.01), launches=CAPTURED)
+    plans = [plan_of(measurements, steps_coarse=0, steps_sos=400, keep=keep) for keep in ((), ("launches",))]
     assert [plan.graphs for plan in plans] == [True, False]
     peaks = [plan.prediction.device_bytes for plan in plans if plan.prediction]
     assert peaks[0] is not None
@@ -541,9 +541,9 @@ def test_plan_mentions_early_stop_only_if_it_is_on() -> None:
 
 def test_gradients_of_shown_gaussians_alone_are_communicated() -> None:
     def communication(**values: Any) -> float:
-        found = plan_of(probe(ranks=2, link=Link(1e3, 1e-3), **values), keep=("ranks",)).prediction
-        assert found is not None
-        return found.communication
+        prediction = plan_of(probe(ranks=2, link=Link(1e3, 1e-3), **values), keep=("ranks",)).prediction
+        assert prediction is not None
+        return prediction.communication
 
     assert communication() - communication(shown=2.5) == pytest.approx(12 * (5 - 2.5) / 1e3)
 
@@ -628,7 +628,7 @@ def test_plans_are_immutable() -> None:
 
 
 def test_decisions_have_a_fixed_order() -> None:
-    found = probe(
+    measurements = probe(
         covered=[0, 1, 2],
         used_degree=0,
         uncovered_share=0.5,
@@ -639,7 +639,7 @@ def test_decisions_have_a_fixed_order() -> None:
         content_bytes=0,
         device="cuda",
     )
-    plan = plan_of(found, content_weight=0, coarsest_side=4000, precision="bfloat16")
+    plan = plan_of(measurements, content_weight=0, coarsest_side=4000, precision="bfloat16")
     assert [decision.item for decision in plan.decisions] == [
         "unseen Gaussians",
         "spherical harmonics",

@@ -47,10 +47,10 @@ def opengl(camera: Camera) -> Camera:
 
 def verdict(scene: Scene, views: list[Camera]) -> str:
     try:
-        found = frame_warnings(scene, views, NEAR)
+        warnings = frame_warnings(scene, views, NEAR)
     except CameraError:
         return "refused"
-    return "warned" if found else "fine"
+    return "warned" if warnings else "fine"
 
 
 @pytest.mark.parametrize("scene", [wall(), ball()])
@@ -139,8 +139,8 @@ def test_orientation_that_resembles_the_scene_is_used(tmp_path: Path, applied: b
         image = Image.open(photo.path)
         (image.rotate(180) if applied else image).save(photo.path, exif=exif)
     photos = [photo for photo in check_photos(tmp_path, views) if photo]
-    found, (line,) = compare_photos(scene, views, photos, NEAR)
-    assert {photo.oriented for photo in found} == {applied}
+    oriented, (line,) = compare_photos(scene, views, photos, NEAR)
+    assert {photo.oriented for photo in oriented} == {applied}
     assert line.decision == f"the EXIF orientation of 3 photos is {'applied' if applied else 'ignored'}"
 
 

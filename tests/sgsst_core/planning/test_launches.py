@@ -33,19 +33,19 @@ SIZE = 32, 48
 @pytest.fixture
 def counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counts]:
     """Yield the counters of a simulated GPU, with Triton's kernels disabled, so that no interpreter is needed."""
-    with pretend_cuda() as found:
+    with pretend_cuda() as counts:
         leave_out_kernels(monkeypatch)
-        yield found
+        yield counts
 
 
 def test_launches_are_timed_with_and_without_a_graph(counts: Counts, tiny_weights: BackboneWeights) -> None:
     loss = SosLoss(FeatureNetwork(tiny_weights, device="cuda"), coarsest=16)
     counts.clear()
-    found = launch_cost(loss, SIZE)
-    assert found.problem is None
-    assert found.seconds > 0
-    assert found.replayed > 0
-    assert found.capture >= 0
+    cost = launch_cost(loss, SIZE)
+    assert cost.problem is None
+    assert cost.seconds > 0
+    assert cost.replayed > 0
+    assert cost.capture >= 0
     replays = [count for line, count in counts.launches.items() if "loss/graphs.py" in line]
     assert LAUNCH_RUNS + 1 in replays  # including the run after the capture
 
@@ -85,9 +85,9 @@ def test_failed_capture_does_not_break_the_process(
 
     monkeypatch.setattr(torch, "__version__", TorchVersion(version))
     monkeypatch.setattr(FeatureNetwork, "_convolve", cannot_be_captured)
-    found = launch_cost(SosLoss(network, coarsest=16), SIZE).problem
-    assert found is not None
-    assert problem in found
+    cost = launch_cost(SosLoss(network, coarsest=16), SIZE).problem
+    assert cost is not None
+    assert problem in cost
     torch.cuda.synchronize()
 
 

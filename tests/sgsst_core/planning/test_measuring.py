@@ -71,8 +71,8 @@ def test_measuring_may_take_half_a_minute_or_its_fraction_of_the_steps() -> None
 
 
 def test_loss_gets_half_of_the_allowed_time_and_at_least_one_view() -> None:
-    for steps, price, found in ((0.0, 3.0, 4), (0.0, 3.01, 2), (0.0, 6.0, 2), (0.0, 6.01, 1), (0.0, 1e9, 1)):
-        assert choose_loss_views(0.1, steps, price, 97) == found
+    for steps, price, views in ((0.0, 3.0, 4), (0.0, 3.01, 2), (0.0, 6.0, 2), (0.0, 6.01, 1), (0.0, 1e9, 1)):
+        assert choose_loss_views(0.1, steps, price, 97) == views
     assert choose_loss_views(0.1, 3000.0, 6.01, 97) == 4
     assert choose_loss_views(0.1, 0.0, 4.0, 3) == 3  # there are only three views
     assert choose_loss_views(0.0, 3000.0, 3.0, 97) == 4
@@ -93,10 +93,10 @@ def test_unvisited_views_make_the_loss_more_expensive() -> None:
 def test_planned_measuring_stays_within_the_allowed_time() -> None:
     for steps in (16, 200, 2000, 20_000):
         plan = plan_of(SLOW, steps_sos=steps)
-        found = expected(plan)
-        allowed = max(LEAST_ALLOWED, 0.1 * (found.job - found.measuring))
-        assert found.measuring <= allowed
-        assert f"{found.measuring:.2g} s in addition to" in text_of(plan, "measuring")
+        prediction = expected(plan)
+        allowed = max(LEAST_ALLOWED, 0.1 * (prediction.job - prediction.measuring))
+        assert prediction.measuring <= allowed
+        assert f"{prediction.measuring:.2g} s in addition to" in text_of(plan, "measuring")
     assert [plan_of(SLOW, steps_sos=steps).measuring for steps in (16, 20_000)] == [NOTHING, 0]
     assert text_of(plan_of(SLOW), "measuring").startswith("the initial loss on 4 views only: about ")
     least = expected(plan_of(VERY_SLOW, steps_sos=4))
@@ -115,14 +115,16 @@ def test_job_time_adds_steps_first_visits_and_measuring() -> None:
 
     The first visits compute cached weights and use the survey's intersections.
     """
-    found = expected(plan_of(SLOW))
-    steps = 8 * found.seconds_coarse + 16 * found.seconds + found.style
-    assert found.job == pytest.approx(steps + 4 * (found.first_visit_coarse + found.first_visit) + found.measuring)
+    prediction = expected(plan_of(SLOW))
+    steps = 8 * prediction.seconds_coarse + 16 * prediction.seconds + prediction.style
+    assert prediction.job == pytest.approx(
+        steps + 4 * (prediction.first_visit_coarse + prediction.first_visit) + prediction.measuring
+    )
     restricted = 0.25 * SLOW.first_seconds
-    assert found.first_visit_coarse > restricted + SLOW.seconds
-    assert 0 < found.first_visit < found.first_visit_coarse
+    assert prediction.first_visit_coarse > restricted + SLOW.seconds
+    assert 0 < prediction.first_visit < prediction.first_visit_coarse
     alone = expected(plan_of(SLOW, steps_coarse=0))
-    assert alone.first_visit == pytest.approx(restricted + found.first_visit)
+    assert alone.first_visit == pytest.approx(restricted + prediction.first_visit)
     limited = expected(plan_of(SLOW, max_seconds=5.0))
     assert limited.job - limited.measuring == pytest.approx(5.0)
 

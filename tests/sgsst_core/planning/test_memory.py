@@ -77,7 +77,7 @@ def test_weights_replace_the_tile_intersections_of_the_survey() -> None:
         probe(raster=replace(rasters[0], bytes=0, intersection_bytes=0)), cached_weights="float32"
     ).prediction
     assert base is not None
-    rises = [found.peak_bytes - base.peak_bytes for found in peaks if found is not None]
+    rises = [prediction.peak_bytes - base.peak_bytes for prediction in peaks if prediction is not None]
     isects = VIEWS * 10**8
     assert rises == [10**9 - isects, BUDGET - isects, BUDGET + 300_000_000 - isects]
 
@@ -88,9 +88,11 @@ def test_weights_replace_the_tile_intersections_of_the_survey() -> None:
 @pytest.mark.parametrize("measured", [False, True])
 def test_budgets_add_up_to_the_memory_limit(device: str, precision: str, weights: str, measured: bool) -> None:
     raster = RasterCost(0.3, 0.1, GIGABYTE, GIGABYTE // 2)
-    found = probe(device=device, raster=raster, precision_ratio=2.0, rasterizer="cpu" if device == "cpu" else "triton")
+    measurements = probe(
+        device=device, raster=raster, precision_ratio=2.0, rasterizer="cpu" if device == "cpu" else "triton"
+    )
     settings = make_settings(precision=precision, cached_weights=weights, steps_sos=4000)
-    plan, memory = decide(found, settings, measured=measured), 10 * GIGABYTE
+    plan, memory = decide(measurements, settings, measured=measured), 10 * GIGABYTE
     approximated = precision == "bfloat16" or weights == "half"
     beside = (least_intersection_memory(memory) if weights == "half" else 0) + measured * (
         (1 + approximated) * measuring_memory(memory)
@@ -105,8 +107,8 @@ def test_budgets_add_up_to_the_memory_limit(device: str, precision: str, weights
 
 def test_gpu_memory_includes_rasterizer_and_measurements() -> None:
     def peak(measured: bool = False, **raster: Any) -> int:
-        found = probe(device="cuda", rasterizer="triton", raster=RasterCost(0.01, **raster))
-        prediction = decide(found, make_settings(steps_sos=4000), measured=measured).prediction
+        measurements = probe(device="cuda", rasterizer="triton", raster=RasterCost(0.01, **raster))
+        prediction = decide(measurements, make_settings(steps_sos=4000), measured=measured).prediction
         assert prediction is not None
         assert prediction.device_bytes is not None
         return prediction.device_bytes
@@ -130,11 +132,11 @@ def test_largest_temporary_allocation_counts() -> None:
 
 def test_float32_reference_needs_memory_of_its_own() -> None:
     """If the job is not in float32, its activations and view contents are needed a second time."""
-    found = probe(precision_ratio=2.0)
+    measurements = probe(precision_ratio=2.0)
     rises = []
     for precision in ("float32", "bfloat16"):
         plain, measured = (
-            decide(found, make_settings(precision=precision, steps_coarse=0, steps_sos=4000), measured=flag)
+            decide(measurements, make_settings(precision=precision, steps_coarse=0, steps_sos=4000), measured=flag)
             for flag in (False, True)
         )
         assert plain.prediction is not None

@@ -125,22 +125,22 @@ def test_survey_finds_weights_regions_and_blind_views() -> None:
     views = cameras(2)
     away = replace(views[0], world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64)))
     rasterizer = make_rasterizer("cpu", replace(scene, means=scene.means.clamp_min(0)))
-    found = survey_views(rasterizer.scene, [*views, away], rasterizer)  # type: ignore[attr-defined]
-    assert found.covered == [0, 1]
+    survey = survey_views(rasterizer.scene, [*views, away], rasterizer)  # type: ignore[attr-defined]
+    assert survey.covered == [0, 1]
     expected = sum(rasterizer.coverage(camera).double().sum() for camera in views)
-    assert float(found.total_blend_weights.sum()) == pytest.approx(float(expected), rel=1e-5)
+    assert float(survey.total_blend_weights.sum()) == pytest.approx(float(expected), rel=1e-5)
     coverage = rasterizer.coverage(views[0])
     outside = coverage.clone()
-    outside[found.regions[0].slices] = 0
+    outside[survey.regions[0].slices] = 0
     assert outside.max() == 0
-    assert 0 < found.regions[0].pixels < coverage.numel()
+    assert 0 < survey.regions[0].pixels < coverage.numel()
 
 
 def test_unseen_gaussians_follow_their_seen_neighbors() -> None:
     means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.1, 0, 0], [50, 0, 0]])
     change = torch.tensor([[1.0, 0, 0], [0, 1, 0], [9, 9, 9], [9, 9, 9]])
-    found = neighbors_change(means, change, torch.tensor([3e-9, 1e-9, 0, 0], dtype=torch.float64))
-    torch.testing.assert_close(found, torch.tensor([[0.75, 0.25, 0], [0.75, 0.25, 0]]))
+    change_of_all = neighbors_change(means, change, torch.tensor([3e-9, 1e-9, 0, 0], dtype=torch.float64))
+    torch.testing.assert_close(change_of_all, torch.tensor([[0.75, 0.25, 0], [0.75, 0.25, 0]]))
     assert neighbors_change(means, change, torch.ones(4, dtype=torch.float64)).shape == (0, 3)
 
 
@@ -149,15 +149,15 @@ def test_neighbors_of_unseen_gaussians_do_not_depend_on_the_chunk_size(monkeypat
     means, change = torch.randn(400, 3, generator=generator), torch.randn(400, 3, generator=generator)
     weights = torch.rand(400, generator=generator).double() * (torch.arange(400) % 4 > 0)
     seen = weights > 0
-    found = neighbors_change(means, change, weights)
+    actual = neighbors_change(means, change, weights)
     distances, nearest = torch.cdist(means[~seen].double(), means[seen].double()).sort(dim=1)
     assert bool((distances[:, :9].diff(dim=1) > 0).all())  # without ties, the neighbors are unique
     own = weights[seen][nearest[:, :8]]
     expected = (change[seen].double()[nearest[:, :8]] * own[..., None]).sum(1) / own.sum(1, keepdim=True)
-    torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(actual.double(), expected, rtol=1e-6, atol=1e-6)
     for part in (1, 7, 100):
         monkeypatch.setattr("sgsst_core.stylizing.unseen._CHUNK", part)
-        assert torch.equal(neighbors_change(means, change, weights), found)
+        assert torch.equal(neighbors_change(means, change, weights), actual)
 
 
 def test_unseen_gaussians_keep_their_color_in_paper(tiny_weights: BackboneWeights) -> None:

@@ -54,8 +54,8 @@ def test_ranks_wait_for_the_sent_bytes_except_statistics_of_other_scales() -> No
 def test_groups_sum_complete_gradients() -> None:
     """The model cannot know which Gaussians the views of a step show together."""
     phases = [(0, [work()]), (10, [replace(work(), shown=1)])]
-    found = choose_ranks(phases, 2, 2, SLOW)
-    assert found.seconds[2] - found.seconds[1] / 2 == pytest.approx(10 * SLOW.all_reduce(12 * 50_000, 2))
+    groups = choose_ranks(phases, 2, 2, SLOW)
+    assert groups.seconds[2] - groups.seconds[1] / 2 == pytest.approx(10 * SLOW.all_reduce(12 * 50_000, 2))
 
 
 def test_free_link_uses_all_ranks_and_slow_link_one() -> None:
@@ -78,14 +78,14 @@ def test_additional_ranks_must_save_time() -> None:
 def test_groups_process_views_in_parallel() -> None:
     """Two views per step on two ranks need no halos, so they are twice as fast apart from the sum of colors."""
     phases = [(0, [work()]), (10, [work()])]
-    found = choose_ranks(phases, 2, 2, FREE)
-    assert found.speed_up == pytest.approx(2.0)
+    groups = choose_ranks(phases, 2, 2, FREE)
+    assert groups.speed_up == pytest.approx(2.0)
 
 
 def test_large_numbers_of_ranks_are_tried_in_increasing_steps() -> None:
-    found = choose_ranks([(0, [work()]), (1, [work()])], 1, 64, FREE)
-    assert {1, 2, 3, 4, 8, 64} <= set(found.seconds)
-    assert len(found.seconds) < 25
+    groups = choose_ranks([(0, [work()]), (1, [work()])], 1, 64, FREE)
+    assert {1, 2, 3, 4, 8, 64} <= set(groups.seconds)
+    assert len(groups.seconds) < 25
 
 
 def test_pixels_beyond_memory_are_recomputed() -> None:

@@ -27,9 +27,9 @@ def plan_of(raster: RasterCost, *, measured: bool = False, **values: Any) -> Pla
 
 
 def expected(*arguments: Any, **values: Any) -> Prediction:
-    found = plan_of(*arguments, **values).prediction
-    assert found is not None
-    return found
+    prediction = plan_of(*arguments, **values).prediction
+    assert prediction is not None
+    return prediction
 
 
 def test_data_that_fit_cost_time_once_and_others_at_every_visit() -> None:
@@ -51,14 +51,14 @@ def test_views_that_are_cached_completely_leave_some_budget_unused() -> None:
 
 def test_blend_weights_take_no_memory_if_no_view_fits() -> None:
     """Tile intersections are cached in the memory that is not used for weights, and used to render each view."""
-    found = {size: plan_of(replace(LARGE, bytes=8 * size, half_bytes=4 * size)) for size in (GIGABYTE, 3 * GIGABYTE)}
-    predictions = [plan.prediction for plan in found.values()]
-    assert all(plan.cached_weights == "half" for plan in found.values())
+    plans = {size: plan_of(replace(LARGE, bytes=8 * size, half_bytes=4 * size)) for size in (GIGABYTE, 3 * GIGABYTE)}
+    predictions = [plan.prediction for plan in plans.values()]
+    assert all(plan.cached_weights == "half" for plan in plans.values())
     assert predictions[0] is not None
     assert predictions[1] is not None
     assert predictions[0].peak_bytes - predictions[1].peak_bytes == pytest.approx(2 * GIGABYTE, rel=0.2)
     assert predictions[1].first_visit < predictions[0].first_visit, "nothing is computed to be cached"
-    lines = [next(each for each in plan.decisions if each.item == "blend weights").decision for plan in found.values()]
+    lines = [next(each for each in plan.decisions if each.item == "blend weights").decision for plan in plans.values()]
     assert lines[0].startswith("50% of the views'")
     assert lines[1].startswith("0% of the views'")
 
@@ -111,13 +111,13 @@ def test_region_maps_add_to_the_first_visit() -> None:
     """
     settings = make_settings(steps_coarse=0, steps_sos=40, position_weights="off")
     plain = probe(raster=LARGE)
-    found = [decide(each, settings).prediction for each in (plain, replace(plain, maps=4))]
-    assert found[0] is not None
-    assert found[1] is not None
-    assert found[1].first_visit - found[0].first_visit == pytest.approx(3 * 0.5 * 2.0)
-    assert found[1].seconds == found[0].seconds
+    predictions = [decide(each, settings).prediction for each in (plain, replace(plain, maps=4))]
+    assert predictions[0] is not None
+    assert predictions[1] is not None
+    assert predictions[1].first_visit - predictions[0].first_visit == pytest.approx(3 * 0.5 * 2.0)
+    assert predictions[1].seconds == predictions[0].seconds
     pixels = sum(height * width for height, width in plain.sizes)
-    assert found[1].peak_bytes - found[0].peak_bytes == pytest.approx(4 * pixels * 16 / 3, abs=2)
+    assert predictions[1].peak_bytes - predictions[0].peak_bytes == pytest.approx(4 * pixels * 16 / 3, abs=2)
 
 
 def test_frozen_gaussians_are_rendered_and_not_optimized() -> None:
@@ -125,6 +125,6 @@ def test_frozen_gaussians_are_rendered_and_not_optimized() -> None:
     frozen = torch.zeros(plain.scene.gaussians, dtype=torch.bool)
     frozen[:10] = True
     settings = make_settings(steps_coarse=0, steps_sos=40)
-    without, found = (decide(each, settings) for each in (plain, replace(plain, frozen=frozen)))
-    assert torch.equal(found.seen, without.seen)
-    assert torch.equal(found.optimized, without.optimized & ~frozen)
+    without, partly_frozen = (decide(each, settings) for each in (plain, replace(plain, frozen=frozen)))
+    assert torch.equal(partly_frozen.seen, without.seen)
+    assert torch.equal(partly_frozen.optimized, without.optimized & ~frozen)

@@ -161,16 +161,16 @@ def test_warp_reproduces_the_image_of_the_other_camera():
     scene = plane(5, 4, DEPTH)
     cameras = [camera((0.4, -0.1, 0)), camera((1.0, -0.4, 0.4))]
     rasterizer = make_rasterizer("cpu", scene)
-    picture = renders(scene, cameras, rasterizer)
+    images = renders(scene, cameras, rasterizer)
     depths = [expected_depth(scene, c, rasterizer) for c in cameras]
-    warped, valid = find_warp(depths[1], cameras[1], depths[0], cameras[0]).apply(picture(1))
+    warped, valid = find_warp(depths[1], cameras[1], depths[0], cameras[0]).apply(images(1))
     positions = pixel_centers(cameras[0]) @ homography(*cameras).T
     x, y = positions[..., 0] / positions[..., 2], positions[..., 1] / positions[..., 2]
     to_border = torch.stack([x - 0.5, 63.5 - x, y - 0.5, 47.5 - y]).amin(0)
     assert valid[to_border > 0.1].all()
     assert not valid[to_border < -0.1].any()
     assert 0.5 < float(valid.double().mean()) < 1
-    assert float((warped - picture(0))[valid].abs().max()) < 0.03
+    assert float((warped - images(0))[valid].abs().max()) < 0.03
     assert not warped[~valid].any()
 
 
@@ -192,9 +192,9 @@ def test_pixels_hidden_in_the_other_view_are_masked():
     scene = joined(plane(6, 4, DEPTH, blue), plane(0.4, 0.4, 2.0, red))
     cameras = [camera((0, 0, 0)), camera((1, 0, 0), (1, 0, DEPTH))]
     rasterizer = make_rasterizer("cpu", scene)
-    picture = renders(scene, cameras, rasterizer)
+    images = renders(scene, cameras, rasterizer)
     depths = [expected_depth(scene, c, rasterizer) for c in cameras]
-    warped, valid = find_warp(depths[1], cameras[1], depths[0], cameras[0]).apply(picture(1))
+    warped, valid = find_warp(depths[1], cameras[1], depths[0], cameras[0]).apply(images(1))
     # A point (X, Y, 4) of the plane is hidden from the camera at (c, 0, 0) if its ray meets the patch at z = 2.
     wall = (pixel_centers(cameras[0])[..., :2] - torch.tensor([32.0, 24.0])) / 70 * DEPTH
 
@@ -208,10 +208,10 @@ def test_pixels_hidden_in_the_other_view_are_masked():
     assert visible.sum() > 500
     assert not valid[hidden].any()
     assert valid[visible].all()
-    careless, _ = find_warp(depths[1], cameras[1], depths[0], cameras[0], tolerance=1e9).apply(picture(1))
-    assert (careless - picture(0))[hidden].abs().amax(-1).min() > 0.7  # the patch is painted onto the wall behind it
+    careless, _ = find_warp(depths[1], cameras[1], depths[0], cameras[0], tolerance=1e9).apply(images(1))
+    assert (careless - images(0))[hidden].abs().amax(-1).min() > 0.7  # the patch is painted onto the wall behind it
     assert measure(scene, cameras).rmse < 0.02
-    assert float((warped - picture(0))[valid].abs().max()) < 0.1
+    assert float((warped - images(0))[valid].abs().max()) < 0.1
 
 
 def test_identical_cameras_give_zero(lpips):
@@ -333,9 +333,9 @@ def test_real_scene_is_more_consistent_at_short_than_at_long_range(shared_data, 
     scene = read_scene(folder / "point_cloud.ply").scene
     cameras = [resized(c, 200) for c in read_cameras(folder / "cameras.json")]
     rasterizer = make_rasterizer("cpu", scene)
-    picture = renders(scene, cameras, rasterizer)
-    short = consistency_of(picture, cameras, rasterizer, scene, SHORT_RANGE, lpips, at_most=3)
-    long = consistency_of(picture, cameras, rasterizer, scene, LONG_RANGE, lpips, at_most=3)
+    images = renders(scene, cameras, rasterizer)
+    short = consistency_of(images, cameras, rasterizer, scene, SHORT_RANGE, lpips, at_most=3)
+    long = consistency_of(images, cameras, rasterizer, scene, LONG_RANGE, lpips, at_most=3)
     assert short.rmse < 0.09
     assert short.rmse < 0.8 * long.rmse
     assert short.lpips < 0.8 * long.lpips

@@ -60,8 +60,8 @@ def test_existing_survey_gives_the_same_findings(tmp_path: Path, looks_away: boo
     assert any("in no view" in finding.what for finding in reread)
 
 
-def finding_about(found: dict[str, Finding], text: str) -> Finding:
-    (match,) = [finding for what, finding in found.items() if text in what]
+def finding_about(findings: dict[str, Finding], text: str) -> Finding:
+    (match,) = [finding for what, finding in findings.items() if text in what]
     return match
 
 
@@ -69,8 +69,8 @@ def test_ordinary_scene_has_no_findings(tmp_path: Path) -> None:
     scene = replace(wall(), opacities=torch.full((len(wall()),), -1.0))
     assert found_in(tmp_path, scene) == {}
     # The wall extends beyond what its cameras see of it.
-    found = seen_by(tmp_path, wall(), cameras())
-    assert {what.split(":")[0] for what in found} == {"in no view", "hardly seen"}
+    findings = seen_by(tmp_path, wall(), cameras())
+    assert {what.split(":")[0] for what in findings} == {"in no view", "hardly seen"}
     assert style_findings(style(), cameras()) == []
 
 
@@ -138,11 +138,11 @@ def test_invalid_rows_are_reported_with_file_indices(tmp_path: Path) -> None:
     scene.sh_dc[5, 0] = math.inf
     scene.quats[20] = 0
     scene.scales[21, 1] = 5.0
-    found = found_in(tmp_path, scene)
-    invalid = finding_about(found, "NaN or infinite")
+    findings = found_in(tmp_path, scene)
+    invalid = finding_about(findings, "NaN or infinite")
     assert (invalid.count, invalid.total, invalid.worst) == (3, len(scene), "first: Gaussian 2")
     assert "--drop-invalid" in invalid.done
-    assert finding_about(found, "longer than the scene's extent").worst.startswith("Gaussian 21: ")
+    assert finding_about(findings, "longer than the scene's extent").worst.startswith("Gaussian 21: ")
 
 
 def test_scene_far_from_origin_is_reported_with_its_resolution(tmp_path: Path) -> None:
@@ -165,20 +165,20 @@ def test_unseen_and_hardly_seen_gaussians_follow_blend_weights(tmp_path: Path) -
     scene.means[10:12] = torch.tensor([0.0, 0.0, 5.0])  # faint, behind two opaque layers
     front = replace(wall(), means=wall().means * torch.tensor([0.9, 0.9, 0.9]))
     scene = Scene(*(torch.cat([getattr(scene, n), getattr(front, n)]) for n in TENSORS))
-    found = seen_by(tmp_path, scene, cameras())
+    findings = seen_by(tmp_path, scene, cameras())
     file = stored(tmp_path, scene)
     rasterizer = make_rasterizer("reference", file.scene)
     weights: Any = sum(rasterizer.color_gradient(torch.ones(c.height, c.width, 3), c)[:, 0] for c in cameras())
-    unseen = finding_about(found, "in no view")
+    unseen = finding_about(findings, "in no view")
     assert unseen.count == int((weights == 0).sum()) >= 10
-    hardly = finding_about(found, "hardly seen")
+    hardly = finding_about(findings, "hardly seen")
     assert hardly.count == int(((weights > 0) & (weights < 1 / 255)).sum()) > 0
 
 
 def test_blind_views_are_distinguished_from_uncovered_views(tmp_path: Path) -> None:
-    found = seen_by(tmp_path, ball(), [*cameras(), blind_camera()])
-    assert finding_about(found, "see no Gaussian").worst.startswith("'blind'")
-    uncovered = finding_about(found, "uncovered")
+    findings = seen_by(tmp_path, ball(), [*cameras(), blind_camera()])
+    assert finding_about(findings, "see no Gaussian").worst.startswith("'blind'")
+    uncovered = finding_about(findings, "uncovered")
     assert (uncovered.count, uncovered.total) == (3, 4)
 
 
@@ -190,11 +190,11 @@ def test_extreme_lenses_and_sizes_are_reported(tmp_path: Path) -> None:
         replace(view, name="shifted", cx=-70.0),
         replace(view, name="small", height=9, cy=4.5),
     ]
-    found = seen_by(tmp_path, wall(), views)
-    assert finding_about(found, "above 140 degrees").worst.startswith("'wide': 169")
-    assert finding_about(found, "below 1 degree").worst.startswith("'narrow'")
-    assert finding_about(found, "principal point").worst.startswith("'shifted'")
-    assert finding_about(found, "fewer than 16 pixels on a side").worst == "'small': 9"
+    findings = seen_by(tmp_path, wall(), views)
+    assert finding_about(findings, "above 140 degrees").worst.startswith("'wide': 169")
+    assert finding_about(findings, "below 1 degree").worst.startswith("'narrow'")
+    assert finding_about(findings, "principal point").worst.startswith("'shifted'")
+    assert finding_about(findings, "fewer than 16 pixels on a side").worst == "'small': 9"
 
 
 def test_cameras_inside_the_scene_are_reported(tmp_path: Path) -> None:

@@ -35,17 +35,17 @@ def alex(vgg16_weights: object) -> Lpips:
     return Lpips()
 
 
-def judge_of(lpips: Lpips, scene: Scene, views: list[Camera], picture: Tensor | None = None) -> Judge:
-    return Judge(lpips, style() if picture is None else picture, scene, CpuRasterizer(scene), views)
+def judge_of(lpips: Lpips, scene: Scene, views: list[Camera], style_image: Tensor | None = None) -> Judge:
+    return Judge(lpips, style() if style_image is None else style_image, scene, CpuRasterizer(scene), views)
 
 
 def judged(judge: Judge, sh_dc: Tensor) -> Judgment:
-    found = judge.judge(sh_dc)
-    assert found is not None
-    return found
+    judgment = judge.judge(sh_dc)
+    assert judgment is not None
+    return judgment
 
 
-def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple[list[float], float, float, float]:
+def plain(scene: Scene, sh_dc: Tensor, camera: Camera, style_image: Tensor) -> tuple[list[float], float, float, float]:
     """Compute a view's style distances on black and on white, color, content and feature distance, in plain loops."""
     lpips = Lpips(dtype=torch.float64)
     rasterizer = ReferenceRasterizer(scene)
@@ -58,7 +58,7 @@ def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple
             image = rasterizer.render((0.5 + SH_C0 * dc.double() + rest).clamp_min(0), camera)
             shown.append((image + (1 - coverage)[..., None] * behind).clamp(0, 1))
         own, theirs = map(lpips.features, shown)
-        wanted = lpips.features(resize_area(picture, (58, 48)).double())  # the view's shorter side is 48
+        wanted = lpips.features(resize_area(style_image, (58, 48)).double())  # the view's shorter side is 48
         distances, angles = [], []
         for x, y, z in zip(own, theirs, wanted, strict=True):
             height, width = x.shape[:2]
@@ -72,7 +72,7 @@ def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple
         turns.append(float(np.mean(angles)))
         contents.append(float((lpips.distance(*shown).map * coverage).sum() / coverage.sum()))
         mass = coverage.reshape(-1).numpy()
-        pixels, others = shown[0].reshape(-1, 3).numpy(), picture.double().reshape(-1, 3).numpy()
+        pixels, others = shown[0].reshape(-1, 3).numpy(), style_image.double().reshape(-1, 3).numpy()
         mean, other = np.average(pixels, axis=0, weights=mass), others.mean(axis=0)
         spread, other_spread = np.cov(pixels.T, aweights=mass, bias=True), np.cov(others.T, bias=True)
         shared = scipy.linalg.sqrtm(spread @ other_spread).real
@@ -84,21 +84,21 @@ def plain(scene: Scene, sh_dc: Tensor, camera: Camera, picture: Tensor) -> tuple
 def test_agrees_with_plain_formulas_in_float64(alex: Lpips, scene: Scene) -> None:
     view = cameras(1)[0]
     other = torch.randn(len(scene), 3, generator=torch.Generator().manual_seed(3))
-    found = judged(judge_of(alex, scene, [view]), other)
+    judgment = judged(judge_of(alex, scene, [view]), other)
     styles, palette, content, features = plain(scene, other, view, style())
-    assert found.style == pytest.approx(sum(styles) / 2, rel=1e-4)
-    assert found.background_sensitivity == pytest.approx(abs(styles[0] - styles[1]), abs=1e-4)
-    assert found.color_distance == pytest.approx(palette, rel=1e-4)
-    assert found.content == pytest.approx(content, rel=1e-3)
-    assert found.features == pytest.approx(features, rel=1e-3)
+    assert judgment.style == pytest.approx(sum(styles) / 2, rel=1e-4)
+    assert judgment.background_sensitivity == pytest.approx(abs(styles[0] - styles[1]), abs=1e-4)
+    assert judgment.color_distance == pytest.approx(palette, rel=1e-4)
+    assert judgment.content == pytest.approx(content, rel=1e-3)
+    assert judgment.features == pytest.approx(features, rel=1e-3)
 
 
 def test_unstylized_scene_has_no_content_difference(alex: Lpips) -> None:
     scene = ball()
-    found = judged(judge_of(alex, scene, cameras(2)), scene.sh_dc)
-    assert found.content == 0
-    assert found.features == 0
-    assert found.background_sensitivity > 0  # an object has a background
+    judgment = judged(judge_of(alex, scene, cameras(2)), scene.sh_dc)
+    assert judgment.content == 0
+    assert judgment.features == 0
+    assert judgment.background_sensitivity > 0  # an object has a background
 
 
 def test_scene_that_shows_the_style_is_close_to_it(alex: Lpips) -> None:
@@ -106,9 +106,9 @@ def test_scene_that_shows_the_style_is_close_to_it(alex: Lpips) -> None:
     scene, view = wall(56, 44), cameras(1)[0]
     scene = replace(scene, scales=scene.scales - 0.69)
     places = (scene.means[:, :2] / torch.tensor([2.4, 1.9])).clamp(-1, 1)
-    picture = style()
-    painted = F.grid_sample(picture.permute(2, 0, 1)[None], places[None, None], align_corners=False)[0, :, 0].T
-    judge = judge_of(alex, scene, [view], picture)
+    style_image = style()
+    painted = F.grid_sample(style_image.permute(2, 0, 1)[None], places[None, None], align_corners=False)[0, :, 0].T
+    judge = judge_of(alex, scene, [view], style_image)
     noise, like = judged(judge, scene.sh_dc), judged(judge, (painted - 0.5) / SH_C0)
     assert like.style < 0.6 * noise.style
     assert like.color_distance < 0.4 * judged(judge, torch.full_like(scene.sh_dc, 1.5)).color_distance
@@ -123,17 +123,17 @@ def test_blind_views_are_skipped(alex: Lpips) -> None:
 
 
 def test_large_views_are_judged_at_a_fixed_size(alex: Lpips) -> None:
-    found = judge_of(alex, ball(), cameras(1, 3000, 2250)).cameras[0]
-    assert (found.width, found.height) == (JUDGED_SIDE, JUDGED_SIDE * 3 // 4)
+    camera = judge_of(alex, ball(), cameras(1, 3000, 2250)).cameras[0]
+    assert (camera.width, camera.height) == (JUDGED_SIDE, JUDGED_SIDE * 3 // 4)
 
 
-@pytest.mark.parametrize("picture", [torch.full((1, 1, 3), 0.5), torch.zeros(40, 40, 3), torch.ones(5, 900, 3)])
-def test_extreme_styles_give_finite_values(alex: Lpips, picture: Tensor) -> None:
+@pytest.mark.parametrize("style_image", [torch.full((1, 1, 3), 0.5), torch.zeros(40, 40, 3), torch.ones(5, 900, 3)])
+def test_extreme_styles_give_finite_values(alex: Lpips, style_image: Tensor) -> None:
     """The styles are a single pixel, a black image without variance, and a line."""
     scene = ball()
-    found = judged(judge_of(alex, scene, cameras(1), picture), torch.full_like(scene.sh_dc, -50.0))
-    assert all(value is None or np.isfinite(value) for value in vars(found).values())
-    assert found.saturated == 1
+    judgment = judged(judge_of(alex, scene, cameras(1), style_image), torch.full_like(scene.sh_dc, -50.0))
+    assert all(value is None or np.isfinite(value) for value in vars(judgment).values())
+    assert judgment.saturated == 1
 
 
 def test_interior_features_do_not_depend_on_the_background(alex: Lpips) -> None:
@@ -155,15 +155,15 @@ def test_interior_features_do_not_depend_on_the_background(alex: Lpips) -> None:
 def test_interior_measures_agree_with_plain_formulas(alex: Lpips) -> None:
     """A wall that covers its views has interior features; weights of a mixture count pixels, not images."""
     scene, view = wall(), cameras(1, 240, 180)[0]
-    pictures = (style(), style().flip(0).flip(2))
-    judge = judge_of(alex, scene, [view], Style(pictures, (0.75, 0.25)))  # type: ignore[arg-type]
-    found = judged(judge, scene.sh_dc)
+    images = (style(), style().flip(0).flip(2))
+    judge = judge_of(alex, scene, [view], Style(images, (0.75, 0.25)))  # type: ignore[arg-type]
+    judgment = judged(judge, scene.sh_dc)
     lpips, renders = Lpips(dtype=torch.float64), judge.renders(scene.sh_dc, view)
     coverage = CpuRasterizer(scene).coverage(view)
     grams, sliced = [], []
     for image in renders:
         wanted = [
-            lpips.features(resize_area(one, style_size((one.shape[0], one.shape[1]), (180, 240)))) for one in pictures
+            lpips.features(resize_area(one, style_size((one.shape[0], one.shape[1]), (180, 240)))) for one in images
         ]
         for layer, (own, least) in enumerate(zip(lpips.features(image), lpips.least_coverage(coverage), strict=True)):
             inside = own[least >= 0.9].numpy()
@@ -185,14 +185,14 @@ def test_interior_measures_agree_with_plain_formulas(alex: Lpips) -> None:
                 difference, size = difference + np.abs(first - second).mean(), size + np.abs(second).mean()
             sliced.append(difference / size)
     assert len(grams) >= 6
-    assert found.interior_style == pytest.approx(np.mean(grams), rel=1e-4)
-    assert found.sliced_features == pytest.approx(np.mean(sliced), rel=1e-3)
+    assert judgment.interior_style == pytest.approx(np.mean(grams), rel=1e-4)
+    assert judgment.sliced_features == pytest.approx(np.mean(sliced), rel=1e-3)
 
 
 def test_objects_smaller_than_receptive_fields_have_no_interior_measures(alex: Lpips) -> None:
-    found = judged(judge_of(alex, ball(), cameras(1)), ball().sh_dc)
-    assert found.interior_style is None
-    assert found.sliced_features is None
+    judgment = judged(judge_of(alex, ball(), cameras(1)), ball().sh_dc)
+    assert judgment.interior_style is None
+    assert judgment.sliced_features is None
 
 
 def test_frechet_distance_of_known_distributions() -> None:
@@ -222,13 +222,13 @@ def test_regions_are_judged_by_their_own_styles(alex: Lpips) -> None:
     dark, bright = torch.full((64, 64, 3), 0.1), torch.full((64, 64, 3), 0.9)
     right = (scene.means[:, 0] > 0)[:, None]
     colors = (torch.where(right, 0.9, 0.1).expand(-1, 3) - 0.5) / SH_C0
-    found = [
+    judgments = [
         judged(Judge(alex, styles, scene, CpuRasterizer(scene), views), colors)
         for styles in (regions_of(scene, dark, bright), regions_of(scene, bright, dark))
     ]
-    assert found[0].color_distance < 60  # colors mix at the border
-    assert found[1].color_distance > 150
-    assert found[0].content == found[1].content
+    assert judgments[0].color_distance < 60  # colors mix at the border
+    assert judgments[1].color_distance > 150
+    assert judgments[0].content == judgments[1].content
 
 
 def test_frozen_gaussians_are_not_judged_by_a_style(alex: Lpips) -> None:

@@ -61,7 +61,7 @@ def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: Ba
     measured(usual)
     measured(other)
     assert other.measured[0]["step"] == usual.measured[0]["step"] == 0
-    start, same = (found.measured[0]["novel_views"]["gram"] for found in (other, usual))
+    start, same = (stylizer.measured[0]["novel_views"]["gram"] for stylizer in (other, usual))
     assert start == pytest.approx(same, rel=1e-6)
     assert all(terms["nearest"] > 0 for terms in other.history[-1].terms.values())
 

@@ -86,8 +86,8 @@ def ring(count: int, radius: float = 3.0) -> list[Camera]:
     ]
 
 
-def names(found: list[Camera]) -> list[str]:
-    return [camera.name for camera in found]
+def names(novel: list[Camera]) -> list[str]:
+    return [camera.name for camera in novel]
 
 
 @pytest.mark.parametrize(
@@ -101,31 +101,40 @@ def names(found: list[Camera]) -> list[str]:
     ],
 )
 def test_midpoint_halves_shortest_rotation_and_translation(first: float, second: float, middle: float):
-    found = between(posed(rotation(first), (1, -2, 3), "left"), posed(rotation(second), (2, 4, -5), "right", width=90))
-    assert found.name == "left–right"
-    torch.testing.assert_close(found.world_to_camera[:3, :3], rotation(middle), rtol=0, atol=1e-13)
-    torch.testing.assert_close(found.center, torch.tensor([1.5, 1, -1], dtype=torch.float64), rtol=0, atol=1e-13)
-    assert (found.width, found.height, found.fx, found.fy, found.cx, found.cy) == (60, 40, 55.0, 56.0, 31.0, 19.0)
-    assert found.world_to_camera[3].tolist() == [0, 0, 0, 1]
+    midpoint = between(
+        posed(rotation(first), (1, -2, 3), "left"), posed(rotation(second), (2, 4, -5), "right", width=90)
+    )
+    assert midpoint.name == "left–right"
+    torch.testing.assert_close(midpoint.world_to_camera[:3, :3], rotation(middle), rtol=0, atol=1e-13)
+    torch.testing.assert_close(midpoint.center, torch.tensor([1.5, 1, -1], dtype=torch.float64), rtol=0, atol=1e-13)
+    assert (midpoint.width, midpoint.height, midpoint.fx, midpoint.fy, midpoint.cx, midpoint.cy) == (
+        60,
+        40,
+        55.0,
+        56.0,
+        31.0,
+        19.0,
+    )
+    assert midpoint.world_to_camera[3].tolist() == [0, 0, 0, 1]
 
 
 def test_midpoints_of_opposite_and_of_equal_cameras_are_valid():
     ends = posed(rotation(0.0), (0, 0, 0)), posed(rotation(math.pi), (2, 0, 0))
-    found = between(*ends)
-    assert [angle_between(found, end) for end in ends] == pytest.approx([math.pi / 2] * 2, abs=1e-7)
-    orientation = found.world_to_camera[:3, :3]
+    midpoint = between(*ends)
+    assert [angle_between(midpoint, end) for end in ends] == pytest.approx([math.pi / 2] * 2, abs=1e-7)
+    orientation = midpoint.world_to_camera[:3, :3]
     torch.testing.assert_close(orientation @ orientation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
     assert float(torch.linalg.det(orientation)) == pytest.approx(1)
-    assert found.center.tolist() == pytest.approx([1, 0, 0])
+    assert midpoint.center.tolist() == pytest.approx([1, 0, 0])
     same = posed(rotation(2.0), (0.3, 0.2, 0.1))
     torch.testing.assert_close(between(same, same).world_to_camera, same.world_to_camera, rtol=0, atol=1e-14)
 
 
 def test_midpoint_on_a_ring_looks_at_its_center():
-    for found in cameras_between(ring(9), range(9)):
-        direction = found.world_to_camera[2, :3]
-        torch.testing.assert_close(direction, -found.center / found.center.norm(), rtol=0, atol=1e-7)
-        assert float(found.center.norm()) == pytest.approx(3 * math.cos(math.pi / 9))
+    for midpoint in cameras_between(ring(9), range(9)):
+        direction = midpoint.world_to_camera[2, :3]
+        torch.testing.assert_close(direction, -midpoint.center / midpoint.center.norm(), rtol=0, atol=1e-7)
+        assert float(midpoint.center.norm()) == pytest.approx(3 * math.cos(math.pi / 9))
 
 
 def test_one_novel_camera_lies_between_neighbors():
@@ -140,8 +149,8 @@ def test_one_novel_camera_lies_between_neighbors():
 
 def test_no_novel_camera_spans_a_jump_or_a_wide_rotation():
     near, far = ring(20), [replace(c, name="far " + c.name) for c in ring(20, radius=30)]
-    found = names(cameras_between([*near[:8], *far[:8]], range(16)))
-    assert found == [f"{i}–{i + 1}" for i in range(7)] + [f"far {i}–far {i + 1}" for i in range(7)]
+    between_names = names(cameras_between([*near[:8], *far[:8]], range(16)))
+    assert between_names == [f"{i}–{i + 1}" for i in range(7)] + [f"far {i}–far {i + 1}" for i in range(7)]
     assert len(cameras_between(ring(6), range(6))) == 5  # 60 degrees between neighbors
     assert cameras_between(ring(5), range(5)) == []
     assert cameras_between([cameras(1)[0], blind_camera()], [0, 1]) == []
@@ -158,12 +167,12 @@ def test_unordered_cameras_are_sorted(seed: int):
     shuffled = ring(40)
     random.Random(seed).shuffle(shuffled)
     by_name = {camera.name: camera for camera in shuffled}
-    found = cameras_between(shuffled, range(40))
-    assert len(found) >= 38
-    for camera in found:
+    novel = cameras_between(shuffled, range(40))
+    assert len(novel) >= 38
+    for camera in novel:
         parents = [by_name[name] for name in camera.name.split("–")]
         assert angle_between(*parents) < math.radians(3.5 * 360 / 40)
-    following = [angle_between(*pair) for pair in itertools.pairwise(found)]
+    following = [angle_between(*pair) for pair in itertools.pairwise(novel)]
     assert sum(angle < math.radians(2.5 * 360 / 40) for angle in following) >= 36
 
 
@@ -225,7 +234,7 @@ def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | 
     for scale in range(pyramid.scale_count(image.shape[0], image.shape[1], COARSEST)):
         side = 1 << scale
         seen, wanted = (
-            features_reference(weights, box_average_reference(picture.double(), side)) for picture in (image, painting)
+            features_reference(weights, box_average_reference(each.double(), side)) for each in (image, painting)
         )
         result[scale] = 0.0
         for layer in STYLE_LAYERS:
@@ -271,11 +280,11 @@ def test_gram_distance_is_relative_to_the_first_measurement(network):
 
 def test_caching_does_not_change_measurements(network, lpips):
     scene, views = wall(sh_degree=1), cameras(10)
-    kept = novel_views(scene, views, network, weighted=True, lpips=lpips)
+    cached = novel_views(scene, views, network, weighted=True, lpips=lpips)
     nothing_kept = novel_views(scene, views, network, weighted=True, lpips=lpips, memory=0)
-    moment = kept.measure(scene.sh_dc)
-    assert moment == nothing_kept.measure(scene.sh_dc) == kept.measure(scene.sh_dc)
-    assert {gap: len(pairs) for gap, pairs in kept.pairs.items()} == {SHORT_RANGE: MOST_VIEWS, LONG_RANGE: 2}
+    moment = cached.measure(scene.sh_dc)
+    assert moment == nothing_kept.measure(scene.sh_dc) == cached.measure(scene.sh_dc)
+    assert {gap: len(pairs) for gap, pairs in cached.pairs.items()} == {SHORT_RANGE: MOST_VIEWS, LONG_RANGE: 2}
 
 
 def test_consistency_ignores_unseen_gaussians(network, lpips):
@@ -404,9 +413,9 @@ def test_sample_of_a_large_scene_preserves_coverage_and_depth() -> None:
     part = sampled(scene, 1001)
     assert len(part) == 1001
     looks = []
-    for found in (scene, part):
-        rasterizer = make_rasterizer("cpu", found)
-        coverage, depth = rasterizer.coverage(camera), expected_depth(found, camera, rasterizer)
+    for each in (scene, part):
+        rasterizer = make_rasterizer("cpu", each)
+        coverage, depth = rasterizer.coverage(camera), expected_depth(each, camera, rasterizer)
         looks.append((float(coverage.mean()), float(depth.depth[depth.known].median())))
     (covered, depth_of_all), (covered_by_part, depth_of_part) = looks
     assert covered_by_part == pytest.approx(covered, rel=0.25)

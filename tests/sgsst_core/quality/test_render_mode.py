@@ -68,11 +68,11 @@ def test_counts_are_those_of_the_reference(tmp_path: Path) -> None:
             if opacity > 0.5 and index in visible:
                 opaque += 1
                 small += left.get(index, 0.0) < 0.5 * opacity
-    found = small_gaussians(scene, VIEWS, 0.2)
+    counts = small_gaussians(scene, VIEWS, 0.2)
     assert 0 < small < opaque
     # The projection leaves out small ones between pixel centers, which the reference keeps.
-    assert found[1] == pytest.approx(opaque / 2, abs=1)
-    assert found[0] == pytest.approx(small / 2, rel=0.02)
+    assert counts[1] == pytest.approx(opaque / 2, abs=1)
+    assert counts[0] == pytest.approx(small / 2, rel=0.02)
 
 
 def visible_in(scene: Scene, view: Camera) -> list[int]:

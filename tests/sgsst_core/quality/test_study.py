@@ -62,9 +62,9 @@ def test_order_of_images_on_the_page_differs_between_views(tmp_path: Path) -> No
 
 def test_tokens_identify_the_images_of_the_variants(study: tuple[Path, Path]) -> None:
     page, key = study
-    found = re.search(r"const study = (.*);$", page.read_text(), re.MULTILINE)
-    assert found is not None
-    on_page = {entry["token"]: entry["image"] for view in json.loads(found[1])["views"] for entry in view}
+    match = re.search(r"const study = (.*);$", page.read_text(), re.MULTILINE)
+    assert match is not None
+    on_page = {entry["token"]: entry["image"] for view in json.loads(match[1])["views"] for entry in view}
     for tokens in json.loads(key.read_text())["views"]:
         for index, token in enumerate(tokens):
             image = Image.open(io.BytesIO(base64.b64decode(on_page.pop(token).partition(",")[2])))

@@ -72,6 +72,6 @@ def covariance(quat: Array, scale: Array) -> Array:
     return axes @ np.diag(scale**2) @ axes.T
 
 
-def psnr(found: Array, expected: Array) -> float:
+def psnr(actual: Array, expected: Array) -> float:
     """Return the PSNR in dB for values in 0..1."""
-    return float(-10 * np.log10(np.mean(np.square(found - expected))))
+    return float(-10 * np.log10(np.mean(np.square(actual - expected))))

@@ -106,11 +106,11 @@ def test_extreme_shapes_are_drawn_or_counted() -> None:
     )
     scene.scales[3] = 500
     scene = replace(scene, rendering=Rendering("antialiased"))
-    found = project(scene, camera())
-    assert found.gaussians.tolist() == [0]
-    assert (found.outcomes[Outcome.FAINT], found.outcomes[Outcome.INVALID]) == (2, 1)
+    projection = project(scene, camera())
+    assert projection.gaussians.tolist() == [0]
+    assert (projection.outcomes[Outcome.FAINT], projection.outcomes[Outcome.INVALID]) == (2, 1)
     assert splat(scene, camera()).gaussians.tolist() == [0]
-    assert np.isfinite(found.values).all()
+    assert np.isfinite(projection.values).all()
     assert np.isfinite(make_rasterizer("cpu", scene).coverage(camera()).numpy()).all()
 
 

@@ -72,9 +72,9 @@ def test_gaussian_on_the_near_plane_is_visible() -> None:
     at, before, behind = 0.5, math.nextafter(0.5, 0), -1.0
     scene = together([((0, 0, z), 0.9, (0.01,) * 3, (1, 0, 0, 0)) for z in (at, float(np.float32(before)), behind)])
     scene.means[1, 2] = float(np.nextafter(np.float32(0.5), np.float32(0)))
-    found = project(scene, camera(), near=0.5)
-    assert found.gaussians.tolist() == [0]
-    assert found.outcomes[Outcome.NEAR] == 2
+    projection = project(scene, camera(), near=0.5)
+    assert projection.gaussians.tolist() == [0]
+    assert projection.outcomes[Outcome.NEAR] == 2
     assert splat(scene, camera(), near=0.5).gaussians.tolist() == [0]
     with pytest.raises(ValueError, match="must be positive"):
         project(scene, camera(), near=0.0)
@@ -84,11 +84,11 @@ def test_opacities_below_the_cutoff_are_dropped() -> None:
     logit = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
     scene = together([((0, 0, 4), 0.5, (2.0,) * 3, (1, 0, 0, 0))] * 5)
     scene.opacities[:] = torch.tensor([logit - 1e-3, logit + 1e-3, -200.0, 200.0, -1e4])
-    found = project(scene, camera())
-    assert found.gaussians.tolist() == [1, 3]
-    assert found.outcomes[Outcome.FAINT] == 3
-    assert found.values[0, Column.EXTENT_X] < 0.1 * found.values[1, Column.EXTENT_X]
-    assert found.values[1, Column.LOG2_OPACITY] == pytest.approx(0, abs=1e-80)
+    projection = project(scene, camera())
+    assert projection.gaussians.tolist() == [1, 3]
+    assert projection.outcomes[Outcome.FAINT] == 3
+    assert projection.values[0, Column.EXTENT_X] < 0.1 * projection.values[1, Column.EXTENT_X]
+    assert projection.values[1, Column.LOG2_OPACITY] == pytest.approx(0, abs=1e-80)
 
 
 def test_equal_depths_stay_in_file_order() -> None:
@@ -102,16 +102,16 @@ def test_gaussians_without_a_projection_are_dropped_and_counted() -> None:
     scene.quats[1] = 0
     scene.quats[2] = 1e-30  # short, but still a direction
     scene.scales[3] = 500  # e^500 squared overflows
-    found = project(scene, camera())
-    assert found.gaussians.tolist() == [0, 2]
-    assert found.outcomes[Outcome.INVALID] == 2
+    projection = project(scene, camera())
+    assert projection.gaussians.tolist() == [0, 2]
+    assert projection.outcomes[Outcome.INVALID] == 2
     assert splat(scene, camera()).gaussians.tolist() == [0, 2]
 
 
 def test_huge_gaussians_and_empty_scenes_are_projected() -> None:
-    found = project(single((0, 0, 4), scales=(1e12, 1e12, 1e12)), camera())
-    assert found.outcomes[Outcome.VISIBLE] == 1
-    assert np.isfinite(found.values).all()
+    projection = project(single((0, 0, 4), scales=(1e12, 1e12, 1e12)), camera())
+    assert projection.outcomes[Outcome.VISIBLE] == 1
+    assert np.isfinite(projection.values).all()
     assert len(project(empty_scene(), camera()).gaussians) == 0
 
 

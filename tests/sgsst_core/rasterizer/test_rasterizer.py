@@ -256,7 +256,7 @@ def test_view_without_gaussians_is_background(name: str, scene: Scene) -> None:
     assert image[..., 0].eq(0.5).all()
     assert image[..., 2].eq(0.125).all()
     assert not rasterizer.coverage(view).any()
-    assert not any(found.any() for found in rasterizer.survey(view))
+    assert not any(values.any() for values in rasterizer.survey(view))
     gradient = rasterizer.color_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()

@@ -47,20 +47,20 @@ def threads(request: pytest.FixtureRequest) -> Iterator[None]:
 def test_depth_order_equals_a_stable_sort(name: str, threads: None) -> None:
     depths = DEPTHS[name]
     visible = np.flatnonzero(_RANDOM.random(len(depths)) < 0.8)
-    found = depth_order(depths, visible)
-    assert found.dtype == np.int32
-    assert np.array_equal(found, visible[np.argsort(depths[visible], kind="stable")])
+    order = depth_order(depths, visible)
+    assert order.dtype == np.int32
+    assert np.array_equal(order, visible[np.argsort(depths[visible], kind="stable")])
 
 
 def test_projected_values_are_in_depth_order(threads: None) -> None:
     scene, view = cloud(700, seed=31), camera()
-    found = project(scene, view)
+    projection = project(scene, view)
     pose = view.world_to_camera.double()
-    depths = (scene.means.double() @ pose[2, :3] + pose[2, 3]).numpy()[found.gaussians]
+    depths = (scene.means.double() @ pose[2, :3] + pose[2, 3]).numpy()[projection.gaussians]
     assert np.all(np.diff(depths) >= -1e-12)
-    first = found.gaussians[0]
+    first = projection.gaussians[0]
     alone = project(scene.subset(torch.tensor([int(first)])), view)
-    assert np.array_equal(found.values[0], alone.values[0])
+    assert np.array_equal(projection.values[0], alone.values[0])
 
 
 def intersections_one_by_one(scene: Scene, view: Camera) -> list[list[int]]:
@@ -94,14 +94,14 @@ def test_tile_intersections_equal_a_loop_over_gaussians(count: int, threads: Non
     check_slots(isects)
 
 
-def check_same(found: TileIntersections, expected: TileIntersections) -> None:
+def check_same(actual: TileIntersections, expected: TileIntersections) -> None:
     """Check that all arrays are bit-identical."""
     for name in ("starts", "ranks", "slots", "first_slots"):
-        own, other = getattr(found, name), getattr(expected, name)
+        own, other = getattr(actual, name), getattr(expected, name)
         assert own.dtype == other.dtype
         assert np.array_equal(own, other), name
-    assert np.array_equal(found.projection.gaussians, expected.projection.gaussians)
-    assert np.array_equal(found.projection.values, expected.projection.values)
+    assert np.array_equal(actual.projection.gaussians, expected.projection.gaussians)
+    assert np.array_equal(actual.projection.values, expected.projection.values)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.6, 1.0])
@@ -110,8 +110,8 @@ def test_tile_intersections_of_a_subset_equal_rebuilt_ones(share: float, threads
     scene.scales[:10] += 4
     chosen = torch.rand(900, generator=torch.Generator().manual_seed(1)) < share
     places = torch.where(chosen, chosen.cumsum(0) - 1, -1).to(torch.int32).numpy()
-    found = intersections_of_subset(build_tile_intersections(scene, view), places)
-    check_same(found, build_tile_intersections(scene.subset(chosen), view))
+    subset = intersections_of_subset(build_tile_intersections(scene, view), places)
+    check_same(subset, build_tile_intersections(scene.subset(chosen), view))
 
 
 def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
@@ -151,23 +151,23 @@ def test_guests_use_the_rest_of_the_budget_for_tile_intersections() -> None:
     host = CpuRasterizer(scene, max_intersection_bytes=sum(sizes))
     guests = [host.beside(scene) for _ in range(2)]
 
-    def kept() -> list[list[bool]]:
+    def cached_by_view() -> list[list[bool]]:
         return [[one.has_intersections(view) for view in views] for one in (host, *guests)]
 
     host.intersections(views[0])
     guests[0].intersections(views[1])
     guests[1].intersections(views[2])
     guests[1].intersections(views[0])  # uses up all bytes
-    assert kept() == [[True, False, False], [False, True, False], [False, False, True]]
+    assert cached_by_view() == [[True, False, False], [False, True, False], [False, False, True]]
     check_same(guests[1].intersections(views[0]), host.intersections(views[0]))
     host.intersections(views[1])
     host.intersections(views[2])
-    assert kept() == [[True] * 3, [False] * 3, [False] * 3]
+    assert cached_by_view() == [[True] * 3, [False] * 3, [False] * 3]
     host.release_view(views[0], sum(sizes))
     guests[0].intersections(views[0])
-    assert kept()[1] == [True, False, False]
+    assert cached_by_view()[1] == [True, False, False]
     host.release_view(views[1], sizes[2])
-    assert kept()[:2] == [[False, False, True], [False] * 3]
+    assert cached_by_view()[:2] == [[False, False, True], [False] * 3]
     del guests[1]
     gc.collect()
     assert len(host._intersections._guests) == 1

@@ -160,7 +160,7 @@ def test_view_without_gaussians_is_background(scene: Scene) -> None:
     rasterizer, view = on_device(scene), camera(20, 18)
     assert torch.equal(rasterizer.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
     assert not rasterizer.coverage(view).any()
-    assert not any(found.any() for found in rasterizer.survey(view))
+    assert not any(values.any() for values in rasterizer.survey(view))
     gradient = rasterizer.color_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()

@@ -173,13 +173,13 @@ def test_pieces_have_weights_and_slots_are_filled_once() -> None:
 @contextmanager
 def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Yield a list that collects the names of calls that would synchronize with a GPU."""
-    found: list[str] = []
+    waiting: list[str] = []
 
     def noted(name: str) -> Callable[..., Any]:
         original = getattr(Tensor, name)
 
         def call(*arguments: Any, **options: Any) -> Any:
-            found.append(name)
+            waiting.append(name)
             return original(*arguments, **options)
 
         return call
@@ -187,7 +187,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     with monkeypatch.context() as patch:
         for name in ("item", "tolist", "nonzero", "__bool__", "__int__", "__float__", "__index__"):
             patch.setattr(Tensor, name, noted(name))
-        yield found
+        yield waiting
 
 
 def test_caching_synchronizes_once_and_cached_views_never(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,12 +196,12 @@ def test_caching_synchronizes_once_and_cached_views_never(monkeypatch: pytest.Mo
     cached, colors, pixels = cached_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
     uncached: Any = cached.uncached
     uncached.intersections(view)
-    with waits(monkeypatch) as found:
+    with waits(monkeypatch) as waiting:
         cached.coverage(view)
-    assert found == ["__int__"]
-    with waits(monkeypatch) as found:
+    assert waiting == ["__int__"]
+    with waits(monkeypatch) as waiting:
         cached.color_gradient(cached.render(colors, view) + pixels, view)
-    assert not found
+    assert not waiting
 
 
 def test_rasterizer_is_created_by_name() -> None:
@@ -224,18 +224,18 @@ VIEWS = cameras(2, 32, 24)
 def test_plan_predicts_the_bytes_of_cached_weights(tiny_weights: BackboneWeights) -> None:
     scene = ball(60)
     planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
-    found = measure(
+    cost = measure(
         planning_context, survey_views(scene, VIEWS, planning_context.rasterizer), Link(float("inf"), 0.0)
     ).raster
-    planned: dict[Precision, int | None] = {"float32": found.bytes, "half": found.half_bytes}
+    planned: dict[Precision, int | None] = {"float32": cost.bytes, "half": cost.half_bytes}
     for precision, size in planned.items():
         cached = CachedRasterizer(scene, precision=precision, uncached=planning_context.rasterizer)  # type: ignore[arg-type]
         for view in VIEWS:
             cached.coverage(view)
         assert cached.cached_bytes == size
-    assert found.cached_seconds is not None
-    assert found.caching_seconds is not None
-    assert min(found.seconds, found.cached_seconds, found.caching_seconds) > 0
+    assert cost.cached_seconds is not None
+    assert cost.caching_seconds is not None
+    assert min(cost.seconds, cost.cached_seconds, cost.caching_seconds) > 0
 
 
 @pytest.mark.slow

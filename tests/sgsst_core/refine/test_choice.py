@@ -27,17 +27,21 @@ from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
 def test_projected_axes_add_up_to_the_projected_covariance() -> None:
     scene, view = cloud(300), camera(pose=rotated_pose())
-    found = project(scene, view)
-    rows = torch.from_numpy(found.gaussians).long()
-    x, y = (torch.from_numpy(found.values[:, column]) for column in (Column.X, Column.Y))
+    projection = project(scene, view)
+    rows = torch.from_numpy(projection.gaussians).long()
+    x, y = (torch.from_numpy(projection.values[:, column]) for column in (Column.X, Column.Y))
     inside = (x > 0) & (x < view.width) & (y > 0) & (y < view.height)  # outside the view, directions are clamped
     lengths, reach = axes_in_view(scene, rows[inside], view)
     reference = ReferenceRasterizer(scene)
     assert reference.dtype == torch.float64
     # Extents are t sqrt(p) and t sqrt(r) with the same t; without blur, the squared axes sum to p + r.
-    support = torch.from_numpy(found.values[:, Column.LOG2_OPACITY]).double()[inside] + torch.log2(torch.tensor(255.0))
+    support = torch.from_numpy(projection.values[:, Column.LOG2_OPACITY]).double()[inside] + torch.log2(
+        torch.tensor(255.0)
+    )
     t = (2 * torch.log(torch.tensor(2.0, dtype=torch.float64)) * support).sqrt()
-    extents = [torch.from_numpy(found.values[:, column])[inside] / t for column in (Column.EXTENT_X, Column.EXTENT_Y)]
+    extents = [
+        torch.from_numpy(projection.values[:, column])[inside] / t for column in (Column.EXTENT_X, Column.EXTENT_Y)
+    ]
     expected = extents[0].square() + extents[1].square() - 2 * EPS2D
     assert len(expected) > 50
     assert torch.allclose(lengths.square().sum(dim=1), expected, rtol=1e-5, atol=1e-5)

@@ -27,10 +27,10 @@ def test_mask_of_one_half_selects_half_of_the_wall():
     mask = torch.zeros(views[0].height, views[0].width)
     mask[:, views[0].width // 2 :] = 1
     inside, total = count_votes(make_rasterizer("cpu", scene), views, [lambda: mask], len(scene))
-    found = decide_by_votes(scene.means, inside, total)
+    decided = decide_by_votes(scene.means, inside, total)
     x = scene.means[:, 0]
-    assert bool(found[x > 0.2].all())  # those outside the view follow their neighbors
-    assert not bool(found[x < -0.2].any())
+    assert bool(decided[x > 0.2].all())  # those outside the view follow their neighbors
+    assert not bool(decided[x < -0.2].any())
 
 
 def test_undecided_and_unseen_gaussians_follow_their_neighbors():
@@ -39,8 +39,8 @@ def test_undecided_and_unseen_gaussians_follow_their_neighbors():
     inside = torch.tensor([0.0] * 3 + [1.0] * 9, dtype=torch.float64)
     inside[10], inside[0] = 0.45, 0.55  # between
     total[11] = inside[11] = 0
-    found = decide_by_votes(places, inside, total)
-    assert found[1:].tolist() == [False, False, *[True] * 9]
+    decided = decide_by_votes(places, inside, total)
+    assert decided[1:].tolist() == [False, False, *[True] * 9]
     inside[5] = 0.39  # outvoted by a margin, whatever its neighbors are
     assert not bool(decide_by_votes(places, inside, total)[5])
 

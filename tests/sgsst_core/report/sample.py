@@ -125,6 +125,6 @@ def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _judged(style: float, content: float) -> dict[str, float]:
-    found = {"style": style, "color_distance": 40 * style, "content": content, "features": content / 2}
+    judged = {"style": style, "color_distance": 40 * style, "content": content, "features": content / 2}
     interior = {"interior_style": style / 2, "sliced_features": style / 4}
-    return {**found, **interior, "background_sensitivity": 0.25, "saturated": 0.02}
+    return {**judged, **interior, "background_sensitivity": 0.25, "saturated": 0.02}

@@ -23,17 +23,17 @@ def colors_in(path: Path) -> set[tuple[int, ...]]:
 @pytest.mark.parametrize(("coarse", "sos", "scales"), [(0, 1, 1), (1, 0, 2), (3, 0, 2), (2, 2, 2), (40, 60, 3)])
 def test_chart_has_a_line_for_each_optimized_scale(coarse: int, sos: int, scales: int, tmp_path: Path) -> None:
     write_loss_chart(tmp_path / "c.png", sample_report(coarse, sos, scales))
-    found = colors_in(tmp_path / "c.png")
+    colors = colors_in(tmp_path / "c.png")
     there = range(scales) if sos else [scales - 1]
     for place, color in enumerate(COLORS):
-        assert (ImageColor.getrgb(color) in found) == (place in there), f"scale {place}"
+        assert (ImageColor.getrgb(color) in colors) == (place in there), f"scale {place}"
 
 
 def test_chart_without_steps_has_only_axes(tmp_path: Path) -> None:
     write_loss_chart(tmp_path / "c.png", sample_report(0, 0))
-    found = colors_in(tmp_path / "c.png")
-    assert ImageColor.getrgb(INK) in found
-    assert not found & {ImageColor.getrgb(color) for color in COLORS}
+    colors = colors_in(tmp_path / "c.png")
+    assert ImageColor.getrgb(INK) in colors
+    assert not colors & {ImageColor.getrgb(color) for color in COLORS}
 
 
 def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:

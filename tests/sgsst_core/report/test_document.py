@@ -171,7 +171,7 @@ def test_loss_after_is_the_mean_of_the_last_round_everywhere(
 def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
     """With two views per round, the mean of the last two losses counts."""
     stylizer = finished[0]
-    kept, seconds, covered = stylizer.history, stylizer.seconds, stylizer.job.views.covered
+    history, seconds, covered = stylizer.history, stylizer.seconds, stylizer.job.views.covered
     losses = [8.0, 8.0, 4.0, 4.0, 0.48, 0.48, 0.48]
     stylizer.history = [
         StepRecord(i + 1, "sos", i % 2, 10.0 * (i + 1), loss, {0: LossTerms(gram=loss)}, {}, 0)
@@ -179,22 +179,26 @@ def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evalua
     ]
     stylizer.seconds, stylizer.job.views.covered = 70.0, [0, 1]
     try:
-        found = loss_over_time(stylizer, {0: LossTerms(gram=8.0)})
+        summary = loss_over_time(stylizer, {0: LossTerms(gram=8.0)})
     finally:
-        stylizer.history, stylizer.seconds, stylizer.job.views.covered = kept, seconds, covered
-    assert found is not None
-    assert found["relative"] == pytest.approx(0.06)
-    assert [(entry["relative"], entry["step"]) for entry in found["reached"]] == [(0.5, 4), (0.2, 5), (0.1, 6)]
-    assert found["last_tenth"] == {"seconds": pytest.approx(7.0), "from": pytest.approx(0.06), "to": found["relative"]}
+        stylizer.history, stylizer.seconds, stylizer.job.views.covered = history, seconds, covered
+    assert summary is not None
+    assert summary["relative"] == pytest.approx(0.06)
+    assert [(entry["relative"], entry["step"]) for entry in summary["reached"]] == [(0.5, 4), (0.2, 5), (0.1, 6)]
+    assert summary["last_tenth"] == {
+        "seconds": pytest.approx(7.0),
+        "from": pytest.approx(0.06),
+        "to": summary["relative"],
+    }
 
 
 def test_loss_over_time_needs_steps(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
     stylizer = finished[0]
-    kept, stylizer.history = stylizer.history, []
+    history, stylizer.history = stylizer.history, []
     try:
         assert loss_over_time(stylizer, {0: LossTerms(gram=8.0)}) is None
     finally:
-        stylizer.history = kept
+        stylizer.history = history
 
 
 def test_report_is_plain_json(
@@ -215,7 +219,7 @@ def test_coarse_steps_are_relative_to_their_own_scale(
 ) -> None:
     stylizer = finished[0]
     before = {0: LossTerms(gram=6.0), 1: LossTerms(gram=2.0)}
-    kept = stylizer.history
+    history = stylizer.history
     stylizer.history = [
         StepRecord(1, "coarse", 0, 0.1, 1.0, {1: LossTerms(gram=1.0)}, {}, 0),
         StepRecord(2, "sos", 0, 0.2, 1.0, {0: LossTerms(gram=1.0), 1: LossTerms(gram=1.0)}, {}, 0),
@@ -223,7 +227,7 @@ def test_coarse_steps_are_relative_to_their_own_scale(
     try:
         report = build_report(stylizer, sources, "finished", before, before)
     finally:
-        stylizer.history = kept
+        stylizer.history = history
     assert [entry["relative"] for entry in report["history"]] == [0.5, 0.25]
     assert [report["steps"][stage]["done"] for stage in ("coarse", "sos")] == [1, 1]
 

@@ -102,11 +102,11 @@ def viewmat() -> Tensor:
 
 @pytest.mark.parametrize("form", [torch.Tensor.float, torch.Tensor.numpy, torch.Tensor.tolist, lambda view: view[:3]])
 def test_cameras_are_created_from_matrices(form: Any) -> None:
-    found = Camera.from_matrix(form(viewmat()), form(K.double()), 990, 742, name="a")
-    assert (found.name, found.width, found.height) == ("a", 990, 742)
-    assert (found.fx, found.fy, found.cx, found.cy) == (820, 810, 490, 380)
-    torch.testing.assert_close(found.world_to_camera, viewmat(), rtol=0, atol=2e-7)
-    rotation = found.world_to_camera[:3, :3]
+    created = Camera.from_matrix(form(viewmat()), form(K.double()), 990, 742, name="a")
+    assert (created.name, created.width, created.height) == ("a", 990, 742)
+    assert (created.fx, created.fy, created.cx, created.cy) == (820, 810, 490, 380)
+    torch.testing.assert_close(created.world_to_camera, viewmat(), rtol=0, atol=2e-7)
+    rotation = created.world_to_camera[:3, :3]
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3).double(), rtol=0, atol=1e-15)
 
 

@@ -75,8 +75,8 @@ def test_undistorted_photos_match_colmap(model: str) -> None:
         cy=expected.principal_point_y,
     )
     photo = torch.from_numpy(pattern()).float() / 255
-    found = undistort(photo, same)[2:-2, 2:-2] * 255
-    assert float((found - torch.from_numpy(bitmap.to_array()).float()[2:-2, 2:-2]).abs().max()) < 1.5
+    actual = undistort(photo, same)[2:-2, 2:-2] * 255
+    assert float((actual - torch.from_numpy(bitmap.to_array()).float()[2:-2, 2:-2]).abs().max()) < 1.5
     assert (view.fx, view.fy) == (expected.focal_length_x, expected.focal_length_y)
 
 

@@ -11,13 +11,13 @@ def colors(count: int = 200, dtype: torch.dtype = torch.float64) -> torch.Tensor
 
 
 def test_gray_keeps_luminance_and_has_no_chroma() -> None:
-    found = gray(colors())
+    grays = gray(colors())
     assert sum(WEIGHTS) == pytest.approx(1, abs=1e-15)
-    torch.testing.assert_close(found[:, 0], colors() @ torch.tensor(WEIGHTS, dtype=torch.float64))
-    assert torch.equal(found[:, 0], found[:, 1])
-    assert torch.equal(found[:, 0], found[:, 2])
-    torch.testing.assert_close(luminance(found), found[:, 0])
-    assert found.is_contiguous()
+    torch.testing.assert_close(grays[:, 0], colors() @ torch.tensor(WEIGHTS, dtype=torch.float64))
+    assert torch.equal(grays[:, 0], grays[:, 1])
+    assert torch.equal(grays[:, 0], grays[:, 2])
+    torch.testing.assert_close(luminance(grays), grays[:, 0])
+    assert grays.is_contiguous()
 
 
 def test_gray_gradient_agrees_with_autograd() -> None:
@@ -30,9 +30,9 @@ def test_chroma_comes_from_the_original() -> None:
     original = 3 * colors(dtype=torch.float32)
     shift = torch.linspace(-5, 5, 200)[:, None]
     noise = 1e-3 * colors(dtype=torch.float32).flip(0)
-    found = with_chroma_of(original + shift + noise, original)
-    change = found.double() - original.double()
-    largest = torch.maximum(found.abs(), original.abs()).amax()
+    result = with_chroma_of(original + shift + noise, original)
+    change = result.double() - original.double()
+    largest = torch.maximum(result.abs(), original.abs()).amax()
     assert float((change - change.mean(1, keepdim=True)).abs().max()) <= float(largest) * 2**-23
     torch.testing.assert_close(change.mean(1), (shift[:, 0] + noise.mean(1)).double(), rtol=0, atol=1e-5)
 

@@ -34,24 +34,24 @@ def test_bound_is_the_largest_float32_within_range() -> None:
 @given(st.lists(COLOR, min_size=1, max_size=8))
 def test_channels_are_clamped_separately(rows: list[tuple[float, float, float]]) -> None:
     sh_dc = torch.tensor(rows, dtype=torch.float32)
-    found = on_screen(sh_dc)
-    shown = colors(found)
+    result = on_screen(sh_dc)
+    shown = colors(result)
     assert float(shown.min()) >= 0
     assert float(shown.max()) <= 1
     inside = ((colors(sh_dc) >= 0) & (colors(sh_dc) <= 1)).all(dim=1)
-    assert torch.equal(found[inside], sh_dc[inside])
+    assert torch.equal(result[inside], sh_dc[inside])
     assert torch.allclose(shown, colors(sh_dc).clamp(0, 1), atol=1e-7)
 
 
 @given(st.lists(COLOR, min_size=1, max_size=8))
 def test_gray_shift_is_as_small_as_possible(rows: list[tuple[float, float, float]]) -> None:
     sh_dc = torch.tensor(rows, dtype=torch.float32).double()
-    found = on_screen_by_luminance(sh_dc)
-    shift = found - sh_dc
+    result = on_screen_by_luminance(sh_dc)
+    shift = result - sh_dc
     size = 1 + sh_dc.abs().amax(dim=1)
     assert float(((shift - shift.mean(dim=1, keepdim=True)).abs().amax(dim=1) / size).max()) < 1e-12
     fits = sh_dc.amax(dim=1) - sh_dc.amin(dim=1) <= 2 * LARGEST * (1 - 1e-6)
-    for before, after, fit in zip(sh_dc, found, fits, strict=True):
+    for before, after, fit in zip(sh_dc, result, fits, strict=True):
         outside = max(float(-LARGEST - before.min()), float(before.max() - LARGEST), 0.0)
         if fit:
             assert float(after.abs().max()) <= HIGHEST
@@ -64,9 +64,9 @@ def test_gray_shift_preserves_chroma_in_float32() -> None:
     generator = torch.Generator().manual_seed(1)
     original = torch.rand((1000, 3), generator=generator) * 2 - 1
     moved = original + 6 * torch.randn((1000, 1), generator=generator)
-    found = with_chroma_of(on_screen_by_luminance(moved), original)
-    shown = colors(found)
+    result = with_chroma_of(on_screen_by_luminance(moved), original)
+    shown = colors(result)
     assert float(shown.min()) >= 0
     assert float(shown.max()) <= 1
-    change = (found - original).double()
+    change = (result - original).double()
     assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < ROUNDING

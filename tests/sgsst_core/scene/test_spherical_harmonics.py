@@ -153,9 +153,9 @@ def test_kernel_agrees_with_float64_reference(name: str, degree: int) -> None:
     exact = reference_rest_colors(whole.double(), scene.means, view, degree)
     sizes = whole[:, :count].abs().double().sum(1)
     for sh_rest in (whole, whole[:, :count]):
-        found = kernel_rest_colors(sh_rest.to(device), scene.means.to(device), view, degree)
-        assert found.dtype == torch.float32
-        assert bool(((found.cpu().double() - exact).abs() <= 1e-6 * sizes).all())
+        actual = kernel_rest_colors(sh_rest.to(device), scene.means.to(device), view, degree)
+        assert actual.dtype == torch.float32
+        assert bool(((actual.cpu().double() - exact).abs() <= 1e-6 * sizes).all())
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
@@ -167,9 +167,9 @@ def test_cpu_sums_are_float64_rounded_once(name: str, degree: int) -> None:
     exact = reference_rest_colors(whole.double(), scene.means, view, degree)
     sizes = whole[:, :count].abs().double().sum(1)
     for sh_rest in (whole, whole[:, :count]):
-        found = rest_colors(sh_rest, scene.means, view, degree=degree)
-        assert found.dtype == torch.float32
-        assert bool(((found.double() - exact).abs() <= 2**-24 * exact.abs() + 1e-14 * sizes).all())
+        actual = rest_colors(sh_rest, scene.means, view, degree=degree)
+        assert actual.dtype == torch.float32
+        assert bool(((actual.double() - exact).abs() <= 2**-24 * exact.abs() + 1e-14 * sizes).all())
 
 
 @pytest.mark.gpu
@@ -177,9 +177,9 @@ def test_cpu_sums_are_float64_rounded_once(name: str, degree: int) -> None:
 def test_gpu_colors_come_from_the_kernel() -> None:
     scene, view = cloud(300, degree=3), camera(pose=rotated_pose())
     sh_rest, means = held(scene.sh_rest).cuda(), scene.means.cuda()
-    found = rest_colors(sh_rest, means, view)
-    assert torch.equal(found, kernel_rest_colors(sh_rest, means, view, 3))
-    assert torch.allclose(found.cpu(), rest_colors(scene.sh_rest, scene.means, view), atol=1e-5)
+    colors_on_gpu = rest_colors(sh_rest, means, view)
+    assert torch.equal(colors_on_gpu, kernel_rest_colors(sh_rest, means, view, 3))
+    assert torch.allclose(colors_on_gpu.cpu(), rest_colors(scene.sh_rest, scene.means, view), atol=1e-5)
     assert not rest_colors(sh_rest, means, view, degree=0).any()
 
 
@@ -201,8 +201,8 @@ def test_clamp_aware_gradient_only_raises_clamped_colors() -> None:
     """At a color clamped to 0, a gradient passes if it would raise the color, not if it would lower it."""
     colors = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
     gradient = torch.tensor([[-1.0, 1.0, 2.0], [0.0, -3.0, -4.0]])
-    found = view_colors_gradient(gradient, colors, clamp_aware_gradient=True)
-    torch.testing.assert_close(found, SH_C0 * torch.tensor([[-1.0, 0.0, 2.0], [0.0, -3.0, -4.0]]))
+    result = view_colors_gradient(gradient, colors, clamp_aware_gradient=True)
+    torch.testing.assert_close(result, SH_C0 * torch.tensor([[-1.0, 0.0, 2.0], [0.0, -3.0, -4.0]]))
 
 
 def test_clamp_aware_gradient_recovers_clamped_colors() -> None:

@@ -152,8 +152,10 @@ def test_small_scenes_are_read_into_memory(tmp_path: Path) -> None:
 def test_values_derived_from_stored_coefficients_are_the_same(tmp_path: Path) -> None:
     """These are fingerprints of jobs, so that a job can be resumed either way, and the largest coefficients."""
     stored, plain = both(written(tmp_path))
-    found = [fingerprint(scene, [camera()], torch.zeros(2, 2, 3), make_settings(), "w") for scene in (stored, plain)]
-    assert found[0] == found[1]
+    fingerprints = [
+        fingerprint(scene, [camera()], torch.zeros(2, 2, 3), make_settings(), "w") for scene in (stored, plain)
+    ]
+    assert fingerprints[0] == fingerprints[1]
     assert isinstance(stored.sh_rest, StoredHarmonics)
     assert torch.equal(stored.sh_rest.largest(), held(plain.sh_rest).abs().flatten(1).amax(1))
 
@@ -165,14 +167,14 @@ def test_zero_bands_are_removed_without_a_copy(tmp_path: Path, last: int | None,
     if last is not None:
         values[61, last, 2] = -1e-30
     write_scene(tmp_path / "scene.ply", replace(scene, sh_rest=values))
-    for found in both(tmp_path / "scene.ply"):
-        less = found.without_zero_bands()
-        assert (found.used_degree(), less.sh_degree) == (degree, degree)
-        assert type(less.sh_rest) is type(found.sh_rest)
+    for loaded in both(tmp_path / "scene.ply"):
+        less = loaded.without_zero_bands()
+        assert (loaded.used_degree(), less.sh_degree) == (degree, degree)
+        assert type(less.sh_rest) is type(loaded.sh_rest)
         assert torch.equal(held(less.sh_rest), values[:, : (degree + 1) ** 2 - 1])
         without = torch.ones(100, dtype=torch.bool)
         without[61] = False
-        assert found.used_degree(without) == 0
+        assert loaded.used_degree(without) == 0
 
 
 def test_invalid_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
@@ -291,9 +293,9 @@ def test_neither_harmonics_nor_result_are_in_memory(tmp_path: Path) -> None:
     count, one = 300_000, cloud(3000, degree=3)
     write_scene(tmp_path / "large.ply", one.subset(torch.arange(3000).repeat(count // 3000)))
     run = [sys.executable, "-c", _PEAK, str(tmp_path)]
-    found = subprocess.run(
+    output = subprocess.run(
         run, capture_output=True, text=True, check=True, cwd=Path(scene_file.__file__).parents[2]
     ).stdout
-    held_bytes, writing = map(int, found.split())
+    held_bytes, writing = map(int, output.split())
     assert held_bytes < 236  # a scene in memory without its subset
     assert writing < 40 << 20  # one block of rows plus the comparison of its colors; the file has 74 MB

@@ -84,8 +84,8 @@ class Photos:
 
 @pytest.fixture
 def counts() -> Iterator[Counts]:
-    with pretend_cuda() as found:
-        yield found
+    with pretend_cuda() as counts:
+        yield counts
 
 
 def make(weights: BackboneWeights, photos: Photos, **values: Any) -> Stylizer:

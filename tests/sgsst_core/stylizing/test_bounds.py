@@ -56,12 +56,12 @@ def test_changed_colors_stay_in_the_range_of_screens(
     run(free)
     bounded = make(tiny_weights, scene, bounded=True, **values)
     run(bounded)
-    found = bounded.stylized()
-    changed = (found != scene.sh_dc).any(dim=1)
+    stylized = bounded.stylized()
+    changed = (stylized != scene.sh_dc).any(dim=1)
     assert saturated(free.stylized()) > 0.1
-    assert saturated(found[changed]) == 0
+    assert saturated(stylized[changed]) == 0
     if values.get("unseen") != "freeze":
-        assert saturated(found) == 0
+        assert saturated(stylized) == 0
         assert bool(changed.all())
 
 
@@ -69,12 +69,12 @@ def test_luminance_mode_preserves_chroma_within_the_bounds(tiny_weights: Backbon
     scene = wall(60, 40)
     stylizer = make(tiny_weights, scene, bounded=True, preserve_colors="luminance")
     run(stylizer)
-    found = stylizer.stylized()
-    change = (found - scene.sh_dc).double()
+    stylized = stylizer.stylized()
+    change = (stylized - scene.sh_dc).double()
     assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
     fits = scene.sh_dc.amax(dim=1) - scene.sh_dc.amin(dim=1) < 2 * LARGEST * (1 - 1e-5)
     assert bool(fits.any())
-    assert saturated(found[fits]) == 0
+    assert saturated(stylized[fits]) == 0
     assert bool((~fits).any()), "a color that no luminance brings into the bounds belongs to this test"
 
 
@@ -84,11 +84,11 @@ def test_frozen_gaussians_may_be_out_of_range(tiny_weights: BackboneWeights) -> 
     regions = Regions((Region("rest"), Region("right", freeze=True)), right)
     stylizer = make(tiny_weights, scene, regions, bounded=True)
     run(stylizer)
-    found = stylizer.stylized()
-    kept = regions.frozen
-    assert saturated(scene.sh_dc[kept]) > 0.1
-    assert torch.equal(found[kept].view(torch.int32), scene.sh_dc[kept].view(torch.int32))
-    assert saturated(found[~kept]) == 0
+    stylized = stylizer.stylized()
+    frozen = regions.frozen
+    assert saturated(scene.sh_dc[frozen]) > 0.1
+    assert torch.equal(stylized[frozen].view(torch.int32), scene.sh_dc[frozen].view(torch.int32))
+    assert saturated(stylized[~frozen]) == 0
 
 
 def test_rendering_unseen_gaussians_does_not_change_bounds(tiny_weights: BackboneWeights) -> None:

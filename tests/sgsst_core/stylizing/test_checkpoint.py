@@ -79,11 +79,11 @@ def full_checkpoint(state: StylizerState) -> Checkpoint:
     return Checkpoint(state, plan, 3, "run", versions())
 
 
-def assert_same(expected: object, found: object) -> None:
+def assert_same(expected: object, actual: object) -> None:
     """Assert that all fields of two objects are equal, and that tensors are bit-identical."""
-    assert type(expected) is type(found)
+    assert type(expected) is type(actual)
     for name in type(expected).__dataclass_fields__:  # type: ignore[attr-defined]
-        one, other = getattr(expected, name), getattr(found, name)
+        one, other = getattr(expected, name), getattr(actual, name)
         if isinstance(one, torch.Tensor):
             assert one.dtype == other.dtype, name
             assert torch.equal(one, other), name
@@ -112,12 +112,12 @@ def test_gpu_memory_round_trips(full_checkpoint: Checkpoint, tmp_path: Path) -> 
 
 def test_refinement_round_trips(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     pieces = torch.tensor([[1, 1, 1], [3, 1, 1]], dtype=torch.uint8)
-    made = Refinement(pieces, 1, 4, 1 / 3, 44.4, 41.1, 2, torch.rand(4, 3))
-    refined = replace(full_checkpoint, plan=replace(full_checkpoint.plan, refinement=made))
+    refinement = Refinement(pieces, 1, 4, 1 / 3, 44.4, 41.1, 2, torch.rand(4, 3))
+    refined = replace(full_checkpoint, plan=replace(full_checkpoint.plan, refinement=refinement))
     save_checkpoint(tmp_path / "c", refined, "job")
-    found = load_checkpoint(tmp_path / "c", "job")
-    assert_same(refined, found)
-    assert found.plan.refinement is not None
+    checkpoint = load_checkpoint(tmp_path / "c", "job")
+    assert_same(refined, checkpoint)
+    assert checkpoint.plan.refinement is not None
 
 
 def test_checkpoint_of_an_earlier_version_is_refused(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
@@ -308,12 +308,12 @@ def test_fingerprint_ignores_budgets() -> None:
 
 def test_fingerprint_distinguishes_styles_and_their_weights() -> None:
     scene, views, settings = wall(), cameras(), make_settings()
-    pictures = [style(), style().flip(0)]
+    images = [style(), style().flip(0)]
     alone = fingerprint(scene, views, style(), settings, "w")
-    assert fingerprint(scene, views, Style.weighted(pictures[:1], [3]), settings, "w") == alone
+    assert fingerprint(scene, views, Style.weighted(images[:1], [3]), settings, "w") == alone
     mixtures = [([0, 1], [1, 1]), ([0, 1], [1, 2]), ([1, 0], [1, 2])]
-    found = {
-        fingerprint(scene, views, Style.weighted([pictures[i] for i in order], weights), settings, "w")
+    fingerprints = {
+        fingerprint(scene, views, Style.weighted([images[i] for i in order], weights), settings, "w")
         for order, weights in mixtures
     }
-    assert len(found | {alone}) == 4
+    assert len(fingerprints | {alone}) == 4

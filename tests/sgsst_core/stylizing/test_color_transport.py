@@ -68,9 +68,9 @@ def test_axes_are_distinct_rotations() -> None:
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
 def test_weighted_colors_get_the_target_distribution(scale: float) -> None:
     own, count, wanted = colors(4000, 0), scale * weights(4000, 1), 1 - colors(3000, 2)
-    found = transported(own, count, wanted)
+    actual = transported(own, count, wanted)
     assert distance(own[_drawn(count)], wanted) > 0.1
-    assert distance(found[_drawn(count)], wanted) < 0.01
+    assert distance(actual[_drawn(count)], wanted) < 0.01
 
 
 def test_transport_by_samples_and_knots_is_close_to_exact() -> None:
@@ -94,28 +94,28 @@ def test_equal_colors_stay_equal_and_zero_weights_are_ignored() -> None:
     own, count, wanted = colors(500, 7), weights(500, 8), colors(500, 9)
     more = torch.cat([own, own[:100], 5 - own])
     less = torch.cat([count, torch.zeros(600, dtype=torch.float64)])
-    found = transported(more, less, wanted)
-    torch.testing.assert_close(found[:500], transported(own, count, wanted), rtol=0, atol=1e-12)
-    torch.testing.assert_close(found[500:600], found[:100], rtol=0, atol=1e-12)
+    actual = transported(more, less, wanted)
+    torch.testing.assert_close(actual[:500], transported(own, count, wanted), rtol=0, atol=1e-12)
+    torch.testing.assert_close(actual[500:600], actual[:100], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 1e6, 1e30])
 def test_colors_of_any_size_get_close_to_the_target(size: float) -> None:
     own, wanted = size * (colors(800, 10) - 0.5), colors(900, 11)
-    found = transported(own, torch.ones(800, dtype=torch.float64), wanted)
-    assert bool(found.isfinite().all())
-    assert float(found.min()) > -0.3
-    assert float(found.max()) < 1.3
-    torch.testing.assert_close(found.mean(0), wanted.mean(0), rtol=0, atol=0.05)
+    actual = transported(own, torch.ones(800, dtype=torch.float64), wanted)
+    assert bool(actual.isfinite().all())
+    assert float(actual.min()) > -0.3
+    assert float(actual.max()) < 1.3
+    torch.testing.assert_close(actual.mean(0), wanted.mean(0), rtol=0, atol=0.05)
 
 
 def test_nearly_equal_colors_become_the_mean() -> None:
     wanted = colors(1000, 12)
     own = torch.full((100_000, 3), 0.1, dtype=torch.float64)
     own += 1e-9 * torch.randn(own.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found = transported(own, torch.ones(len(own), dtype=torch.float64), wanted)
-    torch.testing.assert_close(found.mean(0), wanted.mean(0), rtol=0, atol=1e-3)
-    assert float(found.std(0).max()) < 1e-6
+    actual = transported(own, torch.ones(len(own), dtype=torch.float64), wanted)
+    torch.testing.assert_close(actual.mean(0), wanted.mean(0), rtol=0, atol=1e-3)
+    assert float(actual.std(0).max()) < 1e-6
 
 
 @pytest.mark.parametrize("case", ["heaps", "far", "flat", "two"])

@@ -43,13 +43,13 @@ def stylized(stylizer: Stylizer) -> torch.Tensor:
 def test_frozen_gaussians_are_not_split_and_children_keep_regions(tiny_weights: BackboneWeights) -> None:
     settings, regions = make_settings("preview", refine=2.0), halves()
     free = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights)
-    made = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights, regions=regions)
+    refinement = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights, regions=regions)
     assert free is not None
-    assert made is not None
+    assert refinement is not None
     assert bool((piece_counts(free.pieces)[regions.frozen] > 1).any()), "nothing is proved"
-    assert bool((piece_counts(made.pieces)[regions.frozen] == 1).all())
-    assert made.split
-    assert torch.equal(regions.refined(made).labels, regions.labels[parents_of(made.pieces)])
+    assert bool((piece_counts(refinement.pieces)[regions.frozen] == 1).all())
+    assert refinement.split
+    assert torch.equal(regions.refined(refinement).labels, regions.labels[parents_of(refinement.pieces)])
 
 
 @pytest.mark.parametrize("colors", ["no", "luminance"])
@@ -57,15 +57,15 @@ def test_all_controls_work_together(tiny_weights: BackboneWeights, colors: str) 
     values = {"refine": 2.0, "preserve_colors": colors, "scales": (1.0, 0.5), "warm_start": True}
     stylizer = job(tiny_weights, **values)
     before = stylizer.job.scene.sh_dc.clone()
-    found = stylized(stylizer)
-    assert len(found) > len(large_wall())
+    stylized_colors = stylized(stylizer)
+    assert len(stylized_colors) > len(large_wall())
     assert stylizer.job.regions is not None
-    kept = stylizer.job.regions.frozen
-    assert torch.equal(found[kept], before[kept])
-    assert not torch.equal(found[~kept], before[~kept])
-    assert bool(found.isfinite().all())
+    frozen = stylizer.job.regions.frozen
+    assert torch.equal(stylized_colors[frozen], before[frozen])
+    assert not torch.equal(stylized_colors[~frozen], before[~frozen])
+    assert bool(stylized_colors.isfinite().all())
     if colors == "luminance":
-        change = found.double() - before.double()
+        change = stylized_colors.double() - before.double()
         assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
         assert float(luminance(change).abs().max()) > 0.01
-    assert torch.equal(stylized(job(tiny_weights, **values)), found)
+    assert torch.equal(stylized(job(tiny_weights, **values)), stylized_colors)

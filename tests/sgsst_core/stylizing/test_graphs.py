@@ -35,8 +35,8 @@ MOST_LAUNCHES = 60
 
 @pytest.fixture
 def counts() -> Iterator[Counts]:
-    with pretend_cuda() as found:
-        yield found
+    with pretend_cuda() as counts:
+        yield counts
 
 
 def test_kernels_run_on_the_device_of_their_data(counts: Counts, tiny_weights: BackboneWeights) -> None:
@@ -91,13 +91,13 @@ def test_steps_with_graphs_are_bit_identical(
     for _ in range(plain.job.total_steps):
         expected, stage = plain.run_step(), graphs.phase.stage
         counts.clear()
-        found = graphs.run_step()
-        assert (found.view, found.loss, found.terms) == (expected.view, expected.loss, expected.terms)
+        actual = graphs.run_step()
+        assert (actual.view, actual.loss, actual.terms) == (expected.view, expected.loss, expected.terms)
         if sum(record.stage == stage for record in graphs.history) > FIRST_VISITS:
             assert counts.launches.total() < MOST_LAUNCHES
             assert counts.waits.total() == 1
-            assert {"network", "render", "raster_backward"} <= found.parts.keys()
-            assert "vgg_forward" not in found.parts
+            assert {"network", "render", "raster_backward"} <= actual.parts.keys()
+            assert "vgg_forward" not in actual.parts
     assert graphs.stylized().equal(plain.stylized())
     assert graphs.job.graphs is not None
     assert (graphs.job.graphs.captured, graphs.job.graphs.problem) == (2, None)
@@ -114,19 +114,19 @@ def test_one_graph_serves_every_background_color(
         make(tiny_weights, graphs=graphs, training_background="random", **options) for graphs in (False, True)
     )
     fixed = make(tiny_weights, graphs=True, **options)
-    found: dict[str, list[tuple[int, int]]] = {"drawn": [], "fixed": []}
+    launches: dict[str, list[tuple[int, int]]] = {"drawn": [], "fixed": []}
     for _ in range(plain.job.total_steps):
         expected = plain.run_step()
         for name, stylizer in (("drawn", graphs), ("fixed", fixed)):
             counts.clear()
             record = stylizer.run_step()
-            found[name].append((counts.waits.total(), counts.copies.total()))
+            launches[name].append((counts.waits.total(), counts.copies.total()))
             if name == "drawn":
                 assert (record.view, record.loss, record.terms) == (expected.view, expected.loss, expected.terms)
     assert graphs.job.graphs is not None
     assert (graphs.job.graphs.captured, graphs.job.graphs.problem) == (1, None)
-    assert found["drawn"][-1] == found["fixed"][-1]
-    assert found["drawn"][-1][0] == 1
+    assert launches["drawn"][-1] == launches["fixed"][-1]
+    assert launches["drawn"][-1][0] == 1
 
 
 def test_graphs_support_several_views_per_step_and_resuming(

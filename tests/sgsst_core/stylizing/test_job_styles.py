@@ -42,15 +42,15 @@ def test_rotations_by_90_degrees_only_move_pixels() -> None:
 def test_brightness_ramp_rotates_with_the_image(degrees: float, size: tuple[int, int]) -> None:
     """Every pixel comes from inside the image: edges are not extended and nothing is filled in."""
     height, width = size
-    found = rotated(ramp(height, width, 0.001, 0.002), degrees)[..., 0]
+    image = rotated(ramp(height, width, 0.001, 0.002), degrees)[..., 0]
     angle = math.radians(degrees)
     # Counterclockwise, as seen with y pointing down: what was on the right moves up.
     slope_x = 0.002 * math.cos(angle) + 0.001 * math.sin(angle)
     slope_y = 0.001 * math.cos(angle) - 0.002 * math.sin(angle)
-    wanted = ramp(found.shape[0], found.shape[1], slope_y, slope_x)[..., 0]
+    wanted = ramp(image.shape[0], image.shape[1], slope_y, slope_x)[..., 0]
     shift = 0.0025  # the crop is half a pixel off center
-    torch.testing.assert_close(found - found.mean(), wanted - wanted.mean(), atol=1e-4, rtol=0)
-    assert abs(float(found.mean()) - 0.5) <= shift
+    torch.testing.assert_close(image - image.mean(), wanted - wanted.mean(), atol=1e-4, rtol=0)
+    assert abs(float(image.mean()) - 0.5) <= shift
 
 
 @pytest.mark.parametrize("degrees", [0.5, 10, 30, 45, 60, 89.5])
@@ -84,20 +84,20 @@ def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
     settings = make_settings("standard", preserve_colors="match")
     style = 0.5 + 0.05 * torch.randn(64, 64, 3, generator=generator)
     (image,) = prepared_style(Style.of(style), settings, (colors - 0.5) / SH_C0, weights).images
-    found = image.reshape(-1, 3).double()
+    matched = image.reshape(-1, 3).double()
     share = (weights / weights.sum())[:, None]
     inside = colors.double().clamp(0, 1)
     mean = (share * inside).sum(dim=0)
     covariance = (share * (inside - mean)).T @ (inside - mean)
-    torch.testing.assert_close(found.mean(dim=0), mean, atol=1e-4, rtol=0)
-    torch.testing.assert_close(found.T.cov(correction=0), covariance, atol=1e-4, rtol=0)
+    torch.testing.assert_close(matched.mean(dim=0), mean, atol=1e-4, rtol=0)
+    torch.testing.assert_close(matched.T.cov(correction=0), covariance, atol=1e-4, rtol=0)
 
 
 def test_uniform_style_gets_the_mean_of_the_scene() -> None:
     settings = make_settings("standard", preserve_colors="match")
     gray = Style.of(torch.full((4, 4, 3), 0.9))
-    (found,) = prepared_style(gray, settings, torch.zeros(10, 3), torch.ones(10).double()).images
-    torch.testing.assert_close(found, torch.full((4, 4, 3), 0.5))
+    (image,) = prepared_style(gray, settings, torch.zeros(10, 3), torch.ones(10).double()).images
+    torch.testing.assert_close(image, torch.full((4, 4, 3), 0.5))
 
 
 def test_default_settings_leave_the_style_unchanged() -> None:
@@ -111,10 +111,10 @@ def test_style_scale_uses_statistics_of_a_resized_style(tiny_weights: BackboneWe
     size = style_size((96, 120), view, scale)
     assert size == (round(64 * scale), round(80 * scale))
     network = FeatureNetwork(tiny_weights)
-    found = SosLoss(network, style_scale=scale).targets.of_style(Style.of(style), view)[0][0]
+    actual = SosLoss(network, style_scale=scale).targets.of_style(Style.of(style), view)[0][0]
     wanted = SosLoss(network).targets.of_style(Style.of(resize_area(style, size)), size)[0][0]
-    for layer in found.layers:
-        torch.testing.assert_close(found.layers[layer].gram, wanted.layers[layer].gram)
+    for layer in actual.layers:
+        torch.testing.assert_close(actual.layers[layer].gram, wanted.layers[layer].gram)
 
 
 def test_small_style_is_not_enlarged_by_default() -> None:

@@ -59,13 +59,13 @@ def test_transfer_changes_results_but_not_optimized_colors(tiny_weights: Backbon
     optimized = stylizer.sh_dc.detach().clone()
     rows = stylizer.job.plan.optimized
     assert rows.any()
-    found = stylizer.stylized()
+    stylized = stylizer.stylized()
     weights = stylizer.job.plan.survey.total_blend_weights[stylizer.job.plan.seen]
     wanted = warm_start(optimized, weights, stylizer.job.style)
-    assert torch.equal(found[rows], wanted[rows[stylizer.job.plan.seen]])
+    assert torch.equal(stylized[rows], wanted[rows[stylizer.job.plan.seen]])
     assert float((wanted - optimized).abs().mean()) > 0.01
     assert torch.equal(stylizer.sh_dc, optimized)
-    assert torch.equal(stylizer.shown(), found[stylizer.job.plan.seen])
+    assert torch.equal(stylizer.shown(), stylized[stylizer.job.plan.seen])
     assert plan_mentions_transfer(stylizer.job.plan)
 
 
@@ -108,10 +108,10 @@ def test_regions_get_colors_of_their_styles_and_frozen_ones_none(tiny_weights: B
     )
     stylizer = make(tiny_weights, scene, regions)
     run(stylizer)
-    found = stylizer.stylized()
-    assert torch.equal(found[labels == 2].view(torch.int32), scene.sh_dc[labels == 2].view(torch.int32))
+    stylized = stylizer.stylized()
+    assert torch.equal(stylized[labels == 2].view(torch.int32), scene.sh_dc[labels == 2].view(torch.int32))
     for place, gray in enumerate((0.2, 0.7)):
-        own = 0.5 + SH_C0 * found[(labels == place) & stylizer.job.plan.optimized]
+        own = 0.5 + SH_C0 * stylized[(labels == place) & stylizer.job.plan.optimized]
         assert float((own - gray).abs().max()) < 1e-3
 
 
@@ -120,11 +120,11 @@ def test_luminance_mode_preserves_chroma(tiny_weights: BackboneWeights, bounded:
     stylizer = make(tiny_weights, preserve_colors="luminance", warm_start=True, bounded=bounded, unseen="freeze")
     run(stylizer)
     rows, before = stylizer.job.plan.optimized, stylizer.job.scene.sh_dc
-    found = stylizer.stylized()
-    change = (found - before)[rows].double()
+    stylized = stylizer.stylized()
+    change = (stylized - before)[rows].double()
     assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
-    assert not torch.equal(found[rows], stylizer.sh_dc.detach()[rows[stylizer.job.plan.seen]])
-    off = float((on_screen_by_luminance(found[rows]) - found[rows]).abs().max())
+    assert not torch.equal(stylized[rows], stylizer.sh_dc.detach()[rows[stylizer.job.plan.seen]])
+    off = float((on_screen_by_luminance(stylized[rows]) - stylized[rows]).abs().max())
     assert off < 1e-6 if bounded else off > 0.1
 
 

@@ -41,10 +41,10 @@ def make(weights: BackboneWeights, scene: Scene, steps: int = 4, **values: Any) 
     return Stylizer.planned(scene, cameras(), style(), settings, weights=weights)
 
 
-def chroma_off(found: torch.Tensor, scene: Scene) -> float:
+def chroma_off(stylized: torch.Tensor, scene: Scene) -> float:
     """Return the largest difference between the changes of two color channels of a Gaussian."""
-    change = found.double() - scene.sh_dc.double()
-    size = torch.maximum(found.abs(), scene.sh_dc.abs()).amax(1, keepdim=True).clamp_min(1).double()
+    change = stylized.double() - scene.sh_dc.double()
+    size = torch.maximum(stylized.abs(), scene.sh_dc.abs()).amax(1, keepdim=True).clamp_min(1).double()
     return float(((change - change.mean(1, keepdim=True)).abs() / size).max())
 
 
@@ -71,12 +71,12 @@ def test_every_gaussian_keeps_its_chroma(
     assert any(line.item == "colors" for line in stylizer.job.plan.decisions)
     before = stylizer.sh_dc.detach().clone()
     run(stylizer)
-    found = stylizer.stylized()
+    stylized = stylizer.stylized()
     assert float((stylizer.sh_dc.detach() - before).abs().max()) > 0.1
-    assert chroma_off(found, scene) < ROUNDING
+    assert chroma_off(stylized, scene) < ROUNDING
     if values.get("unseen") != "freeze" and not stylizer.job.plan.seen.all():
         hidden = ~stylizer.job.plan.seen
-        assert float((found - scene.sh_dc)[hidden].abs().max()) > 0
+        assert float((stylized - scene.sh_dc)[hidden].abs().max()) > 0
 
 
 def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) -> None:
@@ -84,7 +84,7 @@ def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) 
     scene, view = wall(), cameras(1)[0]
     settings = make_settings(preserve_colors="luminance", coarsest_side=24, steps_coarse=0, clamp_aware_gradient=False)
     stylizer = Stylizer.planned(scene, [view], style(), settings, weights=tiny_weights)
-    found, _ = stylizer.gradient(0, range(stylizer.job.scale_count(0)))
+    actual, _ = stylizer.gradient(0, range(stylizer.job.scale_count(0)))
 
     rasterizer = ReferenceRasterizer(scene)
     colors = (COLOR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
@@ -95,7 +95,7 @@ def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) 
     _, pixels = sos_reference(stylizer.job.weights, image, used, image, coarsest=24)
     exact = rasterizer.color_gradient(pixels, view) * SH_C0 * (colors > 0)
     assert stylizer.job.weights.gray
-    assert relative_error(found.sum(1).double(), exact.sum(1)[stylizer.job.plan.seen]) < 1e-4
+    assert relative_error(actual.sum(1).double(), exact.sum(1)[stylizer.job.plan.seen]) < 1e-4
 
 
 def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> None:
@@ -111,10 +111,10 @@ def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> Non
     for tile_size in (None, 64):
         loss = SosLoss(FeatureNetwork(weights, dtype=torch.float64), tile_size=tile_size, coarsest=70)
         targets = loss.targets.of_style(Style.of(painting), (129, 161))
-        found = loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
-        assert found.loss == pytest.approx(expected, rel=1e-9)
-        assert found.image_gradient is not None
-        assert relative_error(found.image_gradient, gradient) < 1e-9
+        actual = loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
+        assert actual.loss == pytest.approx(expected, rel=1e-9)
+        assert actual.image_gradient is not None
+        assert relative_error(actual.image_gradient, gradient) < 1e-9
 
 
 def test_colors_of_equal_luminance_have_equal_features(tiny_weights: BackboneWeights) -> None:
@@ -132,12 +132,12 @@ def test_style_gets_the_luminance_of_the_scene() -> None:
     weights = torch.rand(5000, generator=generator, dtype=torch.float64)
     settings = make_settings(preserve_colors="luminance")
     painting = Style.of(0.5 + 0.1 * synthetic_image(64, 64, seed=2).float())
-    (found,) = prepared_style(painting, settings, (colors - 0.5) / SH_C0, weights).images
-    assert torch.equal(found[..., 0], found[..., 1])
+    (image,) = prepared_style(painting, settings, (colors - 0.5) / SH_C0, weights).images
+    assert torch.equal(image[..., 0], image[..., 1])
     share, values = weights / weights.sum(), luminance(colors.double())
     mean = float((share * values).sum())
-    assert float(found.double().mean()) == pytest.approx(mean, abs=1e-5)
-    assert float(found[..., 0].double().std(correction=0)) == pytest.approx(
+    assert float(image.double().mean()) == pytest.approx(mean, abs=1e-5)
+    assert float(image[..., 0].double().std(correction=0)) == pytest.approx(
         float((share * (values - mean).square()).sum().sqrt()), rel=1e-3
     )
 
@@ -148,8 +148,8 @@ def test_mixture_as_a_whole_gets_the_luminance_of_the_scene() -> None:
     dark, bright = (0.2 + 0.1 * synthetic_image(40, 60, seed=2), 0.6 + 0.1 * synthetic_image(60, 40, seed=3))
     mixture = Style.weighted([dark.float(), bright.float()], [3, 1])
     ones = torch.ones(5000, dtype=torch.float64)
-    found = prepared_style(mixture, make_settings(preserve_colors="luminance"), (colors - 0.5) / SH_C0, ones)
-    first, second = (luminance(each.double()) for each in found.images)
+    image = prepared_style(mixture, make_settings(preserve_colors="luminance"), (colors - 0.5) / SH_C0, ones)
+    first, second = (luminance(each.double()) for each in image.images)
     assert float(first.mean()) < float(second.mean())
     values = luminance(colors.double())
     mean = 0.75 * first.mean() + 0.25 * second.mean()
@@ -168,10 +168,10 @@ def test_flat_styles_and_scenes_are_finite(value: float) -> None:
     flat, some = torch.full((5, 4, 3), value), 0.3 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     ones = torch.ones(20, dtype=torch.float64)
     for scene_colors, painting in ((some, flat), (torch.full((20, 3), (value - 0.5) / SH_C0), style())):
-        (found,) = prepared_style(Style.of(painting), settings, scene_colors, ones).images
-        assert bool(found.isfinite().all())
+        (image,) = prepared_style(Style.of(painting), settings, scene_colors, ones).images
+        assert bool(image.isfinite().all())
         wanted = luminance((0.5 + SH_C0 * scene_colors).clamp(0, 1)).mean()
-        torch.testing.assert_close(found.mean(), wanted, atol=1e-4, rtol=0)
+        torch.testing.assert_close(image.mean(), wanted, atol=1e-4, rtol=0)
         start = luminance_start(scene_colors, ones, Style.of(painting))
         assert chroma_off(start, replace(wall(), sh_dc=scene_colors)) < ROUNDING
         brightness = luminance(0.5 + SH_C0 * start.double())

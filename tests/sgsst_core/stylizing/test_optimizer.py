@@ -20,8 +20,8 @@ def gradients() -> list[Tensor]:
     """Return gradients of very different magnitudes, including zeros as for Gaussians outside of a view."""
     generator = torch.Generator().manual_seed(1)
     sizes = 10.0 ** torch.linspace(-18, 18, 90)[:, None]
-    found = [torch.randn((90, 3), generator=generator) * sizes for _ in range(STEPS)]
-    return [(gradient * (torch.rand((90, 1), generator=generator) > 0.3)).to(DEVICE) for gradient in found]
+    drawn = [torch.randn((90, 3), generator=generator) * sizes for _ in range(STEPS)]
+    return [(gradient * (torch.rand((90, 1), generator=generator) > 0.3)).to(DEVICE) for gradient in drawn]
 
 
 def rate(step: int) -> float:

@@ -29,9 +29,9 @@ def shown(*, terminal: bool) -> str:
 
 
 def test_terminal_shows_views_then_steps() -> None:
-    found = shown(terminal=True)
+    output = shown(terminal=True)
     for text in ("Surveying the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123 1:01 left"):
-        assert text in found
+        assert text in output
 
 
 def test_log_prints_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,9 +47,9 @@ def settings(**values: object) -> Settings:
 
 
 def refinement_of(weights: BackboneWeights, factor: float, scene: Scene | None = None) -> Refinement:
-    found = refine(scene or large_wall(), cameras(), style(), settings(refine=factor), weights=weights)
-    assert found is not None
-    return found
+    refinement = refine(scene or large_wall(), cameras(), style(), settings(refine=factor), weights=weights)
+    assert refinement is not None
+    return refinement
 
 
 def test_disagreement_is_the_gradient_that_cancels_between_pixels() -> None:
@@ -78,20 +78,20 @@ def test_large_gaussians_are_split_within_the_budget_and_images_are_preserved(
     tiny_weights: BackboneWeights, factor: float
 ) -> None:
     scene = large_wall()
-    found = refinement_of(tiny_weights, factor)
-    counts = piece_counts(found.pieces)
-    assert found.split == int((counts > 1).sum()) > 0
-    assert len(scene) < found.gaussians == int(counts.sum()) <= factor * len(scene)
-    assert found.psnr is not None
-    assert found.lowest_psnr is not None
-    assert found.psnr >= found.lowest_psnr >= LEAST_PSNR
-    refined_scene = refined(scene, found)
+    refinement = refinement_of(tiny_weights, factor)
+    counts = piece_counts(refinement.pieces)
+    assert refinement.split == int((counts > 1).sum()) > 0
+    assert len(scene) < refinement.gaussians == int(counts.sum()) <= factor * len(scene)
+    assert refinement.psnr is not None
+    assert refinement.lowest_psnr is not None
+    assert refinement.psnr >= refinement.lowest_psnr >= LEAST_PSNR
+    refined_scene = refined(scene, refinement)
     errors = []
     for view in cameras():  # with the slow float64 rasterizer
         before, after = (render(each, ReferenceRasterizer(each), view).clamp(0, 1) for each in (scene, refined_scene))
         errors.append(float((after - before).square().mean()))
-    assert psnr(max(errors)) == pytest.approx(found.lowest_psnr, abs=0.01)
-    assert psnr(sum(errors) / len(errors)) == pytest.approx(found.psnr, abs=0.01)
+    assert psnr(max(errors)) == pytest.approx(refinement.lowest_psnr, abs=0.01)
+    assert psnr(sum(errors) / len(errors)) == pytest.approx(refinement.psnr, abs=0.01)
 
 
 def test_refinement_is_deterministic(tiny_weights: BackboneWeights) -> None:
@@ -102,10 +102,10 @@ def test_refinement_is_deterministic(tiny_weights: BackboneWeights) -> None:
 
 def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights) -> None:
     small = replace(wall(), scales=torch.full_like(wall().scales, -5.0))
-    found = refinement_of(tiny_weights, 8.0, small)
-    assert (found.split, found.gaussians, found.taken_back) == (0, len(small), 0)
-    assert found.psnr is None
-    assert refined(small, found) is small
+    refinement = refinement_of(tiny_weights, 8.0, small)
+    assert (refinement.split, refinement.gaussians, refinement.taken_back) == (0, len(small), 0)
+    assert refinement.psnr is None
+    assert refined(small, refinement) is small
 
 
 def test_splits_that_would_change_the_image_are_undone(
@@ -113,14 +113,14 @@ def test_splits_that_would_change_the_image_are_undone(
 ) -> None:
     """An impossible bound undoes all splits, and no bound undoes none."""
     monkeypatch.setattr(refining, "LEAST_PSNR", 200.0)
-    found = refinement_of(tiny_weights, 4.0)
-    assert found.split == 0
-    assert found.taken_back > 0
-    assert "are not split" in choice.refine_decision(found, settings(refine=4)).reason
+    refinement = refinement_of(tiny_weights, 4.0)
+    assert refinement.split == 0
+    assert refinement.taken_back > 0
+    assert "are not split" in choice.refine_decision(refinement, settings(refine=4)).reason
     monkeypatch.setattr(refining, "LEAST_PSNR", 0.0)
     loose = refinement_of(tiny_weights, 4.0)
     assert loose.taken_back == 0
-    assert loose.split == found.taken_back
+    assert loose.split == refinement.taken_back
 
 
 def test_factor_of_one_turns_refinement_off(tiny_weights: BackboneWeights) -> None:
@@ -130,9 +130,9 @@ def test_factor_of_one_turns_refinement_off(tiny_weights: BackboneWeights) -> No
 
 
 def test_cameras_that_see_nothing_cause_no_splits(tiny_weights: BackboneWeights) -> None:
-    found = refine(ball(), [blind_camera()], style(), settings(refine=2), weights=tiny_weights)
-    assert found is not None
-    assert found.split == 0
+    refinement = refine(ball(), [blind_camera()], style(), settings(refine=2), weights=tiny_weights)
+    assert refinement is not None
+    assert refinement.split == 0
 
 
 def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> None:

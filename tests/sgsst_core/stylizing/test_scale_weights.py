@@ -41,12 +41,12 @@ def test_phase_1_uses_the_coarsest_weighted_scale(tiny_weights: BackboneWeights)
 
 def test_evaluated_loss_covers_the_weighted_scales(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, scales=(1.0, 0.0, 0.5), warm_start=False)
-    found = stylizer.evaluate([0, 1])
-    assert sorted(found) == [0, 2]
+    evaluation = stylizer.evaluate([0, 1])
+    assert sorted(evaluation) == [0, 2]
     weights = stylizer.job.loss.weights
-    assert mean_loss(found, weights) == pytest.approx((found[0].total + 0.5 * found[2].total) / 1.5)
+    assert mean_loss(evaluation, weights) == pytest.approx((evaluation[0].total + 0.5 * evaluation[2].total) / 1.5)
     reference = Float32Reference(stylizer).evaluate([0, 1], stylizer.job.scene.sh_dc)
-    assert mean_loss(reference, weights) == pytest.approx(mean_loss(found, weights), rel=1e-5)
+    assert mean_loss(reference, weights) == pytest.approx(mean_loss(evaluation, weights), rel=1e-5)
     run(stylizer)
     measure = Measurements(stylizer)
     measure.at_the_end()

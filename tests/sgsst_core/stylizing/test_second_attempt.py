@@ -43,16 +43,16 @@ class Memory:
 
 @pytest.fixture
 def memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Memory]:
-    found, convolve = Memory(), FeatureNetwork._convolve
+    simulated, convolve = Memory(), FeatureNetwork._convolve
 
     def convolve_within(network: FeatureNetwork, x: Tensor, step: Any) -> Tensor:
-        found.check(x)
+        simulated.check(x)
         return convolve(network, x, step)
 
     leave_out_kernels(monkeypatch)
     monkeypatch.setattr(FeatureNetwork, "_convolve", convolve_within)
     with pretend_cuda():
-        yield found
+        yield simulated
 
 
 def planned(weights: BackboneWeights, **values: Any) -> Stylizer:
@@ -65,18 +65,18 @@ def planned(weights: BackboneWeights, **values: Any) -> Stylizer:
 
 
 def test_job_continues_with_half_of_its_activations(memory: Memory, tiny_weights: BackboneWeights) -> None:
-    expected, found = planned(tiny_weights), planned(tiny_weights)
+    expected, actual = planned(tiny_weights), planned(tiny_weights)
     assert len(expected.job.loss.tiling.tiles((HEIGHT, WIDTH))) == 1
     for step in range(3):
         memory.pixels = 1 << 30
         loss = expected.run_step().loss
         if step:
             memory.pixels = TILE * HEIGHT
-        assert found.run_step().loss == pytest.approx(loss, rel=1e-4)
+        assert actual.run_step().loss == pytest.approx(loss, rel=1e-4)
     assert memory.failures == 1
-    assert len(found.job.loss.tiling.tiles((HEIGHT, WIDTH))) > 1
-    assert found.step == 3
-    torch.testing.assert_close(found.sh_dc.cpu(), expected.sh_dc.cpu(), rtol=1e-3, atol=1e-4)
+    assert len(actual.job.loss.tiling.tiles((HEIGHT, WIDTH))) > 1
+    assert actual.step == 3
+    torch.testing.assert_close(actual.sh_dc.cpu(), expected.sh_dc.cpu(), rtol=1e-3, atol=1e-4)
 
 
 def test_evaluations_get_a_second_attempt(memory: Memory, tiny_weights: BackboneWeights) -> None:

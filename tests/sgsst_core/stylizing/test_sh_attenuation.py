@@ -30,8 +30,8 @@ def make(weights: BackboneWeights, scene: Scene, **values: Any) -> Stylizer:
 
 
 def line(stylizer: Stylizer) -> str:
-    (found,) = (each for each in stylizer.job.plan.decisions if each.item == "spherical harmonics")
-    return f"{found.decision}: {found.reason}"
+    (decision,) = (each for each in stylizer.job.plan.decisions if each.item == "spherical harmonics")
+    return f"{decision.decision}: {decision.reason}"
 
 
 @pytest.mark.parametrize("attenuation", [0.4, 1.0])
@@ -69,11 +69,11 @@ def test_written_result_renders_as_optimized(
     stylizer.set_colors(stylized.scene.sh_dc)
     again = Stylizer.planned(result, cameras(), style(), make_settings(warm_start=False), weights=tiny_weights)
     for index in range(3):
-        pictures = [
+        images = [
             each.job.views.render(index, each.job.views.colors(index, each.sh_dc.detach()))
             for each in (stylizer, again)
         ]
-        assert torch.equal(*pictures)
+        assert torch.equal(*images)
 
 
 def test_plan_describes_the_attenuation(tiny_weights: BackboneWeights) -> None:

@@ -63,14 +63,14 @@ def test_result_has_the_form_of_the_scene_and_new_colors(
 ) -> None:
     given = in_form(form, wall(sh_degree=1), tmp_path)
     before = as_scene(given)
-    kept = copied(before)
+    unchanged = copied(before)
     result = run(given, tiny_weights)
     assert type(result) is type(given)
     after, alone = as_scene(result), run(before, tiny_weights)
     assert torch.equal(after.sh_dc, alone.sh_dc)
     assert not torch.equal(after.sh_dc, before.sh_dc)
     for name in TENSORS:
-        assert torch.equal(getattr(before, name), getattr(kept, name)), "the given scene stays"
+        assert torch.equal(getattr(before, name), getattr(unchanged, name)), "the given scene stays"
         if name != "sh_dc":
             assert torch.equal(getattr(after, name), getattr(before, name))
     if form in ("splats", "activated", "numpy", "parameters"):
@@ -95,9 +95,9 @@ def test_split_and_attenuated_results_have_the_form_of_the_scene(
     assert len(after) > len(before)
     alone = run(before, tiny_weights, refine=2, sh_attenuation=0.25)
     for name in TENSORS:
-        found, wanted = (held(getattr(each, name)) for each in (after, alone))
+        actual, wanted = (held(getattr(each, name)) for each in (after, alone))
         tolerance = 1e-5 if form == "activated" else 0  # exp and log round
-        torch.testing.assert_close(found, wanted, rtol=tolerance, atol=tolerance)
+        torch.testing.assert_close(actual, wanted, rtol=tolerance, atol=tolerance)
     if isinstance(given, dict):
         assert len(result["label"]) == len(after)
         assert set(result["label"]) == set(given["label"])
@@ -167,8 +167,8 @@ def test_numpy_arrays_are_accepted(tiny_weights: BackboneWeights) -> None:
     camera = Camera.from_matrix(view.world_to_camera.numpy(), K, view.width, view.height)
     image = (255 * style()).byte().permute(2, 0, 1).numpy()
     results = [
-        stylize(each, [views], picture, preset="preview", steps_sos=1, weights=tiny_weights)
-        for each, views, picture in ((arrays, camera, image), (scene, view, (255 * style()).byte() / 255))
+        stylize(each, [views], style_image, preset="preview", steps_sos=1, weights=tiny_weights)
+        for each, views, style_image in ((arrays, camera, image), (scene, view, (255 * style()).byte() / 255))
     ]
     assert torch.equal(results[0].sh_dc, results[1].sh_dc)
 
@@ -206,5 +206,5 @@ def test_planning_reports_its_progress(tiny_weights: BackboneWeights) -> None:
 
 def test_importing_the_package_imports_no_pytorch() -> None:
     code = "import sys, sgsst_core; print(sorted({'torch', 'numba', 'numpy', 'pydantic'} & set(sys.modules)))"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.strip() == "[]"

@@ -125,22 +125,22 @@ def test_region_of_everything_is_bit_identical_to_no_regions(tiny_weights: Backb
     whole = Regions(
         (Region("rest"), Region("all", style=Style.of(other_style()))), torch.ones(len(scene), dtype=torch.uint8)
     )
-    found, wanted = make(tiny_weights, scene, whole), make(tiny_weights, scene, None, other_style())
-    for stylizer in (found, wanted):
+    actual, wanted = make(tiny_weights, scene, whole), make(tiny_weights, scene, None, other_style())
+    for stylizer in (actual, wanted):
         run(stylizer)
-    assert torch.equal(found.stylized(), wanted.stylized())
-    assert [record.loss for record in found.history] == [record.loss for record in wanted.history]
+    assert torch.equal(actual.stylized(), wanted.stylized())
+    assert [record.loss for record in actual.history] == [record.loss for record in wanted.history]
 
 
 def test_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
     scene = wall()
     labels = torch.zeros(len(scene), dtype=torch.uint8)
     empty = Regions((Region("rest"), Region("empty", style=Style.of(other_style()))), labels)
-    found, wanted = make(tiny_weights, scene, empty), make(tiny_weights, scene, None)
-    for stylizer in (found, wanted):
+    actual, wanted = make(tiny_weights, scene, empty), make(tiny_weights, scene, None)
+    for stylizer in (actual, wanted):
         run(stylizer)
-    assert torch.equal(found.stylized(), wanted.stylized())
-    (line,) = [each for each in found.job.plan.decisions if each.item == "region empty"]
+    assert torch.equal(actual.stylized(), wanted.stylized())
+    (line,) = [each for each in actual.job.plan.decisions if each.item == "region empty"]
     assert line.decision == "warning: ignored, because it has no Gaussians"
 
 
@@ -151,9 +151,9 @@ def test_each_region_approaches_its_own_style(tiny_weights: BackboneWeights) -> 
     regions = halves(scene, right=Region("right", style=Style.of(bright)))
     stylizer = make(tiny_weights, scene, regions, dark, steps_sos=60, content_weight=0.0, early_stop=False)
     run(stylizer)
-    labels, found = regions.labels[stylizer.job.plan.seen], stylizer.stylized()[stylizer.job.plan.seen]
+    labels, stylized = regions.labels[stylizer.job.plan.seen], stylizer.stylized()[stylizer.job.plan.seen]
     far = scene.means[stylizer.job.plan.seen][:, 0].abs() > 0.5  # features at the border see both regions
-    left, right = (float((0.5 + 0.28209479 * found[(labels == place) & far]).mean()) for place in (0, 1))
+    left, right = (float((0.5 + 0.28209479 * stylized[(labels == place) & far]).mean()) for place in (0, 1))
     assert left < 0.4 < 0.6 < right
 
 
@@ -194,11 +194,11 @@ def test_unseen_gaussians_follow_their_own_region() -> None:
     weights = torch.tensor([1.0, 1, 0, 0, 0]).double()
     labels = torch.tensor([0, 1, 0, 1, 2], dtype=torch.uint8)
     regions = Regions((Region("rest"), Region("a"), Region("b", freeze=True)), labels)
-    found = neighbors_change_by_region(means, change, weights, regions)
-    assert found[2:, 0].tolist() == [1.0, 2.0, 0.0]
+    result = neighbors_change_by_region(means, change, weights, regions)
+    assert result[2:, 0].tolist() == [1.0, 2.0, 0.0]
     without = replace(regions, labels=torch.tensor([0, 0, 1, 0, 2], dtype=torch.uint8))
-    found = neighbors_change_by_region(means, change, weights, without)
-    assert found[2, 0] == 1.5  # nothing in its region is optimized
+    result = neighbors_change_by_region(means, change, weights, without)
+    assert result[2, 0] == 1.5  # nothing in its region is optimized
 
 
 def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
@@ -227,9 +227,9 @@ def test_fingerprint_depends_on_regions() -> None:
     right = regions.every[1]
     others = [replace(right, weight=2.0), replace(right, style=None), replace(right, freeze=True)]
     every = [None, regions, moved, *(replace(regions, every=(regions.every[0], other)) for other in others)]
-    found = [fingerprint(scene, views, style(), settings, "w", "", each) for each in every]
-    assert len(set(found)) == len(every)
-    assert found[0] == fingerprint(scene, views, style(), settings, "w")
+    fingerprints = [fingerprint(scene, views, style(), settings, "w", "", each) for each in every]
+    assert len(set(fingerprints)) == len(every)
+    assert fingerprints[0] == fingerprint(scene, views, style(), settings, "w")
 
 
 def test_float32_reference_has_the_same_regions(tiny_weights: BackboneWeights) -> None:

@@ -93,20 +93,20 @@ def test_resumed_run_is_bit_identical(tiny_weights: BackboneWeights, scene: Scen
     for _ in range(4):
         stopped.run_step()
     assert stopped.state().queue
-    kept = Checkpoint(stopped.state(), stopped.job.plan, 1, "run", versions())
-    save_checkpoint(tmp_path / "c.safetensors", kept, "job")
+    checkpoint = Checkpoint(stopped.state(), stopped.job.plan, 1, "run", versions())
+    save_checkpoint(tmp_path / "c.safetensors", checkpoint, "job")
     resumed = make(tiny_weights, scene, steps_sos=8)
     resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job").state)
     assert run(resumed) == "finished"
-    expected, found = whole.state(), resumed.state()
+    expected, actual = whole.state(), resumed.state()
     for name in ("sh_dc", "first_moment", "second_moment", "generator"):
-        assert torch.equal(getattr(expected, name), getattr(found, name)), name
-    assert expected.queue == found.queue
+        assert torch.equal(getattr(expected, name), getattr(actual, name)), name
+    assert expected.queue == actual.queue
     assert [replace(r, seconds=0, parts={}, memory=0) for r in expected.history] == [
-        replace(r, seconds=0, parts={}, memory=0) for r in found.history
+        replace(r, seconds=0, parts={}, memory=0) for r in actual.history
     ]
-    assert found.seconds > stopped.seconds
-    assert found.seconds_by_part["vgg_forward"] > stopped.seconds_by_part["vgg_forward"]
+    assert actual.seconds > stopped.seconds
+    assert actual.seconds_by_part["vgg_forward"] > stopped.seconds_by_part["vgg_forward"]
 
 
 def test_every_view_is_visited_once_per_round(tiny_weights: BackboneWeights, scene: Scene) -> None:
@@ -228,11 +228,11 @@ def test_result_is_cached_for_the_same_colors(tiny_weights: BackboneWeights, sce
     stylizer = make(tiny_weights, scene)
     first = stylizer.stylized()
     assert stylizer.stylized() is first
-    kept = stylizer.sh_dc.clone()
+    colors = stylizer.sh_dc.clone()
     with stylizer.with_colors(scene.sh_dc + 1):
         assert torch.equal(stylizer.stylized()[stylizer.job.plan.seen], scene.sh_dc[stylizer.job.plan.seen] + 1)
     assert stylizer.stylized() is first
-    assert torch.equal(stylizer.sh_dc, kept)
+    assert torch.equal(stylizer.sh_dc, colors)
     stylizer.run_step()
     second = stylizer.stylized()
     assert not torch.equal(second, first)
@@ -361,10 +361,10 @@ def test_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scen
     clock, events = (make(tiny_weights, scene) for _ in range(2))
     events.job.loss.timer = events.job.views.timer = Timer(event=ClockEvent)
     for _ in range(6):  # the last step is on all scales
-        expected, found = clock.run_step(), events.run_step()
-        assert found.parts.keys() == expected.parts.keys()
-        assert all(seconds > 0 for seconds in found.parts.values())
-        assert sum(found.parts.values()) < events.seconds
-        assert found.loss == expected.loss
+        expected, actual = clock.run_step(), events.run_step()
+        assert actual.parts.keys() == expected.parts.keys()
+        assert all(seconds > 0 for seconds in actual.parts.values())
+        assert sum(actual.parts.values()) < events.seconds
+        assert actual.loss == expected.loss
     assert events.seconds_by_part.keys() == clock.seconds_by_part.keys()
-    assert sum(found.parts.values()) > 0.5 * (events.seconds - events.history[-2].seconds)
+    assert sum(actual.parts.values()) > 0.5 * (events.seconds - events.history[-2].seconds)

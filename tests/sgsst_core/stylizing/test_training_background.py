@@ -75,8 +75,8 @@ def test_replaced_background_matches_a_render_with_it(scale: int) -> None:
     colors = torch.rand(len(scene), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     over, expected = (ReferenceRasterizer(scene, background=color).render(colors, camera) for color in (present, COLOR))
     coverage = ReferenceRasterizer(scene).coverage(camera)
-    found = replace_background(downscale(over, scale), downscale(coverage, scale), COLOR, present)
-    torch.testing.assert_close(found, downscale(expected, scale), rtol=0, atol=1e-12)
+    actual = replace_background(downscale(over, scale), downscale(coverage, scale), COLOR, present)
+    torch.testing.assert_close(actual, downscale(expected, scale), rtol=0, atol=1e-12)
     assert replace_background(over.float(), coverage.float(), COLOR, present).dtype == torch.float32
 
 
@@ -101,12 +101,12 @@ def test_step_gradient_matches_a_job_with_its_background(
         drawn.sh_dc += 0.3
         fixed.sh_dc.copy_(drawn.sh_dc)
     for _ in range(2):
-        found, loss = drawn_gradient(drawn, 1, scales, COLOR)
+        actual, loss = drawn_gradient(drawn, 1, scales, COLOR)
         expected, exact = drawn_gradient(fixed, 1, scales, None)
         assert loss.loss == pytest.approx(exact.loss, rel=1e-5)
         assert loss.terms[scales[-1]]["content"] == pytest.approx(exact.terms[scales[-1]]["content"], rel=1e-3)
         assert exact.terms[scales[-1]]["content"] > 0
-        assert relative_error(found, expected) < 1e-4
+        assert relative_error(actual, expected) < 1e-4
 
 
 def test_photos_get_the_color_in_uncovered_pixels(tiny_weights: BackboneWeights) -> None:
@@ -116,9 +116,9 @@ def test_photos_get_the_color_in_uncovered_pixels(tiny_weights: BackboneWeights)
     coverage = stylizer.job.view_targets.coverage(0)[0][..., None]
     content = coverage * photo + (1 - coverage) * torch.tensor(COLOR)
     expected = stylizer.job.loss.targets.of_view(content, coverage[..., 0]).content[0]
-    found = stylizer.job.view_targets.target(0, [0], COLOR).content[0]
+    actual = stylizer.job.view_targets.target(0, [0], COLOR).content[0]
     for tile, features in expected.items():
-        torch.testing.assert_close(found[tile], features, rtol=1e-4, atol=1e-2)
+        torch.testing.assert_close(actual[tile], features, rtol=1e-4, atol=1e-2)
 
 
 def test_losses_are_measured_on_the_fixed_background(tiny_weights: BackboneWeights) -> None:
@@ -164,9 +164,9 @@ def test_covered_scene_ignores_the_training_background(tiny_weights: BackboneWei
     for stylizer in (plain, automatic):
         run(stylizer)
     assert torch.equal(plain.sh_dc, automatic.sh_dc)
-    told = [[line.item for line in stylizer.job.plan.decisions] for stylizer in (plain, automatic)]
-    assert told[0] == told[1]
-    assert "training_background" not in told[0]
+    items = [[line.item for line in stylizer.job.plan.decisions] for stylizer in (plain, automatic)]
+    assert items[0] == items[1]
+    assert "training_background" not in items[0]
 
 
 def test_paper_preset_uses_a_fixed_background_for_scans(tiny_weights: BackboneWeights) -> None:

@@ -38,22 +38,22 @@ def test_weighted_mean_and_covariance_match_the_style(scale: float) -> None:
     style = 0.45 + 0.1 * synthetic_image(40, 50, seed=3).float()
     sh_dc = torch.randn(500, 3, generator=generator) @ torch.tensor([[1.0, 0.5, 0], [0, 1, 0.3], [0, 0, 0.2]])
     weights = scale * torch.rand(500, generator=generator, dtype=torch.float64) ** 4
-    found = moments(colors_of(with_moments(sh_dc, weights, Style.of(style))), weights)
+    actual = moments(colors_of(with_moments(sh_dc, weights, Style.of(style))), weights)
     pixels = style.reshape(-1, 3).double()
     wanted = moments(pixels, torch.ones(len(pixels), dtype=torch.float64))
-    torch.testing.assert_close(found[0], wanted[0], rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(found[1], wanted[1], rtol=1e-4, atol=1e-8)
+    torch.testing.assert_close(actual[0], wanted[0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(actual[1], wanted[1], rtol=1e-4, atol=1e-8)
 
 
 @pytest.mark.parametrize("start", [with_moments, warm_start])
 def test_matching_colors_are_unchanged(start: Start) -> None:
     style = synthetic_image(30, 30, seed=2).float()
     sh_dc = (style.reshape(-1, 3) - 0.5) / SH_C0
-    found = start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style))
+    started = start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style))
     if start is with_moments:
-        torch.testing.assert_close(found, sh_dc, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(started, sh_dc, rtol=1e-4, atol=1e-4)
     else:
-        torch.testing.assert_close(colors_of(found), colors_of(sh_dc), rtol=0, atol=0.06)
+        torch.testing.assert_close(colors_of(started), colors_of(sh_dc), rtol=0, atol=0.06)
 
 
 def test_dark_scene_gets_both_colors_of_a_bright_style() -> None:
@@ -62,20 +62,20 @@ def test_dark_scene_gets_both_colors_of_a_bright_style() -> None:
     style[:10] = torch.tensor([0.1, 0.2, 0.6])
     generator = torch.Generator().manual_seed(4)
     sh_dc = (0.2 * torch.rand(3000, 1, generator=generator) ** 4 - 0.5).expand(-1, 3) / SH_C0
-    found = colors_of(warm_start(sh_dc, torch.ones(3000, dtype=torch.float64), Style.of(style)))
-    blue = (found - style[0, 0]).norm(dim=1) < 0.1
-    white = (found - style[-1, 0]).norm(dim=1) < 0.1
+    colors = colors_of(warm_start(sh_dc, torch.ones(3000, dtype=torch.float64), Style.of(style)))
+    blue = (colors - style[0, 0]).norm(dim=1) < 0.1
+    white = (colors - style[-1, 0]).norm(dim=1) < 0.1
     assert float(blue.double().mean()) == pytest.approx(1 / 3, abs=0.02)
     assert float(white.double().mean()) == pytest.approx(2 / 3, abs=0.02)
 
 
 def test_style_images_count_by_their_weights() -> None:
     """Colors are as frequent as in the mixture, whatever the sizes of the images."""
-    pictures = [torch.full((8, 8, 3), 0.2), torch.full((300, 400, 3), 0.8)]
-    mixture = Style.weighted(pictures, [3.0, 1.0])
+    images = [torch.full((8, 8, 3), 0.2), torch.full((300, 400, 3), 0.8)]
+    mixture = Style.weighted(images, [3.0, 1.0])
     sh_dc = torch.randn(4000, 3, generator=torch.Generator().manual_seed(5))
-    found = colors_of(warm_start(sh_dc, torch.ones(4000, dtype=torch.float64), mixture))
-    assert float((found < 0.5).all(dim=1).double().mean()) == pytest.approx(0.75, abs=0.02)
+    colors = colors_of(warm_start(sh_dc, torch.ones(4000, dtype=torch.float64), mixture))
+    assert float((colors < 0.5).all(dim=1).double().mean()) == pytest.approx(0.75, abs=0.02)
 
 
 @pytest.mark.parametrize("start", [with_moments, warm_start])
@@ -94,8 +94,8 @@ def test_flat_scenes_and_styles_give_finite_colors_in_range(case: str, start: St
         style = torch.full((10, 10, 3), 0.25)
     else:
         style = torch.zeros((10, 10, 3))
-    found = colors_of(start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style)))
-    assert bool(found.isfinite().all())
-    assert -1e-6 <= float(found.min()) <= float(found.max()) <= 1 + 1e-6
+    colors = colors_of(start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style)))
+    assert bool(colors.isfinite().all())
+    assert -1e-6 <= float(colors.min()) <= float(colors.max()) <= 1 + 1e-6
     expected = style.reshape(-1, 3).double().mean(0)
-    torch.testing.assert_close(found.mean(0), expected, rtol=0, atol=0.06)  # clamping changes the mean slightly
+    torch.testing.assert_close(colors.mean(0), expected, rtol=0, atol=0.06)  # clamping changes the mean slightly

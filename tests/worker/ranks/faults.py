@@ -122,11 +122,11 @@ def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
 
 def shared_memory(processes: Iterable[psutil.Process]) -> set[Path]:
     """Return the shared memory files that these processes have mapped."""
-    found = set()
+    segments = set()
     for process in processes:
         with contextlib.suppress(psutil.Error):
-            found |= {Path(entry.path) for entry in process.memory_maps() if entry.path.startswith("/dev/shm/")}
-    return found
+            segments |= {Path(entry.path) for entry in process.memory_maps() if entry.path.startswith("/dev/shm/")}
+    return segments
 
 
 def folders(processes: Iterable[psutil.Process]) -> set[Path]:

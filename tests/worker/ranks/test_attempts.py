@@ -124,8 +124,8 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
     assert len(report["workers"]["ranks"]) == 2
     assert heard.previews
     for path in heard.previews:
-        with Image.open(path) as picture:
-            assert picture.format == "JPEG"
+        with Image.open(path) as image:
+            assert image.format == "JPEG"
     return loss_of(ended), request.out.read_bytes()
 
 

@@ -33,8 +33,8 @@ def test_several_ranks_match_one_rank(scene: Scene, values: dict[str, Any]) -> N
     values = {"steps_coarse": 2, "steps_sos": 4, "learning_rate": 0.01} | values
     expected = stylize(ALONE, scene, 3, values)
     for ranks in (2, 3):
-        found = on_ranks(ranks, stylize, scene, 3, values)
-        for result in found:
+        actual = on_ranks(ranks, stylize, scene, 3, values)
+        for result in actual:
             assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
             assert relative_error(result["colors"], expected["colors"]) < 1e-3
-            assert torch.equal(result["colors"], found[0]["colors"])
+            assert torch.equal(result["colors"], actual[0]["colors"])

@@ -86,8 +86,8 @@ def gradient(
     result = loss.evaluate(views.render(0, colors), targets, target, scales)
     assert result.image_gradient is not None
     assert target.division is not None
-    kept = loss.tiling.cached([tile.outer.pixels for tiles in target.division.tiles.values() for tile in tiles])
-    return views.gradient(0, result.image_gradient, colors), result.loss, kept
+    cached = loss.tiling.cached([tile.outer.pixels for tiles in target.division.tiles.values() for tile in tiles])
+    return views.gradient(0, result.image_gradient, colors), result.loss, cached
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
@@ -108,17 +108,17 @@ def test_gradient_matches_one_rank(
     camera = cameras(1, width, height)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, dtype, tile_size)
     results = on_ranks(ranks, gradient, scene, camera, dtype, tile_size)
-    for found, found_loss, _ in results:
-        assert relative_error(found, expected) < BOUNDS[dtype]
+    for actual, found_loss, _ in results:
+        assert relative_error(actual, expected) < BOUNDS[dtype]
         assert found_loss == pytest.approx(loss, rel=BOUNDS[dtype])
-        assert torch.equal(found, results[0][0])
+        assert torch.equal(actual, results[0][0])
 
 
 def test_division_by_speed_preserves_the_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, None)
-    for found, found_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
-        assert relative_error(found, expected) < 1e-9
+    for actual, found_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
+        assert relative_error(actual, expected) < 1e-9
         assert found_loss == pytest.approx(loss, rel=1e-9)
 
 
@@ -132,8 +132,8 @@ def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> No
     regions = Regions(every, labels.clamp(max=2))
     arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss, regions
     expected, loss, _ = gradient(ALONE, *arguments)
-    for found, found_loss, _ in on_ranks(3, gradient, *arguments):
-        assert relative_error(found, expected) < 1e-9
+    for actual, found_loss, _ in on_ranks(3, gradient, *arguments):
+        assert relative_error(actual, expected) < 1e-9
         assert found_loss == pytest.approx(loss, rel=1e-9)
 
 
@@ -143,8 +143,8 @@ def test_partly_cached_activations_preserve_the_gradient() -> None:
     memory = int(30_000 * FeatureNetwork(tiny_weights(), dtype=torch.float64).held_bytes_per_pixel())
     results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, memory)
     assert set(results[0][2]) == {True, False}
-    for found, found_loss, _ in results:
-        assert relative_error(found, expected) < 1e-9
+    for actual, found_loss, _ in results:
+        assert relative_error(actual, expected) < 1e-9
         assert found_loss == pytest.approx(loss, rel=1e-9)
 
 
@@ -154,8 +154,8 @@ def test_gradient_of_matched_features_matches_one_rank(style_loss: StyleLossName
     scene, camera = ball(), cameras(1, 128, 96)[0]
     arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss
     expected, loss, _ = gradient(ALONE, *arguments)
-    for found, found_loss, _ in on_ranks(3, gradient, *arguments):
-        assert relative_error(found, expected) < 1e-9
+    for actual, found_loss, _ in on_ranks(3, gradient, *arguments):
+        assert relative_error(actual, expected) < 1e-9
         assert found_loss == pytest.approx(loss, rel=1e-9)
 
 
@@ -201,9 +201,9 @@ def test_refinement_matches_one_rank() -> None:
     alone = on_a_rank(ALONE, 2.0)
     assert alone is not None
     assert alone.split > 0
-    for found in on_ranks(2, on_a_rank, 2.0):
-        assert torch.equal(found.pieces, alone.pieces)
-        assert found.psnr == pytest.approx(alone.psnr, abs=1e-6)
+    for refinement in on_ranks(2, on_a_rank, 2.0):
+        assert torch.equal(refinement.pieces, alone.pieces)
+        assert refinement.psnr == pytest.approx(alone.psnr, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -212,11 +212,11 @@ def test_several_views_per_step_do_not_depend_on_rank_count(ranks: int, views_pe
     scene = wall()
     values = {"steps_coarse": 2, "steps_sos": 4, "views_per_step": views_per_step, "learning_rate": 0.01}
     expected = stylize(ALONE, scene, 5, values)
-    found = on_ranks(ranks, stylize, scene, 5, values) if ranks > 1 else [expected]
-    for result in found:
+    actual = on_ranks(ranks, stylize, scene, 5, values) if ranks > 1 else [expected]
+    for result in actual:
         assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
         assert result["views"] == expected["views"]
-        assert torch.equal(result["colors"], found[0]["colors"])
+        assert torch.equal(result["colors"], actual[0]["colors"])
     assert expected["losses"] != stylize(ALONE, scene, 5, {**values, "views_per_step": 1})["losses"]
 
 

@@ -49,13 +49,13 @@ def shared(collectives: Collectives, path: Path, drop: bool) -> tuple[str, bool,
     again = read_scene(path, drop_invalid=drop).scene.sh_dc
     assert float((file.scene.sh_dc - again).abs().sum()) == pytest.approx(3.0)
     file.scene.sh_dc[0] = again[0]
-    found, dropped = digest(file.scene), file.dropped
+    digests, dropped = digest(file.scene), file.dropped
     del file
     gc.collect()
     left = sum(
         "memfd:sgsst-scene" in os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()
     )
-    return found, reader, dropped, maps, left
+    return digests, reader, dropped, maps, left
 
 
 @linux
@@ -65,13 +65,13 @@ def test_one_rank_reads_and_shares_the_scene(tmp_path: Path, drop: bool) -> None
     if drop:
         scene.opacities[7] = float("nan")
     write_scene(tmp_path / "scene.ply", scene)
-    found = on_ranks(3, shared, tmp_path / "scene.ply", drop)
+    results = on_ranks(3, shared, tmp_path / "scene.ply", drop)
     alone = digest(read_scene(tmp_path / "scene.ply", drop_invalid=drop).scene)
-    assert [rank[0] for rank in found] == [alone] * 3
-    assert [rank[1] for rank in found] == [True, False, False]
-    assert [rank[2] for rank in found] == [int(drop)] * 3
-    assert all(rank[3] >= 1 for rank in found), "not mapped"
-    assert [rank[4] for rank in found] == [0, 0, 0], "left behind"
+    assert [rank[0] for rank in results] == [alone] * 3
+    assert [rank[1] for rank in results] == [True, False, False]
+    assert [rank[2] for rank in results] == [int(drop)] * 3
+    assert all(rank[3] >= 1 for rank in results), "not mapped"
+    assert [rank[4] for rank in results] == [0, 0, 0], "left behind"
 
 
 @linux
@@ -79,9 +79,9 @@ def test_one_rank_reads_and_shares_the_scene(tmp_path: Path, drop: bool) -> None
 def test_compressed_scene_is_read_once(tmp_path: Path, format: SceneFormat) -> None:
     path = tmp_path / "scene"
     write_scene(path, wall(sh_degree=1), format)
-    found = on_ranks(2, shared, path, False)
-    assert [rank[0] for rank in found] == [digest(read_scene(path).scene)] * 2
-    assert [rank[1] for rank in found] == [True, False]
+    results = on_ranks(2, shared, path, False)
+    assert [rank[0] for rank in results] == [digest(read_scene(path).scene)] * 2
+    assert [rank[1] for rank in results] == [True, False]
 
 
 def test_compressed_scene_needs_memory_of_its_floats(tmp_path: Path) -> None:

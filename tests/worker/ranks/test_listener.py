@@ -22,7 +22,7 @@ class EventRecorder:
         self.relay = Relay(
             Listener(
                 planning=lambda now: self.events.append(("planning", now.fraction)),
-                prepared=lambda found: self.events.append(("prepared", found.step)),
+                prepared=lambda plan: self.events.append(("prepared", plan.step)),
                 progress=lambda now: self.events.append(("step", now.step)),
                 warn=lambda line: self.events.append(("warning", line)),
                 preview=lambda path: self.events.append(("preview", path.name)),

@@ -52,9 +52,9 @@ VALUES = [
 
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
 def test_values_round_trip(value: Any) -> None:
-    found = decode(encode(value))
-    assert found == value
-    assert repr(found) == repr(value)  # distinguishes -0.0 from 0.0, tuples from lists, and True from 1
+    decoded = decode(encode(value))
+    assert decoded == value
+    assert repr(decoded) == repr(value)  # distinguishes -0.0 from 0.0, tuples from lists, and True from 1
 
 
 def test_nan_round_trips() -> None:
@@ -65,26 +65,26 @@ def test_nan_round_trips() -> None:
 @pytest.mark.parametrize("shape", [(), (0, 3), (5, 3)])
 def test_tensors_round_trip_bit_identical(dtype: torch.dtype, shape: tuple[int, ...]) -> None:
     tensor = (torch.randn(shape, generator=torch.Generator().manual_seed(0)) * 100).to(dtype)
-    found = decode(encode({"tensor": tensor, "part": tensor.expand(2, *shape)}))
+    decoded = decode(encode({"tensor": tensor, "part": tensor.expand(2, *shape)}))
     for name, expected in (("tensor", tensor), ("part", tensor.expand(2, *shape))):
-        assert found[name].dtype == dtype
-        assert found[name].shape == expected.shape
-        assert torch.equal(found[name], expected)
+        assert decoded[name].dtype == dtype
+        assert decoded[name].shape == expected.shape
+        assert torch.equal(decoded[name], expected)
 
 
 def test_arrays_and_dataclasses_of_tensors_round_trip() -> None:
     camera = Camera("a.jpg", 8, 6, 5.0, 5.0, 4.0, 3.0, torch.eye(4, dtype=torch.float64))
-    found, kept = decode(encode((camera, np.array([True, False]))))
-    assert isinstance(found, Camera)
-    assert torch.equal(found.world_to_camera, camera.world_to_camera)
-    assert kept.dtype == np.bool_
-    assert kept.tolist() == [True, False]
+    decoded_camera, decoded_flags = decode(encode((camera, np.array([True, False]))))
+    assert isinstance(decoded_camera, Camera)
+    assert torch.equal(decoded_camera.world_to_camera, camera.world_to_camera)
+    assert decoded_flags.dtype == np.bool_
+    assert decoded_flags.tolist() == [True, False]
 
 
 def test_errors_keep_their_type() -> None:
-    found = decode(encode(SceneError("scene.ply: is empty.")))
-    assert type(found) is SceneError
-    assert found.args == ("scene.ply: is empty.",)
+    decoded = decode(encode(SceneError("scene.ply: is empty.")))
+    assert type(decoded) is SceneError
+    assert decoded.args == ("scene.ply: is empty.",)
 
 
 @pytest.mark.parametrize(

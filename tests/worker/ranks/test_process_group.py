@@ -46,8 +46,8 @@ def test_gpus_are_used_if_each_rank_has_one(
     with ThreadPoolExecutor(2) as ranks:
         devices = [torch.device("cpu") if gpu is None else torch.device("cuda", gpu) for gpu in gpus]
         meeting = [ranks.submit(_meet, rank, 2, address, device, patience) for rank, device in enumerate(devices)]
-        found = [met.result(60) for met in meeting]
-    assert [(device.type, shared) for device, shared, _ in found] == [(expected, sharing)] * 2
+        groups = [met.result(60) for met in meeting]
+    assert [(device.type, shared) for device, shared, _ in groups] == [(expected, sharing)] * 2
 
 
 def test_nccl_requires_one_rank_per_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,14 +103,14 @@ def test_merged_statistics_match_one_rank(empty: int | None) -> None:
     present = [features(rank).reshape(-1, 5) for rank in range(3) if rank != empty]
     expected = layer_statistics_reference(torch.cat(present)[None])
     for result in on_ranks(3, merge, empty):
-        for turn, (found, number) in enumerate(result):
+        for turn, (statistics, number) in enumerate(result):
             assert number == pytest.approx(1.5 * (turn + 1))
-            assert float(found.count) == float(expected.count)
-            assert relative_error(found.mean, expected.mean) < 1e-14
-            assert relative_error(found.std(), expected.std()) < 1e-10
-            assert relative_error(found.gram(), expected.gram()) < 1e-12
-            assert float(found.std()[2]) < 1e-12
-            assert float(found.std()[3]) == 0.0
+            assert float(statistics.count) == float(expected.count)
+            assert relative_error(statistics.mean, expected.mean) < 1e-14
+            assert relative_error(statistics.std(), expected.std()) < 1e-10
+            assert relative_error(statistics.gram(), expected.gram()) < 1e-12
+            assert float(statistics.std()[2]) < 1e-12
+            assert float(statistics.std()[3]) == 0.0
 
 
 def test_merged_empty_statistics_are_empty() -> None:
@@ -140,15 +140,15 @@ def values(collectives: Collectives) -> dict[str, Any]:
 
 def test_collectives_and_groups_follow_their_definitions() -> None:
     results = on_ranks(4, values)
-    for rank, found in enumerate(results):
-        assert found["all_gather"] == [0, 1, 2, 3]
-        assert found["broadcast"] == "made by 0"
-        assert found["same"]
-        assert not found["different"]
-        assert found["split"] == (rank % 2, 2, [0, 1] if rank < 2 else [2, 3])
-        assert found["first"] == ((rank, 2, [0, 1]) if rank < 2 else None)
-        assert found["all_reduce"] == 6.0
-        assert found["local"] == 4
+    for rank, result in enumerate(results):
+        assert result["all_gather"] == [0, 1, 2, 3]
+        assert result["broadcast"] == "made by 0"
+        assert result["same"]
+        assert not result["different"]
+        assert result["split"] == (rank % 2, 2, [0, 1] if rank < 2 else [2, 3])
+        assert result["first"] == ((rank, 2, [0, 1]) if rank < 2 else None)
+        assert result["all_reduce"] == 6.0
+        assert result["local"] == 4
 
 
 def fail_on_first(collectives: Collectives) -> str:

@@ -59,10 +59,10 @@ def test_nccl_gradient_matches_one_rank(name: str, tmp_path: Path, exact_convolu
     multiprocessing.spawn(  # type: ignore[attr-defined]
         run_rank, (size, address, name, str(tmp_path)), nprocs=size
     )
-    found = [torch.load(tmp_path / f"{rank}.pt") for rank in range(size)]
-    for own in found:
-        assert torch.equal(own, found[0])
-    assert relative_error(found[0], expected) < 1e-5
+    actual = [torch.load(tmp_path / f"{rank}.pt") for rank in range(size)]
+    for own in actual:
+        assert torch.equal(own, actual[0])
+    assert relative_error(actual[0], expected) < 1e-5
 
 
 def merge_during_other_work(rank: int, size: int, address: str, folder: str) -> None:
@@ -77,8 +77,8 @@ def merge_during_other_work(rank: int, size: int, address: str, folder: str) -> 
             for _ in range(20):
                 torch.randn(64, 64, dtype=torch.float64, device=f"cuda:{rank}")
         merged = [wait() for wait in waiting]
-        found = [(parts[0].count, parts[0].mean, parts[0].centered, numbers) for parts, numbers in merged]
-        torch.save([[value.cpu() for value in values] for values in found], Path(folder) / f"{rank}.pt")
+        sums = [(parts[0].count, parts[0].mean, parts[0].centered, numbers) for parts, numbers in merged]
+        torch.save([[value.cpu() for value in values] for values in sums], Path(folder) / f"{rank}.pt")
         link = probe_link(collectives, torch.device("cuda"))
         assert 1e8 < link.bandwidth < 1e13
         assert 0 < link.latency < 1

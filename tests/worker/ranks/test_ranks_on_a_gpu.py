@@ -56,7 +56,7 @@ def merge_three(collectives: Collectives) -> list[tuple[Tensor, Tensor]]:
     part = layer_statistics(own.to("cuda"))
     numbers = torch.ones(1, dtype=torch.float64, device="cuda")
     waiting = [collectives.all_reduce_statistics([part], numbers * turn) for turn in range(3)]
-    return [(found[0].gram().cpu(), added.cpu()) for found, added in (wait() for wait in waiting)]
+    return [(statistics[0].gram().cpu(), added.cpu()) for statistics, added in (wait() for wait in waiting)]
 
 
 def test_statistics_merge_on_their_own_stream() -> None:

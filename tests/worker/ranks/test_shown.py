@@ -42,20 +42,20 @@ def pixels(camera: Camera, seed: int) -> Tensor:
 
 def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[str, Any]:
     """Return color gradients [N, 3] of two visits, with exchanges of all values and of shown Gaussians' values only."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name, memory in (("whole", 0), ("shown", 1 << 30)):
         views = make_views(collectives, scene, camera, memory)
         colors = views.colors(0, scene.sh_dc)
         sent = [dict(collectives.sent)]
-        found[name] = []
+        results[name] = []
         for visit in range(2):
             own = pixels(camera, 10 * visit + collectives.rank)
-            found[name].append(views.gradient(0, own, colors))
+            results[name].append(views.gradient(0, own, colors))
             sent.append(dict(collectives.sent))
-        found[f"bytes {name}"] = [
+        results[f"bytes {name}"] = [
             {kind: after[kind] - before[kind] for kind in after} for before, after in itertools.pairwise(sent)
         ]
-    return found
+    return results
 
 
 def shown_of(scene: Scene, camera: Camera) -> Tensor:
@@ -82,13 +82,13 @@ def test_exchange_of_shown_gaussians_is_bit_identical_to_all(scene: Scene, heigh
     shown = int(shown_of(scene, camera).sum())
     assert 0 < shown < 0.7 * len(scene)
     results = on_ranks(2, both_ways, scene, camera)
-    for found in results:
-        for whole, packed, first in zip(found["whole"], found["shown"], results[0]["shown"], strict=True):
+    for result in results:
+        for whole, packed, first in zip(result["whole"], result["shown"], results[0]["shown"], strict=True):
             assert packed.any()
             assert torch.equal(whole, packed)
             assert torch.equal(packed, first)
-        assert [sent["gradient"] for sent in found["bytes whole"]] == [12 * len(scene)] * 2
-        assert [sent["gradient"] for sent in found["bytes shown"]] == [len(scene) + 12 * shown, 12 * shown]
+        assert [sent["gradient"] for sent in result["bytes whole"]] == [12 * len(scene)] * 2
+        assert [sent["gradient"] for sent in result["bytes shown"]] == [len(scene) + 12 * shown, 12 * shown]
 
 
 def test_lower_band_shows_no_gaussians() -> None:
@@ -104,8 +104,8 @@ def test_four_ranks_differ_by_rounding_only() -> None:
     """The index of a value determines the rank at which the ring starts to add, so only the rounding differs."""
     scene, camera = wall(), cameras(1, WIDTH, HEIGHT)[0]
     results = on_ranks(4, both_ways, scene, camera)
-    for found in results:
-        for whole, packed, first in zip(found["whole"], found["shown"], results[0]["shown"], strict=True):
+    for result in results:
+        for whole, packed, first in zip(result["whole"], result["shown"], results[0]["shown"], strict=True):
             assert relative_error(packed, whole) < 1e-6
             assert torch.equal(packed, first)
             assert torch.equal(packed == 0, whole == 0)
@@ -114,10 +114,10 @@ def test_four_ranks_differ_by_rounding_only() -> None:
 def test_whole_gradient_is_sent_if_nearly_all_is_shown() -> None:
     camera = cameras(1, WIDTH, HEIGHT)[0]
     scene = wall().subset(shown_of(wall(), camera))
-    for found in on_ranks(2, both_ways, scene, camera):
-        for whole, packed in zip(found["whole"], found["shown"], strict=True):
+    for result in on_ranks(2, both_ways, scene, camera):
+        for whole, packed in zip(result["whole"], result["shown"], strict=True):
             assert torch.equal(whole, packed)
-        assert [sent["gradient"] for sent in found["bytes shown"]] == [13 * len(scene), 12 * len(scene)]
+        assert [sent["gradient"] for sent in result["bytes shown"]] == [13 * len(scene), 12 * len(scene)]
 
 
 def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
@@ -162,10 +162,10 @@ def test_step_record_has_sent_bytes() -> None:
     """Each of two ranks sends twice half of what they add, and twice its half of the image."""
     layer = CHANNELS + 1 + CHANNELS * (CHANNELS + 1) // 2
     statistics = 8 * (len(STYLE_LAYERS) * layer + len(TERMS))
-    for found in on_ranks(2, run_two_steps):
-        assert found["shown"] == int(shown_of(wall(), cameras(1, WIDTH, HEIGHT)[0]).sum())
-        assert found["steps"][1] == {
+    for result in on_ranks(2, run_two_steps):
+        assert result["shown"] == int(shown_of(wall(), cameras(1, WIDTH, HEIGHT)[0]).sum())
+        assert result["steps"][1] == {
             "image": 12 * WIDTH * HEIGHT,
-            "statistics": found["scales"] * statistics,
-            "gradient": 12 * found["shown"],
+            "statistics": result["scales"] * statistics,
+            "gradient": 12 * result["shown"],
         }

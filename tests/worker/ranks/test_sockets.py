@@ -27,13 +27,13 @@ pytestmark = [
 
 def listening(process: psutil.Process) -> list[str]:
     """Return the addresses on which a process accepts connections or datagrams."""
-    found = []
+    sockets = []
     for socket in process.net_connections("inet"):
         if socket.status == psutil.CONN_LISTEN or (socket.type.name == "SOCK_DGRAM" and not socket.raddr):
             address = ip_address(socket.laddr.ip)
             mapped = address.ipv4_mapped if isinstance(address, IPv6Address) else None
-            found.append(str(mapped or address))
-    return found
+            sockets.append(str(mapped or address))
+    return sockets
 
 
 @pytest.mark.slow
@@ -46,11 +46,13 @@ def test_single_machine_job_listens_on_loopback_only(tmp_path: Path, tiny_instal
     finally:
         process.terminate()
         process.communicate(timeout=120)
-    ranks = [found for name, found in sockets.items() if "RankProcess" in name]
-    assert [len(found) >= 2 for found in ranks] == [True, True], f"ranks without sockets of their group: {sockets}"
+    ranks = [addresses for name, addresses in sockets.items() if "RankProcess" in name]
+    assert [len(addresses) >= 2 for addresses in ranks] == [True, True], (
+        f"ranks without sockets of their group: {sockets}"
+    )
     for daemon in ("raylet", "gcs_server"):
-        assert any(daemon in name and found for name, found in sockets.items()), sockets
-    elsewhere = {name: found for name, found in sockets.items() if not all(map(_is_loopback, found))}
+        assert any(daemon in name and addresses for name, addresses in sockets.items()), sockets
+    elsewhere = {name: addresses for name, addresses in sockets.items() if not all(map(_is_loopback, addresses))}
     assert elsewhere == {}
 
 

@@ -48,10 +48,10 @@ def gsply_of(scene: Scene) -> gsply.GSData:
     )
 
 
-def assert_close(found: Scene, expected: Scene, *, opacities: float = 1.1e-3, others: float = 3e-6) -> None:
+def assert_close(actual: Scene, expected: Scene, *, opacities: float = 1.1e-3, others: float = 3e-6) -> None:
     """Assert that scenes are equal up to rounding and the sign of quaternions, and that opacities are finite."""
     for name in TENSORS:
-        first, second = getattr(found, name).double(), getattr(expected, name).double()
+        first, second = getattr(actual, name).double(), getattr(expected, name).double()
         tolerance = others
         if name == "quats":
             first, second = (torch.nn.functional.normalize(each, dim=1) for each in (first, second))
@@ -175,9 +175,9 @@ def check_documents(path: Path, document: Any, make: Callable[[Any], bytes]) -> 
     assert max(lengths) < len(str(path)) + 1000
 
 
-def _keys(value: Any, found: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def _keys(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Yield the keys that lead to each value within a JSON value; of lists, the first values."""
-    yield found
+    yield path
     children = value if isinstance(value, dict) else range(min(len(value), 4)) if isinstance(value, list) else ()
     for key in children:
-        yield from _keys(value[key], (*found, key))
+        yield from _keys(value[key], (*path, key))

@@ -8,8 +8,8 @@ from scipy.cluster.vq import kmeans2
 from sgsst_core.files.formats.codebooks import VALUES, nearest_entries, palette, value_codebook
 
 
-def error(rows: np.ndarray, found: np.ndarray) -> float:
-    return float(((rows.astype(np.float64) - found) ** 2).mean())
+def error(rows: np.ndarray, approximations: np.ndarray) -> float:
+    return float(((rows.astype(np.float64) - approximations) ** 2).mean())
 
 
 def test_few_distinct_values_are_stored_exactly() -> None:

@@ -36,23 +36,23 @@ def test_gsply_files_are_read_as_by_gsply(tmp_path: Path, degree: int) -> None:
     data = gsply_of(cloud(700, degree=degree))
     write_compressed(path, data.means, data.scales, data.quats, data.opacities, data.sh0, data.shN)
     assert read_scene_header(path).format is COMPRESSED_PLY
-    found, reference = read_scene(path), read_compressed(path)
-    assert found.scene.sh_degree == degree
+    actual, reference = read_scene(path), read_compressed(path)
+    assert actual.scene.sh_degree == degree
     # gsply places the first and last level of SH coefficients in the middle of their steps instead of at the ends.
     expected = scene_of(reference)
-    assert_close(replace(found.scene, sh_rest=expected.sh_rest), expected)
+    assert_close(replace(actual.scene, sh_rest=expected.sh_rest), expected)
     rest = held(expected.sh_rest)
     inner = rest.abs() < 3.98
-    torch.testing.assert_close(held(found.scene.sh_rest)[inner], rest[inner], rtol=0, atol=1e-6)
+    torch.testing.assert_close(held(actual.scene.sh_rest)[inner], rest[inner], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gsply_reads_written_files(tmp_path: Path, degree: int) -> None:
     path = tmp_path / "scene"
     write_scene(path, cloud(700, degree=degree), COMPRESSED_PLY)
-    found = read_scene(path).scene
-    assert found.sh_degree == degree
-    assert_close(found, scene_of(read_compressed(path)))
+    loaded = read_scene(path).scene
+    assert loaded.sh_degree == degree
+    assert_close(loaded, scene_of(read_compressed(path)))
 
 
 def test_files_without_color_bounds_are_read(tmp_path: Path) -> None:
@@ -61,12 +61,12 @@ def test_files_without_color_bounds_are_read(tmp_path: Path) -> None:
     scene = replace(wall(), sh_dc=torch.zeros(616, 3))
     write_scene(path, scene, COMPRESSED_PLY)
     ply = PlyData.read(str(path), mmap=False)
-    kept = [name for name in ply["chunk"].data.dtype.names if name[-1] not in "rgb"]
-    chunk = PlyElement.describe(np.array(ply["chunk"].data[kept].tolist(), [(name, "<f4") for name in kept]), "chunk")
+    names = [name for name in ply["chunk"].data.dtype.names if name[-1] not in "rgb"]
+    chunk = PlyElement.describe(np.array(ply["chunk"].data[names].tolist(), [(name, "<f4") for name in names]), "chunk")
     ply["vertex"].data["packed_color"] = 0xFF008080
     PlyData([chunk, ply["vertex"]], byte_order="<").write(str(path))
-    found = read_scene(path).scene
-    assert (0.5 + 0.28209479177387814 * found.sh_dc[0]).tolist() == pytest.approx([1, 0, 128 / 255], abs=1e-6)
+    loaded = read_scene(path).scene
+    assert (0.5 + 0.28209479177387814 * loaded.sh_dc[0]).tolist() == pytest.approx([1, 0, 128 / 255], abs=1e-6)
 
 
 def test_neighbors_share_bounds(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_non_finite_bounds_are_refused_or_dropped(tmp_path: Path) -> None:
     start = data.index(b"end_header\n") + len(b"end_header\n")
     changed = data[:start] + struct.pack("<f", float("nan")) + data[start + 4 :]
     refused(tmp_path, changed, r"256 of 616 Gaussians hold NaN or infinite values: x \(256 NaN\).*--drop-invalid")
-    kept = read_scene(tmp_path / "scene.ply", drop_invalid=True)
-    assert (len(kept.scene), kept.dropped) == (360, 256)
-    write_stylized(kept, tmp_path / "out.ply", torch.zeros(360, 3))
+    loaded = read_scene(tmp_path / "scene.ply", drop_invalid=True)
+    assert (len(loaded.scene), loaded.dropped) == (360, 256)
+    write_stylized(loaded, tmp_path / "out.ply", torch.zeros(360, 3))
     assert len(read_scene(tmp_path / "out.ply").scene) == 360

@@ -17,9 +17,9 @@ from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
 
 def matrix(scale: float = 1.0) -> np.ndarray:
-    found = rotated_pose(2.1).numpy()
-    found[:3, :3] *= scale
-    return found
+    pose = rotated_pose(2.1).numpy()
+    pose[:3, :3] *= scale
+    return pose
 
 
 def applied(frame: Frame, scene: Scene) -> Scene:

@@ -102,11 +102,11 @@ def test_values_match_those_computed_by_hand(tmp_path: Path) -> None:
 def test_written_values_round_trip(tmp_path: Path, degree: int) -> None:
     scene = cloud(500, degree=degree)
     write_scene(tmp_path / "scene.glb", scene, GLB)
-    found = read_scene(tmp_path / "scene.glb").scene
-    assert_close(found, scene, opacities=1e-6)
+    loaded = read_scene(tmp_path / "scene.glb").scene
+    assert_close(loaded, scene, opacities=1e-6)
     for name in ("means", "sh_dc", "sh_rest"):
-        assert torch.equal(getattr(found, name), getattr(scene, name)), name
-    torch.testing.assert_close(found.opacities, scene.opacities, rtol=1e-5, atol=1e-2)
+        assert torch.equal(getattr(loaded, name), getattr(scene, name)), name
+    torch.testing.assert_close(loaded.opacities, scene.opacities, rtol=1e-5, atol=1e-2)
 
 
 def test_document_follows_the_specification(tmp_path: Path) -> None:
@@ -142,10 +142,10 @@ def test_extreme_sizes_and_opacities_are_written_finite(tmp_path: Path) -> None:
     scene.scales[:20], scene.scales[20:] = -200, 200
     scene.opacities[:20], scene.opacities[20:] = -1000, 1000
     write_scene(tmp_path / "scene.glb", scene, GLB)
-    found = read_scene(tmp_path / "scene.glb")
-    assert not found.clamped
-    assert found.scene.scales.abs().amin() > 86
-    assert found.scene.opacities.abs().amin() > 16
+    loaded = read_scene(tmp_path / "scene.glb")
+    assert not loaded.clamped
+    assert loaded.scene.scales.abs().amin() > 86
+    assert loaded.scene.opacities.abs().amin() > 16
 
 
 def test_node_transformations_are_applied(tmp_path: Path) -> None:

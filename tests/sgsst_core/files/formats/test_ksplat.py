@@ -19,8 +19,8 @@ from tests.sgsst_core.splat_scenes import cloud
 
 def scene(degree: int = 2, count: int = 700) -> Scene:
     """Return a scene whose values have the range of the format."""
-    found = cloud(count, degree=degree)
-    return replace(found, sh_dc=found.sh_dc.clamp(-1.7, 1.7), sh_rest=held(found.sh_rest).clamp(-1.4, 1.4))
+    expected = cloud(count, degree=degree)
+    return replace(expected, sh_dc=expected.sh_dc.clamp(-1.7, 1.7), sh_rest=held(expected.sh_rest).clamp(-1.4, 1.4))
 
 
 def read(tmp_path: Path, data: bytes) -> Scene:
@@ -34,13 +34,13 @@ def read(tmp_path: Path, data: bytes) -> Scene:
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_all_compression_levels_are_read(tmp_path: Path, level: int, degree: int) -> None:
     expected = scene(degree)
-    found = read(tmp_path, ksplat(expected, level))
-    assert found.sh_degree == degree
-    colors = replace(found, sh_dc=expected.sh_dc, opacities=expected.opacities)
-    assert float((found.sh_dc - expected.sh_dc).abs().max()) <= 0.5 / 255 / 0.282 * 1.01
-    assert float((found.opacities.sigmoid() - expected.opacities.sigmoid()).abs().max()) < 0.51 / 255
+    actual = read(tmp_path, ksplat(expected, level))
+    assert actual.sh_degree == degree
+    colors = replace(actual, sh_dc=expected.sh_dc, opacities=expected.opacities)
+    assert float((actual.sh_dc - expected.sh_dc).abs().max()) <= 0.5 / 255 / 0.282 * 1.01
+    assert float((actual.opacities.sigmoid() - expected.opacities.sigmoid()).abs().max()) < 0.51 / 255
     if level == 2 and degree:
-        assert float((held(found.sh_rest) - held(expected.sh_rest)).abs().max()) <= 1.5 / 255 * 1.01
+        assert float((held(actual.sh_rest) - held(expected.sh_rest)).abs().max()) <= 1.5 / 255 * 1.01
         colors = replace(colors, sh_rest=expected.sh_rest)
     assert_close(colors, expected, others=1e-3 if level else 1e-6)
 
@@ -53,12 +53,12 @@ def test_values_match_those_computed_by_hand(tmp_path: Path) -> None:
     rows = b"".join(
         struct.pack("<3H3e4e4B", *steps, 1, 2, 0, 1, 0, 0, 0, 0, 255, 51, 128) for steps in ((4, 5, 0), (8, 4, 3))
     )
-    found = read(tmp_path, head + section + buckets + rows + bytes(48))
-    assert found.means.tolist() == [[10, 21, 26], [-6, -20, -31]]
-    torch.testing.assert_close(found.scales[0].exp(), torch.tensor([1.0, 2, 2.0**-25]))
-    assert found.quats.tolist() == [[1, 0, 0, 0]] * 2
-    torch.testing.assert_close(0.5 + 0.28209479 * found.sh_dc[1], torch.tensor([0, 1, 0.2]))
-    torch.testing.assert_close(found.opacities[0].sigmoid(), torch.tensor(128 / 255))
+    result = read(tmp_path, head + section + buckets + rows + bytes(48))
+    assert result.means.tolist() == [[10, 21, 26], [-6, -20, -31]]
+    torch.testing.assert_close(result.scales[0].exp(), torch.tensor([1.0, 2, 2.0**-25]))
+    assert result.quats.tolist() == [[1, 0, 0, 0]] * 2
+    torch.testing.assert_close(0.5 + 0.28209479 * result.sh_dc[1], torch.tensor([0, 1, 0.2]))
+    torch.testing.assert_close(result.opacities[0].sigmoid(), torch.tensor(128 / 255))
 
 
 def test_sections_of_different_sh_degree_are_read(tmp_path: Path) -> None:
@@ -69,11 +69,11 @@ def test_sections_of_different_sh_degree_are_read(tmp_path: Path) -> None:
     struct.pack_into("<IIII", head, 4, 3, 3, 500, 500)
     empty = bytes(1024)
     data = bytes(head) + one[4096:5120] + empty + other[4096:5120] + one[5120:] + other[5120:]
-    found = read(tmp_path, data)
-    assert (len(found), found.sh_degree) == (500, 2)
-    assert not held(found.sh_rest)[300:].any()
+    actual = read(tmp_path, data)
+    assert (len(actual), actual.sh_degree) == (500, 2)
+    assert not held(actual.sh_rest)[300:].any()
     expected = torch.cat([read(tmp_path, each).means for each in (one, other)])
-    assert torch.equal(found.means, expected)
+    assert torch.equal(actual.means, expected)
 
 
 def test_standard_deviations_of_0_are_refused(tmp_path: Path) -> None:

@@ -35,13 +35,13 @@ def test_written_ply_is_bit_identical_to_plyfile(tmp_path: Path) -> None:
 
 def table(scene: Scene) -> dict[str, np.ndarray]:
     """Return the usual properties of a scene, float32, by name."""
-    found = dict(zip("xyz", scene.means.numpy().T, strict=True))
-    found |= {f"f_dc_{i}": values for i, values in enumerate(scene.sh_dc.numpy().T)}
+    columns = dict(zip("xyz", scene.means.numpy().T, strict=True))
+    columns |= {f"f_dc_{i}": values for i, values in enumerate(scene.sh_dc.numpy().T)}
     rest = held(scene.sh_rest).transpose(1, 2).reshape(len(scene), -1).numpy()
-    found |= {f"f_rest_{i}": values for i, values in enumerate(rest.T)}
-    found["opacity"] = scene.opacities.numpy()
-    found |= {f"scale_{i}": values for i, values in enumerate(scene.scales.numpy().T)}
-    return found | {f"rot_{i}": values for i, values in enumerate(scene.quats.numpy().T)}
+    columns |= {f"f_rest_{i}": values for i, values in enumerate(rest.T)}
+    columns["opacity"] = scene.opacities.numpy()
+    columns |= {f"scale_{i}": values for i, values in enumerate(scene.scales.numpy().T)}
+    return columns | {f"rot_{i}": values for i, values in enumerate(scene.quats.numpy().T)}
 
 
 def save(path: Path, columns: dict[str, np.ndarray], text: bool = False) -> None:

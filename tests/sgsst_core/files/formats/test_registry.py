@@ -59,11 +59,11 @@ def test_scenes_of_any_format_become_stylized_plys(tmp_path: Path, format: Scene
     source = read_scene(path)
     colors = torch.randn(616, 3, generator=torch.Generator().manual_seed(1))
     write_stylized(source, out, colors)
-    found = read_scene(out)
-    assert found.format == "ply"
-    assert torch.equal(found.scene.sh_dc, colors)
+    loaded = read_scene(out)
+    assert loaded.format == "ply"
+    assert torch.equal(loaded.scene.sh_dc, colors)
     for name in ("means", "quats", "scales", "opacities", "sh_rest"):
-        assert torch.equal(getattr(found.scene, name), getattr(source.scene, name)), name
+        assert torch.equal(getattr(loaded.scene, name), getattr(source.scene, name)), name
 
 
 def test_sh_bands_of_zeros_are_omitted(tmp_path: Path) -> None:

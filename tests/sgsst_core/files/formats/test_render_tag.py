@@ -79,10 +79,10 @@ def test_doubtful_comments_give_warnings(tmp_path: Path) -> None:
 def test_written_files_state_the_render_mode(tmp_path: Path, format: SceneFormat, rendering: Rendering) -> None:
     path = tmp_path / "scene.any"
     write_scene(path, replace(wall(sh_degree=1), rendering=rendering), format)
-    found = read_scene(path).scene.rendering
+    loaded = read_scene(path).scene.rendering
     if format.name.endswith("spz"):  # has a flag for antialiased scenes only
         rendering = AA if rendering.antialiased else CLASSIC
-    assert found == rendering
+    assert loaded == rendering
 
 
 @pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
@@ -124,8 +124,8 @@ def stylized(file: SceneFile, target: Path) -> SceneFile:
 @pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
 def test_stylized_ply_keeps_the_render_mode_of_its_source(tmp_path: Path, newline: bytes) -> None:
     path = ply(tmp_path, "Exported from Brush", "SplatRenderMode: mip", newline=newline)
-    found = stylized(read_scene(path), tmp_path / "out.ply")
-    assert found.scene.rendering == MIP
+    loaded = stylized(read_scene(path), tmp_path / "out.ply")
+    assert loaded.scene.rendering == MIP
     size = path.read_bytes().index(b"end_header")
     assert (tmp_path / "out.ply").read_bytes()[:size] == path.read_bytes()[:size]
 
@@ -138,10 +138,10 @@ def test_stylized_ply_states_the_requested_render_mode(
 ) -> None:
     mode: RenderMode = "antialiased" if rendering.antialiased else "classic"
     file = read_scene(ply(tmp_path, *comments, newline=newline)).rendered(mode, rendering.eps2d)
-    found = stylized(file, tmp_path / "out.ply")
-    assert found.scene.rendering == file.scene.rendering == rendering
-    assert torch.equal(found.scene.means, file.scene.means)
-    again = stylized(found, tmp_path / "again.ply")
+    result = stylized(file, tmp_path / "out.ply")
+    assert result.scene.rendering == file.scene.rendering == rendering
+    assert torch.equal(result.scene.means, file.scene.means)
+    again = stylized(result, tmp_path / "again.ply")
     assert again.scene.rendering == rendering
 
 
@@ -150,8 +150,8 @@ def test_requested_mode_is_stated_when_gaussians_are_dropped(tmp_path: Path) -> 
     scene.means[3] = torch.nan
     write_scene(tmp_path / "scene.ply", scene)
     file = read_scene(tmp_path / "scene.ply", drop_invalid=True).rendered("antialiased", None)
-    found = stylized(file, tmp_path / "out.ply")
-    assert (len(found.scene), found.scene.rendering) == (len(scene) - 1, AA)
+    result = stylized(file, tmp_path / "out.ply")
+    assert (len(result.scene), result.scene.rendering) == (len(scene) - 1, AA)
 
 
 def test_plys_from_other_formats_keep_the_render_mode(tmp_path: Path) -> None:

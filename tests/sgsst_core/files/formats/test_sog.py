@@ -130,10 +130,10 @@ def test_new_colors_change_only_one_image(tmp_path: Path) -> None:
 def test_transparent_gaussians_keep_their_colors(tmp_path: Path) -> None:
     scene = replace(wall(), opacities=torch.full((616,), -1e4))
     write_scene(tmp_path / "scene", scene, SOG)
-    found = read_scene(tmp_path / "scene").scene
-    order, other = (each.means[:, 0].double().argsort() for each in (scene, found))
-    assert float(found.sh_dc.std()) > 0.01
-    assert float((scene.sh_dc[order].mean(dim=0) - found.sh_dc[other].mean(dim=0)).abs().max()) < 0.01
+    loaded = read_scene(tmp_path / "scene").scene
+    order, other = (each.means[:, 0].double().argsort() for each in (scene, loaded))
+    assert float(loaded.sh_dc.std()) > 0.01
+    assert float((scene.sh_dc[order].mean(dim=0) - loaded.sh_dc[other].mean(dim=0)).abs().max()) < 0.01
 
 
 def changed(**values: Any) -> bytes:

@@ -60,9 +60,9 @@ def test_gsply_files_are_read_as_by_gsply(tmp_path: Path, degree: int, version: 
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=degree)), version=version)
     assert read_scene_header(path).format is (SPZ if version == 3 else SPZ_4)
-    found = read_scene(path)
-    assert found.scene.sh_degree == degree
-    assert_close(found.scene, scene_of(read_spz(path)))
+    loaded = read_scene(path)
+    assert loaded.scene.sh_degree == degree
+    assert_close(loaded.scene, scene_of(read_spz(path)))
     assert_close(rotated(read_scene(path, spz_axes="rub").scene), scene_of(read_spz(path)))
 
 
@@ -71,9 +71,9 @@ def test_gsply_files_are_read_as_by_gsply(tmp_path: Path, degree: int, version: 
 def test_gsply_reads_written_files(tmp_path: Path, degree: int, format: SceneFormat) -> None:
     path = tmp_path / "scene"
     write_scene(path, cloud(700, degree=degree), format)
-    found = read_scene(path).scene
-    assert found.sh_degree == degree
-    assert_close(found, scene_of(read_spz(path)))
+    loaded = read_scene(path).scene
+    assert loaded.sh_degree == degree
+    assert_close(loaded, scene_of(read_spz(path)))
 
 
 def axes_record(number: int) -> bytes:
@@ -100,8 +100,8 @@ def test_stated_axes_are_followed_unless_others_are_requested(tmp_path: Path, ve
     other = struct.pack("<II", 0x12340001, 5) + bytes(5)
     for number, rub in ((6, False), (4, True), (0, True)):
         path.write_bytes(with_records(data, other + axes_record(number)))
-        found = read_scene(path).scene
-        assert_close(rotated(found) if rub else found, plain)
+        loaded = read_scene(path).scene
+        assert_close(rotated(loaded) if rub else loaded, plain)
         assert_close(read_scene(path, spz_axes="rdf").scene, plain)
         assert_close(rotated(read_scene(path, spz_axes="rub").scene), plain)
 
