@@ -37,6 +37,7 @@ COLUMNS = (
     "color_distance",
     "sliced",
     "content",
+    "dists",
     "background_sensitivity",
     "seconds",
 )

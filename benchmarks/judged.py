@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.machine import add_pair
+from sgsst_core.quality.dists import load_dists_or_none
 from sgsst_core.quality.judge import Judge
 from sgsst_core.report.contact_sheet import write_rows
 
@@ -21,10 +22,11 @@ UNSTYLIZED = "unstylized"
 
 
 def judged(judge: Judge, sh_dc: Tensor) -> dict[str, float]:
-    """Return the judgment of colors [N, 3], without measures that no view allows."""
-    judgment = judge.judge(sh_dc)
+    """Return the judgment of colors [N, 3] and, if installed, their DISTS, without measures that no view allows."""
+    judgment, dists = judge.judge(sh_dc), load_dists_or_none()
     assert judgment is not None, "no view can be judged: give more cameras, or larger views"
-    return {name: value for name, value in asdict(judgment).items() if value is not None}
+    measures = {**asdict(judgment), "dists": judge.dists(dists, sh_dc) if dists else None}
+    return {name: value for name, value in measures.items() if value is not None}
 
 
 def compare_rows(

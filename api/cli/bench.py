@@ -142,7 +142,16 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 def quality_table(quality: Quality) -> Table:
     """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
     figures = ("style", "interior_style", "sliced_features", "color_distance", "content", "features")
-    columns = (*figures, "background_sensitivity", "saturated", "short RMSE", "long RMSE", "remaining loss", "steps")
+    columns = (
+        *figures,
+        "DISTS",
+        "background_sensitivity",
+        "saturated",
+        "short RMSE",
+        "long RMSE",
+        "remaining loss",
+        "steps",
+    )
     table = Table(
         Column("", no_wrap=True),
         *columns,
@@ -155,7 +164,7 @@ def quality_table(quality: Quality) -> Table:
             outcome.name + (" *" if outcome in front else ""),
             *(_number(value) for value in (one.style, one.interior_style, one.sliced_features)),
             f"{one.color_distance:.0f}",
-            *(f"{value:.3f}" for value in (one.content, one.features, one.background_sensitivity)),
+            *(_number(value) for value in (one.content, one.features, outcome.dists, one.background_sensitivity)),
             f"{one.saturated:.1%}",
             *(_number(drift.rmse if drift else None) for drift in (outcome.short, outcome.long)),
             _number(outcome.loss),

@@ -21,6 +21,7 @@ from sgsst_core.budget import measuring_memory
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.consistency import Consistency
+from sgsst_core.quality.dists import load_dists_or_none
 from sgsst_core.quality.exact import ExactLoss, rasterizer_beside
 from sgsst_core.quality.judge import Judge, Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
@@ -51,6 +52,7 @@ class Outcome:
         sh_dc: Colors [N, 3].
         judgment: Judgment on the novel views.
         short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
+        dists: DISTS against the unstylized scene; None if it is not installed.
         loss: Remaining loss, relative to the unstylized scene; None if it was not measured.
         steps: Number of steps.
         seconds: Seconds of optimization.
@@ -62,6 +64,7 @@ class Outcome:
     judgment: Judgment
     short: Consistency | None
     long: Consistency | None
+    dists: float | None = None
     loss: float | None = None
     steps: int = 0
     seconds: float = 0.0
@@ -76,6 +79,7 @@ class Outcome:
             "steps": self.steps,
             "seconds": self.seconds,
             **asdict(self.judgment),
+            "dists": self.dists,
             "consistency": {
                 name: {"rmse": values.rmse, "lpips": values.lpips, "pairs": len(values.pairs)} if values else None
                 for name, values in ranges.items()
@@ -157,13 +161,14 @@ def compare_quality(
             "no view between the cameras can be judged: neighboring cameras are too far apart, or views are smaller "
             f"than {lpips.minimum_side} pixels. Give more cameras, or larger views."
         )
-    novel_views.lpips = lpips
+    novel_views.lpips, dists = lpips, load_dists_or_none()
 
     def outcome(name: str, what: str, sh_dc: Tensor) -> Outcome:
         moment: NovelViewMoment = novel_views.measure(sh_dc)
         judgment = judge.judge(sh_dc)
         assert judgment is not None
-        return Outcome(name, what, sh_dc, judgment, moment.short, moment.long)
+        distance = judge.dists(dists, sh_dc) if dists else None
+        return Outcome(name, what, sh_dc, judgment, moment.short, moment.long, distance)
 
     blend_weights = stylizer.job.plan.survey.total_blend_weights
     transferred = warm_start(scene.sh_dc, blend_weights, Style.of(style))
