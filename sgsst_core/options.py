@@ -15,7 +15,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema
+from pydantic_core import CoreSchema, ErrorDetails
 
 #: Former names of options and parameters, mapped to their present names. Only error messages and stored jobs use them.
 RENAMED = {
@@ -128,6 +128,11 @@ class Declared:
         if self.option.default and value == self.info.default:
             return self.option.default
         return _plain(value)
+
+
+def reason(error: ErrorDetails) -> str:
+    """Return pydantic's reason why a value is invalid, or the message of our own validators, for users."""
+    return error["msg"].removeprefix("Value error, ")
 
 
 def declared(model: type[BaseModel]) -> dict[str, Declared]:

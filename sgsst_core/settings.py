@@ -20,7 +20,7 @@ from pydantic_core import CoreSchema, core_schema
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
 from sgsst_core.option_parsers import COLOR_SYNTAX, STRENGTHS, parse_bytes, parse_color, parse_strength, parse_weights
-from sgsst_core.options import Declared, Option, renamed_hint
+from sgsst_core.options import Declared, Option, reason, renamed_hint
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
@@ -355,7 +355,7 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
-        raise SettingsError(f"Setting {name} = {first['input']!r}: {renamed_hint(name) or first['msg']}.") from error
+        raise SettingsError(f"Setting {name} = {first['input']!r}: {renamed_hint(name) or reason(first)}.") from error
 
 
 def preset_texts(setting: Declared) -> dict[str, str]:

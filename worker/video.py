@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import read_scene
@@ -20,7 +21,7 @@ from sgsst_core.report.video import Layer, write_video
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene
-from worker.capture import choose_axes, orbit_request, read_capture
+from worker.capture import about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view
 from worker.options import VideoOptions
 from worker.request import SceneRequest, check_choice, check_folder, check_is_not_scene
@@ -80,27 +81,33 @@ def check_video_request(request: VideoRequest) -> None:
 
 
 def render_video(
-    request: VideoRequest, progress: Callable[[int, int], None] = lambda done, total: None
+    request: VideoRequest,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    warn: Callable[[str], None] = lambda line: None,
 ) -> list[Camera]:
     """Render a requested video on the CPU, and return its cameras. All inputs are checked first.
 
     Args:
         request: Request that `check_video_request` accepts.
         progress: Callback that receives the numbers of completed and of all frames.
+        warn: Callback for warnings about scene and cameras.
 
     Raises:
         InvalidInputError: If an input cannot be used, or the video cannot be written.
     """
     source = request.source
-    scene = _read(source)
+    scene, decisions = _read(source)
     before = None
     if request.unstylized is not None:
-        before = _read(source.model_copy(update={"scene": request.unstylized}))
+        before, _ = _read(source.model_copy(update={"scene": request.unstylized}))
     through = None
     if request.along_cameras:
-        through = read_capture(source, scene, request.images).checked(scene, source.near).cameras
+        capture = read_capture(source, scene, request.images).checked(scene, source.near)
+        through, decisions = capture.cameras, [*decisions, *capture.decisions]
     cameras = video_cameras(scene, source, through, request.options, source.resolution, even=is_encoded(request.out))
     check_something_in_view(scene, cameras, source.near)
+    for line in warnings_of(decisions):
+        warn(line)
     background = (0.0, 0.0, 0.0) if request.transparent else request.background
 
     def layer(shown: Scene) -> Layer:
@@ -166,11 +173,12 @@ def video_cameras(
     return [framed(camera, None, even=even) for camera in cameras]
 
 
-def _read(source: SceneRequest) -> Scene:
-    """Read a scene with the axes that its cameras suggest, and the requested render mode."""
-    axes, _ = choose_axes(source)
+def _read(source: SceneRequest) -> tuple[Scene, list[Decision]]:
+    """Read a scene with the axes that its cameras suggest and the requested render mode; add the lines about both."""
+    axes, decisions = choose_axes(source)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
-    return file.rendered(source.render_mode, source.eps2d).scene
+    file = file.rendered(source.render_mode, source.eps2d)
+    return file.scene, [*decisions, *about_rendering(file)]
 
 
 def _same_geometry(first: Scene, second: Scene) -> bool:

@@ -24,7 +24,20 @@ from sgsst_core.options import renamed_hint
 #: Base of errors in the arguments, which typer does not export.
 _UsageError: Any = typer.BadParameter.__base__
 
+
+class _Program(typer.core.TyperGroup):
+    """The command `sgsst`. Ctrl-C aborts every command that does not handle it itself."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; KeyboardInterrupt becomes Abort, because typer would turn it into a silent exit."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as interrupt:
+            raise typer.Abort() from interrupt
+
+
 app = typer.Typer(
+    cls=_Program,
     help="Style transfer for 3D Gaussian Splatting scenes (SGSST).",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -70,6 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except _UsageError as error:
+        error.message = error.message.removeprefix("Value error, ")  # typer validates words with pydantic
         if "--json" in arguments:
             _print_json("usage", error.format_message())
         else:
@@ -88,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         error_console.print(f"error: {problem}")
         return BAD_INPUT
     except (KeyboardInterrupt, typer.Abort):
-        error_console.print("Aborted.")
+        error_console.print("Aborted. Output files are complete or were not written.")
         return INTERRUPTED
     except BrokenPipeError:  # for example `sgsst weights list | head`
         return FAILURE

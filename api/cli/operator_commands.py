@@ -165,13 +165,14 @@ def _service_settings() -> ServiceSettings:
 
     from service.settings import ServiceSettings
     from sgsst_core.errors import SettingsError
+    from sgsst_core.options import reason
 
     try:
         return ServiceSettings()
     except ValidationError as error:
         first = error.errors()[0]
         name = "SGSST_" + ".".join(str(part) for part in first["loc"]).upper()
-        raise SettingsError(f"Environment variable {name} = {first['input']!r}: {first['msg']}.") from error
+        raise SettingsError(f"Environment variable {name} = {first['input']!r}: {reason(first)}.") from error
 
 
 def _open_store(data: Path | None) -> Store:

@@ -10,7 +10,7 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Declared, declared
+from sgsst_core.options import Declared, declared, reason
 from sgsst_core.settings import BY_PRESET
 
 Command = Callable[..., None]
@@ -161,4 +161,4 @@ def _checked(model: type[M], given: dict[str, object]) -> M:
     except ValidationError as error:
         first = error.errors()[0]
         option = flags(declared(model)[str(first["loc"][0])])
-        raise SettingsError(f"{option} {first['input']}: {first['msg']}.") from error
+        raise SettingsError(f"{option} {first['input']}: {reason(first)}.") from error

@@ -138,7 +138,7 @@ def _render_views(source: SceneRequest, background: Color, out: Path) -> None:
     from api.cli.scene_tools import render_views
 
     with _frame_bar() as progress:
-        paths = render_views(source, background, out, progress)
+        paths = render_views(source, background, out, progress, _print_warning)
     out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
 
 
@@ -157,9 +157,13 @@ def _render_video(request: VideoRequest) -> None:
                 seconds = (time.monotonic() - first) / (done - 1) * total
                 error_console.print(f"Rendering {total} frames, which takes about {clock(seconds)}.")
 
-        cameras = render_video(request, show)
+        cameras = render_video(request, show, _print_warning)
     frames, fps, size = len(cameras), request.options.fps, f"{cameras[0].width}x{cameras[0].height}"
     out_console.print(f"{frames} frames of {size}, {frames / fps:.3g} s at {fps} per second, in {request.out}")
+
+
+def _print_warning(line: str) -> None:
+    error_console.print(f"warning: {line}")
 
 
 @contextmanager

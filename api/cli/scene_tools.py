@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sgsst_core.decision import Decision
+from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
@@ -137,8 +137,16 @@ def render_views(
     background: tuple[float, float, float],
     out: Path,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    warn: Callable[[str], None] = lambda line: None,
 ) -> list[Path]:
     """Render every view into a folder as PNG, numbered in the order of the cameras. All inputs are checked first.
+
+    Args:
+        source: Scene and cameras.
+        background: Background color, in 0..1.
+        out: Folder of the images.
+        progress: Callback that receives the numbers of completed and of all images.
+        warn: Callback for warnings about scene and cameras.
 
     Raises:
         InvalidInputError: If scene, cameras or folder cannot be used.
@@ -149,6 +157,8 @@ def render_views(
     scene, cameras = file.scene, capture.cameras
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
     check_something_seen(cameras, rasterizer)
+    for line in warnings_of(capture.decisions):
+        warn(line)
     ensure_writable_folder(out)
     paths = [out / name for name in view_file_names(cameras)]
     for index, (camera, path) in enumerate(zip(cameras, paths, strict=True)):

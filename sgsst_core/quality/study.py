@@ -25,6 +25,7 @@ from torch import Tensor
 from sgsst_core.errors import InvalidInputError, SettingsError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.json_files import write_json
+from sgsst_core.options import reason
 from sgsst_core.scene.pyramid import resize_area
 
 #: Number of variants that a page can compare: one for each arrow key.
@@ -220,7 +221,7 @@ def _read(kind: type[F], path: Path) -> F:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         what = "the key of a study" if kind is Key else "a file of votes"
-        raise StudyError(f"{path}: not {what}: {where}: {first['msg']}.") from error
+        raise StudyError(f"{path}: not {what}: {where}: {reason(first)}.") from error
 
 
 def _data_uri(image: Tensor) -> str:

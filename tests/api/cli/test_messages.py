@@ -1,0 +1,95 @@
+"""Tests of messages that all commands share: after Ctrl-C, about words that an option does not accept, and warnings."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from api.cli.main import main
+from tests.small_scenes import cameras, wall, write_files
+
+pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
+
+#: Audit event and start of the path at which Ctrl-C arrives. It is cleared when that happens.
+INTERRUPTED_AT: list[tuple[str, str]] = []
+
+
+def _interrupt(event: str, arguments: tuple[object, ...]) -> None:
+    if INTERRUPTED_AT and event == INTERRUPTED_AT[0][0] and str(arguments[0]).startswith(INTERRUPTED_AT[0][1]):
+        INTERRUPTED_AT.clear()
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def hook() -> None:
+    """Deliver Ctrl-C at a chosen access to a file. Hooks cannot be removed, but this one does nothing by itself."""
+    sys.addaudithook(_interrupt)
+
+
+READING = [["check"], ["bench", "quality"], ["stylize"]]
+
+
+@pytest.mark.parametrize("command", READING, ids=" ".join)
+def test_ctrl_c_while_reading_is_announced(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, views, style = write_files(tmp_path, wall())
+    INTERRUPTED_AT.append(("open", str(scene)))
+    out = [] if command == ["check"] else ["--out", str(tmp_path / "out" / "out.ply")]
+    assert main([*command, str(scene), "--cameras", str(views), "--style", str(style), *out]) == 130
+    assert not INTERRUPTED_AT
+    assert capsys.readouterr().err.splitlines()[-1] == "Aborted. Output files are complete or were not written."
+
+
+@pytest.mark.parametrize("command", ["convert", "render", "study"])
+def test_ctrl_c_while_writing_leaves_no_file(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, views, style = map(str, write_files(tmp_path, wall()))
+    out = tmp_path / "out"
+    arguments = {
+        "convert": ["convert", scene, str(out / "scene.spz")],
+        "render": ["render", scene, "--cameras", views, "--out", str(out)],
+        "study": ["study", "make", f"a={scene}", f"b={scene}", "--style", style, "--cameras", views],
+    }[command]
+    if command == "study":
+        arguments += ["--out", str(out / "study.html")]
+    INTERRUPTED_AT.append(("os.rename", str(out)))  # the temporary file is complete, and not yet at its place
+    assert main(arguments) == 130
+    assert not INTERRUPTED_AT
+    assert capsys.readouterr().err.splitlines()[-1] == "Aborted. Output files are complete or were not written."
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "option", ["--render-mode", "--preset", "--precision", "--up", "--spz-axes", "--style-loss", "--unseen"]
+)
+def test_unknown_words_are_refused_with_the_valid_ones(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["stylize", "scene.ply", "--style", "style.png", "--out", "out.ply", option, "foo"]
+    assert main(command) == 2
+    assert f"Invalid value for '{option}': 'foo' is not one of '" in capsys.readouterr().err
+
+
+def test_contradictory_values_are_refused_in_our_words(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stylize", "scene.ply", "--style", "style.png", "--out", "out.ply", "--scales", "0,0"]) == 2
+    shown = capsys.readouterr().err
+    assert "--scales" in shown
+    assert "Value error" not in shown
+
+
+@pytest.mark.parametrize("video", [False, True])
+def test_render_prints_the_warnings_that_check_reports(
+    video: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, views, _ = write_files(tmp_path, wall(), cameras(3))
+    raw = scene.read_bytes().replace(b"\nelement", b"\ncomment SplatRenderMode: other\nelement", 1)
+    scene.write_bytes(raw)
+    out = ["--video", str(tmp_path / "%03d.png"), "--fps", "1", "--seconds", "2"] if video else ["--out", str(tmp_path)]
+    assert main(["render", str(scene), "--cameras", str(views), "--resolution", "24", *out]) == 0
+    warning = (
+        "warning: rendering: drawn classic unless stated otherwise: the comment 'SplatRenderMode: other' is unknown"
+    )
+    assert warning in capsys.readouterr().err.splitlines()
+    assert main(["check", str(scene), "--cameras", str(views)]) == 0
+    assert "SplatRenderMode" in capsys.readouterr().out
