@@ -261,6 +261,19 @@ class TooManyUploadsError(ConflictError):
         super().__init__(f"There are {limit} unfinished uploads of this key. Finish or delete some.")
 
 
+class TooManyBlendsError(ConflictError):
+    """Blend that would exceed the limit of blends of a job."""
+
+    example = (JOB_ID, 20)
+
+    def __init__(self, job_id: str, limit: int) -> None:
+        super().__init__(
+            f"Job {job_id} has {limit} blends already, and no more are stored. Blend downloaded scenes with "
+            "`sgsst blend`.",
+            limit=limit,
+        )
+
+
 class IdempotencyError(ServiceError):
     """Idempotency-Key that was already used for a different request."""
 

@@ -194,6 +194,25 @@ class AsyncClient:
         await self._transport.fetch(Download(f"/v1/jobs/{job_id}/artifacts/{name}{query}", target, progress))
         return target
 
+    async def blend(
+        self, job_id: str, weight: float, others: Mapping[str, float] | None = None, format: str = "ply"
+    ) -> str:
+        """Blend a finished job's scene with its result, and return the name of the blend for `download`.
+
+        Args:
+            job_id: Job whose scene and result are blended, and that stores the blend.
+            weight: Weight of the job's result. The scene has the remaining weight up to 1.
+            others: Weights of results of other jobs of the same scene by job id.
+            format: Format of the blend, such as "spz".
+
+        Raises:
+            RequestError: If a job has no result, or its result has other Gaussians than the scene.
+        """
+        parts = [{"job_id": other, "weight": each} for other, each in (others or {}).items()]
+        body = {"weight": weight, "others": parts, "format": format}
+        name: str = (await self._transport.call("POST", f"/v1/jobs/{job_id}/blends", json=body)).json()["name"]
+        return name
+
     async def rename(self, job_id: str, name: str) -> Job:
         """Change the display name of a job; an empty name restores the names of scene and style."""
         return Job.of((await self._transport.call("PATCH", f"/v1/jobs/{job_id}", json={"name": name})).json())

@@ -110,6 +110,7 @@ class Client:
     wait = _blocking(AsyncClient.wait)
     artifacts = _blocking(AsyncClient.artifacts)
     download = _blocking(AsyncClient.download)
+    blend = _blocking(AsyncClient.blend)
     rename = _blocking(AsyncClient.rename)
     cancel = _blocking(AsyncClient.cancel)
     retry = _blocking(AsyncClient.retry)

@@ -23,7 +23,7 @@ from api.http.problems import METHODS, Problem, add_handlers
 from api.http.rates import Rates
 from api.http.readiness import Readiness
 from api.http.receipts import Receipts
-from api.http.routes import artifacts, events, inputs, jobs, operations, session, uploads
+from api.http.routes import artifacts, blends, events, inputs, jobs, operations, session, uploads
 from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
 from api.http.static import add_static
@@ -32,7 +32,7 @@ from api.http.threads import OwnerThreads
 from service.errors import DamagedWeightsError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
-from service.inspection.compressor import Compressor
+from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -65,7 +65,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             blobs=blobs,
             artifacts=results,
             inspector=Inspector(settings, store, blobs),
-            compressor=Compressor(settings, store, blobs, results),
+            derived=DerivedFiles(settings, store, blobs, results),
             hub=Hub(store),
             sign_ins=SignIns(),
             rates=Rates(),
@@ -93,7 +93,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         context.receipts.close()
         await context.hub.close()
         await context.inspector.close()
-        await context.compressor.close()
+        await context.derived.close()
         context.readiness.close()
         store.close()
 
@@ -105,7 +105,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         docs_url=None,  # FastAPI's own page loads its script from a CDN
         redoc_url=None,
     )
-    for module in (jobs, events, inputs, artifacts, uploads, session, operations):
+    for module in (jobs, events, inputs, blends, artifacts, uploads, session, operations):
         app.include_router(module.router)
     add_static(app)
     add_handlers(app)

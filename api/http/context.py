@@ -30,7 +30,7 @@ from api.http.threads import OwnerThreads
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
-from service.inspection.compressor import Compressor
+from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
 from service.settings import ServiceSettings, is_loopback
 from service.store import Store
@@ -84,7 +84,7 @@ class Context:
     blobs: Blobs
     artifacts: Artifacts
     inspector: Inspector
-    compressor: Compressor
+    derived: DerivedFiles
     hub: Hub
     metrics: Metrics
     readiness: Readiness

@@ -6,7 +6,7 @@ from collections import Counter
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from service.examples import JOB_ID, SHA256, UPLOAD_ID
 from service.files.artifacts import media_type
@@ -14,6 +14,8 @@ from service.parameters import JobName, JobParameters
 from service.store.history import Point
 from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
+from sgsst_core.files.formats import ResultName
+from sgsst_core.files.formats.ply import PLY
 
 if TYPE_CHECKING:
     StatusName = str
@@ -24,6 +26,8 @@ else:  # inlined in the OpenAPI document; enumerations would get schemas of thei
 
 #: Maximum number of points of a loss history.
 MOST_POINTS = 512
+#: Maximum absolute weight of a result in a blend.
+MAX_WEIGHT = 10
 #: Times in the examples.
 _CREATED, _STARTED, _NOW = "2026-11-21T14:06:02.057842Z", "2026-11-21T14:06:05.536727Z", "2026-11-21T14:09:30.532514Z"
 
@@ -35,6 +39,12 @@ def utc(seconds: object) -> object:
 
 #: Time in responses; rows of the database store seconds since the epoch.
 Time = Annotated[datetime, BeforeValidator(utc)]
+
+
+#: Weight of a result in a blend.
+BlendWeight = Annotated[
+    float, Field(ge=-MAX_WEIGHT, le=MAX_WEIGHT), AfterValidator(lambda weight: round(weight, 3) or 0.0)
+]
 
 
 def _with_example(**example: Any) -> ConfigDict:
@@ -275,6 +285,30 @@ class ArtifactList(BaseModel):
     artifacts: list[ArtifactView]
 
 
+class BlendPart(BaseModel):
+    """Result of another job in a blend."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"job_id": JOB_ID, "weight": 0.2}]})
+
+    job_id: str = Field(pattern="^job_[0-9a-f]{31}$", description="Finished job of the same scene.")
+    weight: BlendWeight
+
+
+class BlendRequest(BaseModel):
+    """Blend of a job's scene with its result, and with results of other jobs of the same scene."""
+
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"examples": [{"weight": 0.7, "others": [], "format": "ply"}]}
+    )
+
+    weight: BlendWeight = Field(
+        description="Weight of the job's result, rounded to thousandths. The scene has the remaining weight up to 1; "
+        "1.5 exaggerates the style by half."
+    )
+    others: list[BlendPart] = Field(default_factory=list, max_length=2, description="Results of other jobs.")
+    format: ResultName = Field(PLY.name, description="Format of the blend.")
+
+
 class InputFileView(InputView):
     """A file that a job was created from, and the address of its content."""
 
@@ -422,6 +456,7 @@ ANSWERS: tuple[type[BaseModel], ...] = (
     Health,
     SignIn,
     JobChange,
+    BlendRequest,
 )
 
 

@@ -1,4 +1,4 @@
-"""Process that reads users' files and compresses results: `python -m service.inspection.process`.
+"""Process that reads users' files, and compresses and blends results: `python -m service.inspection.process`.
 
 The process imports slow modules once. For each request it forks a child with limits on time and memory, which reads the
 files and exits. The child is confined (`service.inspection.sandbox`): a hostile file that takes over the child can
@@ -44,6 +44,7 @@ from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.decision import warnings_of
 from sgsst_core.errors import CameraError, InvalidInputError, MaskError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
+from sgsst_core.files.blending import blend_scenes, encode_blend
 from sgsst_core.files.cache_folder import cache_folder
 from sgsst_core.files.formats import format_of_name, read_scene_header
 from sgsst_core.files.images import image_size, load_image
@@ -75,6 +76,8 @@ _ready_at = time.time()
 MAX_ANSWER = 64 << 20
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
+#: Rounding error of 1 minus weights that are rounded to thousandths.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -251,10 +254,35 @@ def compress(staged: Staged, parameters: JobParameters, name: str) -> dict[str, 
     return measure_compression(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
 
 
+def blend(staged: Staged, parameters: JobParameters, parts: dict[str, float], name: str) -> dict[str, Any]:
+    """Blend a job's scene with results into a file whose suffix determines the format.
+
+    Args:
+        parts: Weight of each staged result, the job's own first. The scene has the remaining weight up to 1.
+        name: File to write.
+
+    Returns:
+        Nothing, as JSON.
+    """
+    source, weights = scene_request(staged, parameters), list(parts.values())
+    files = [read_scene(Path(path)) for path in parts]
+    rest = 1 - math.fsum(weights)
+    if abs(rest) > _ROUNDING:
+        axes, _ = choose_axes(source, staged.photos)
+        files.append(read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes))
+        weights.append(rest)
+    format = format_of_name(name)
+    assert format is not None
+    with Path(name).open("wb") as output:
+        encode_blend(output, blend_scenes(files, weights), format, Path(name))
+    return {}
+
+
 WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], dict[str, Any]]] = {
     "validate": lambda staged, parameters, limits, show: validate(staged, parameters, limits),
     "plan": plan,
     "compress": lambda staged, parameters, limits, show: compress(staged, parameters, limits["name"]),
+    "blend": lambda staged, parameters, limits, show: blend(staged, parameters, limits["parts"], limits["name"]),
 }
 
 
@@ -412,7 +440,7 @@ def _close_descriptors(retained: int = 2) -> None:
 
 
 def _confine(request: dict[str, Any]) -> list[None]:
-    """Restrict this child to reading its job's files and the installation, and to writing the compressed result.
+    """Restrict this child to reading its job's files and the installation, and to writing the derived file.
 
     Returns:
         List to which an entry is appended for each kernel that has to be compiled.
@@ -421,10 +449,10 @@ def _confine(request: dict[str, Any]) -> list[None]:
     links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
     linked = [path.resolve() for path in links if path.is_symlink()]
     result, most_bytes = None, 0
-    if request["work"] == "compress":
+    if request["work"] in ("compress", "blend"):
         result = folder / request["limits"]["name"]
         result.touch()
-        most_bytes = (folder / request["staged"]["scene"]).stat().st_size + (1 << 20)  # a compressed scene is smaller
+        most_bytes = request["limits"]["bytes"]
     uncompiled: list[None] = []
     cache_in_memory(lambda: uncompiled.append(None))
     confine([folder, *linked, cache_folder(), *kernel_folders(), *installation()], result, most_bytes)
@@ -462,15 +490,23 @@ def _prefer_oom_kill() -> None:
 
 
 def _memory_besides_reading(request: dict[str, Any]) -> int:
-    """Return the memory limit in bytes for everything but reading: threads, and rendering or compressing."""
+    """Return the memory limit in bytes for everything but reading: threads, and rendering or writing."""
     threads: int = request["threads"] * _THREAD_BYTES
     if request["work"] == "validate" and not JobParameters(**request["parameters"]).selects_by_images:
         return threads
     return threads + (request["parameters"]["memory_limit"] or default_memory_limit())
 
 
+_TITLES = {
+    "validate": "Reading the files",
+    "plan": "Planning the job",
+    "compress": "Compressing the result",
+    "blend": "Blending the results",
+}
+
+
 def _limit_text(request: dict[str, Any]) -> str:
-    what = {"validate": "Reading the files", "plan": "Planning the job"}.get(request["work"], "Packing the result")
+    what = _TITLES[request["work"]]
     text = f"{what} takes more time ({request['seconds']:.0f} s of a processor) or memory "
     text += f"({request['bytes'] / 1e9:.1f} GB) than allowed for files of this size, or breaks their reader."
     return text if request["work"] != "plan" else f"{text} Ask for fewer views, or submit it without a dry run."

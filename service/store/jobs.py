@@ -267,14 +267,20 @@ class Jobs:
         with self._database.reading() as session:
             return session.get(ArtifactRow, (job_id, name))
 
-    def add_derived(self, source: ArtifactRow, files: Sequence[Published]) -> list[str]:
+    def add_derived(
+        self, source: ArtifactRow, files: Sequence[Published], owner: str, quotas: Quotas = NO_QUOTAS
+    ) -> list[str]:
         """Publish files derived from `source`, unless `source` has been removed or replaced.
 
         Returns:
             Locations of files that were not published, because files of these names exist or `source` is gone.
+
+        Raises:
+            QuotaError: If the files exceed the owner's quota of stored bytes; none is published.
         """
         unused = []
         with self._database.writing() as session:
+            lock_owner(session, owner)
             row = session.get(ArtifactRow, (source.job_id, source.name), with_for_update=True)
             for file in files:
                 existing = session.get(ArtifactRow, (source.job_id, file.name))
@@ -283,6 +289,8 @@ class Jobs:
                     continue
                 values = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
                 session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **values))
+            session.flush()
+            check_bytes(session, owner, quotas)
         return unused
 
     def loss_history(self, job: JobRow, most: int) -> list[Point]:

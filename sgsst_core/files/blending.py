@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import BinaryIO
 
 import torch
 from torch import Tensor
 
 from sgsst_core.errors import SceneError, SettingsError
-from sgsst_core.files.scene_file import SceneFile
+from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.scene_file import SceneFile, encode_scene
+from sgsst_core.files.stylized_ply import encode_stylized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held
 
@@ -53,6 +58,19 @@ def blend_scenes(files: Sequence[SceneFile], weights: Sequence[float]) -> SceneF
     return replace(first, scene=replace(scene, sh_rest=_weighted_sum(rests, fractions)), header=None)
 
 
+def encode_blend(output: BinaryIO, blend: SceneFile, format: SceneFormat, target: Path) -> None:
+    """Write a scene from `blend_scenes` to a stream as `save` would; `target` is named in messages.
+
+    Raises:
+        OutputError: If the format cannot represent the scene.
+        SceneError: If the first scene's file has changed since it was read.
+    """
+    if format is PLY:
+        encode_stylized(output, blend, blend.scene.sh_dc, target)
+    else:
+        encode_scene(output, blend.scene, format, target)
+
+
 def normalized(weights: Sequence[float]) -> list[float]:
     """Return weights divided by their sum.
 
@@ -76,14 +94,14 @@ def normalized(weights: Sequence[float]) -> list[float]:
 def _check_same_shape(first: SceneFile, file: SceneFile) -> None:
     if len(file.scene) != len(first.scene):
         raise SceneError(
-            f"{file.path}: has {len(file.scene):,} Gaussians, but {first.path} has {len(first.scene):,}. Blend results "
-            "of one scene, without --refine or with the same."
+            f"{file.path}: has {len(file.scene):,} Gaussians, but {first.path} has {len(first.scene):,}. Blend scenes "
+            "with the same Gaussians; refining splits some."
         )
     for name, title in _SHAPE.items():
         if not torch.equal(getattr(file.scene, name), getattr(first.scene, name)):
             raise SceneError(
-                f"{file.path}: its Gaussians have other {title} than those of {first.path}. Blend results of one "
-                "scene, in the same format."
+                f"{file.path}: its Gaussians have other {title} than those of {first.path}. Blend a scene and its "
+                "results, all in the same format."
             )
 
 

@@ -21,10 +21,10 @@ from torch import Tensor
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.formats.ply import PROPERTIES, RGB
+from sgsst_core.files.formats.ply import PLY, PROPERTIES, RGB
 from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
 from sgsst_core.files.formats.render_tag import FILTER_3D, retagged
-from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, file_stamp, write_scene
+from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, encode_scene, file_stamp
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import changed
 
@@ -40,7 +40,7 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
     - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
     - If another render mode was requested than the file states, comments of the header state it.
 
-    A scene in another format is written as a PLY by `write_scene`.
+    A scene in another format is written as a PLY by `encode_scene`.
 
     Args:
         source: File from `read_scene`.
@@ -59,19 +59,26 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
         >>> bool(load_scene("gray.ply").scene.sh_dc.any())
         False
     """
+    with atomic_path(target) as temporary, temporary.open("wb") as output:
+        encode_stylized(output, source, sh_dc, target, sh_attenuation=sh_attenuation)
+
+
+def encode_stylized(
+    output: BinaryIO, source: SceneFile, sh_dc: Tensor, target: Path, *, sh_attenuation: float = 0.0
+) -> None:
+    """Write the PLY of a scene with new colors to a stream; see `write_stylized`. `target` is named in messages."""
     if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
         raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
     if file_stamp(source.path) != source.stamp:
         raise changed(source.path)
+    colors = sh_dc.detach().to("cpu", torch.float32)
     if source.header is None:
-        write_scene(
-            target, replace(source.scene.attenuated(sh_attenuation), sh_dc=sh_dc.detach().to("cpu", torch.float32))
-        )
+        encode_scene(output, replace(source.scene.attenuated(sh_attenuation), sh_dc=colors), PLY, target)
         return
     check_sh_attenuation(source, sh_attenuation)
     attenuation = _ShAttenuation.of(source.header, sh_attenuation)
-    columns = _new_columns(source, source.header, sh_dc.detach().to("cpu", torch.float32))
-    with atomic_path(target) as temporary, source.path.open("rb") as file, temporary.open("wb") as output:
+    columns = _new_columns(source, source.header, colors)
+    with source.path.open("rb") as file:
         output.write(_header_for(source, source.header))
         if source.header.text:
             _write_text(source, source.header, columns, attenuation, file, output)

@@ -150,7 +150,7 @@ async def _find_artifact(context: Context, job: JobRow, name: str, format_: Resu
     if format_ is not None and format_ != PLY.name:
         if name != RESULT:
             raise RefusedInputError(f"Only {RESULT} has other formats. Omit 'format'.", "invalid-request")
-        return await context.compressor.compressed(job, by_name(format_))
+        return await context.derived.compressed(job, by_name(format_))
     row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
     if row is None:
         raise NoArtifactError(job.id, name[:80])

@@ -104,6 +104,18 @@ def test_stored_bytes_count_uploads_inputs_and_results(store: Store, clock: Cloc
     submit(store, quotas)
 
 
+def test_blends_count_toward_stored_bytes(store: Store) -> None:
+    job_id = submit(store, NO_QUOTAS)
+    store.leases.succeed(lease(store), [Published("stylized.ply", "x/1", 4, SHA)], {})
+    result, blend = store.jobs.artifact(job_id, "stylized.ply"), Published("blends/a.ply", "x/2", 4, SHA)
+    assert result is not None
+    with pytest.raises(QuotaError):
+        store.jobs.add_derived(result, [blend], "local", Quotas(stored_bytes=10))
+    assert store.jobs.artifact(job_id, blend.name) is None
+    assert store.jobs.add_derived(result, [blend], "local", Quotas(stored_bytes=11)) == []
+    assert store.usage.of("local").stored_bytes == 11
+
+
 def test_upload_used_as_an_input_counts_once(store: Store) -> None:
     row = store.inputs.create_upload("local", 3, "scene.ply", "", 1000)
     store.inputs.finish_upload(row.id, SHA, 1000)

@@ -1,0 +1,209 @@
+"""Files derived from results on request, and stored beside them: compressed formats, and blends with other results.
+
+`service.inspection.process` creates them in a child process with resource limits, so that the API process
+never reads a scene.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from service.errors import NoArtifactError, NotFoundError, TooManyBlendsError
+from service.files.artifacts import Artifacts
+from service.files.blobs import Blobs
+from service.files.staging import RESULT, Staged, stage
+from service.inspection.inspector import LEFTOVER_SECONDS, MEMORY_PER_BYTE, InspectionProcess, findings_of
+from service.parameters import stored_parameters
+from service.settings import ServiceSettings
+from service.store import Store
+from service.store.quotas import NO_QUOTAS, Quotas
+from service.store.tables import ArtifactRow, JobRow
+from sgsst_core.files.formats import result_name
+from sgsst_core.files.formats.scene_format import SceneFormat
+
+#: Additional CPU seconds per byte of results, for reading, sorting, compressing, and rendering them several times.
+#: Actual use is less than a fifth.
+_SECONDS_PER_BYTE = 600 / 1e9
+#: Additional bytes of a derived file, for headers.
+_HEADER_BYTES = 1 << 20
+#: Largest size of a blend relative to the result; a PLY with 8-bit values may become one with float32 values.
+_BLEND_SIZE = 4
+#: Maximum number of blends that are stored with a job.
+MOST_BLENDS = 20
+_BLENDS = "blends/"
+
+
+@dataclass(frozen=True)
+class Blend:
+    """Blend of a job's scene with its result, and with results of other jobs.
+
+    Attributes:
+        weight: Weight of the job's result. The scene has the remaining weight up to 1.
+        others: Weights of the results of other jobs by job id.
+        format: Format of the blend.
+    """
+
+    weight: float
+    others: dict[str, float]
+    format: SceneFormat
+
+    @property
+    def name(self) -> str:
+        """Name of the artifact: `blends/stylized_0.7.ply`, with the end of the id before other jobs' weights."""
+        parts = [f"{self.weight:g}", *(f"{job_id[-8:]}_{weight:g}" for job_id, weight in sorted(self.others.items()))]
+        return f"{_BLENDS}{Path(RESULT).stem}_{'_'.join(parts)}{self.format.suffix}"
+
+
+class DerivedFiles:
+    """Writer of files derived from results, one at a time; concurrent requests for the same file share one task."""
+
+    def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts) -> None:
+        self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
+        self._process = InspectionProcess()
+        self._tasks: dict[tuple[str, str], asyncio.Task[None]] = {}
+        self._folder = settings.folder / "packing"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for leftover in self._folder.iterdir():  # left behind by a killed process
+            if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
+                shutil.rmtree(leftover, ignore_errors=True)
+
+    async def compressed(self, job: JobRow, format: SceneFormat) -> ArtifactRow:
+        """Return a job's result in a compressed format; the compression error is stored beside it as JSON.
+
+        Raises:
+            NotFoundError: If the job has no result yet, or the result is gone.
+            RefusedInputError: If the format cannot represent the result, or compressing exceeds the limits.
+            BusyError, NoSpaceError: If the result cannot be compressed now.
+        """
+        name = result_name(RESULT, format)
+        return await self._derived(job, name, lambda result: self._compress(job, result, name))
+
+    async def blended(self, job: JobRow, blend: Blend, quotas: Quotas) -> ArtifactRow:
+        """Return a blend of a job's scene and results. The owner of the job must also own the others.
+
+        Raises:
+            NotFoundError: If a job has no result yet, or a result is gone.
+            RefusedInputError: If the results have other Gaussians than the scene, the format cannot represent the
+                blend, or blending exceeds the limits.
+            TooManyBlendsError: If the job has `MOST_BLENDS` already.
+            QuotaError: If the blend exceeds the owner's quota of stored bytes.
+            BusyError, NoSpaceError: If the results cannot be blended now.
+        """
+        return await self._derived(job, blend.name, lambda result: self._blend(job, result, blend, quotas))
+
+    async def _derived(self, job: JobRow, name: str, derive: Callable[[ArtifactRow], Awaitable[None]]) -> ArtifactRow:
+        """Return the database row of a derived file, which `derive` creates from the job's result if there is none."""
+        result = await asyncio.to_thread(self._result, job.id)
+        row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
+        if row is None:
+            task = self._tasks.get((job.id, name))
+            if task is None:
+                task = asyncio.ensure_future(derive(result))
+                self._tasks[job.id, name] = task
+                task.add_done_callback(lambda done: self._tasks.pop((job.id, name), None))
+            await asyncio.shield(task)
+            row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
+        if row is None:
+            raise NotFoundError(f"The results of job {job.id} are gone.")
+        return row
+
+    def _result(self, job_id: str) -> ArtifactRow:
+        row = self._store.jobs.artifact(job_id, RESULT)
+        if row is None:
+            raise NoArtifactError(job_id, RESULT)
+        return row
+
+    # --- compressed formats ---------------------------------------------------------------------------------------
+
+    async def _compress(self, job: JobRow, result: ArtifactRow, name: str) -> None:
+        """Compress the result, store the files, and make them visible."""
+        self._blobs.ensure_space(3 * result.size)
+        with tempfile.TemporaryDirectory(dir=self._folder) as given:
+            folder = Path(given)
+            staged = await asyncio.to_thread(self._stage, folder, job, [result])
+            limits = {"name": name, "bytes": result.size + _HEADER_BYTES}  # a compressed scene is smaller
+            loss = await self._ask("compress", folder, job, replace(staged, scene=Path(RESULT)), limits, result.size)
+            loss_file = folder / "loss.json"
+            loss_file.write_text(json.dumps(loss, indent=1) + "\n")
+            files = {f"{name}.json": loss_file, name: folder / name}
+            await asyncio.to_thread(self._publish, job, result, files)
+
+    # --- blends ---------------------------------------------------------------------------------------------------
+
+    async def _blend(self, job: JobRow, result: ArtifactRow, blend: Blend, quotas: Quotas) -> None:
+        """Blend the results, store the file, and make it visible."""
+        await asyncio.to_thread(self._check_count, job)
+        others = [await asyncio.to_thread(self._result, job_id) for job_id in blend.others]
+        scene = sum(entry["size"] for entry in job.inputs if entry["role"] == "scene")
+        size = scene + sum(row.size for row in (result, *others))
+        self._blobs.ensure_space(size + _BLEND_SIZE * result.size)
+        with tempfile.TemporaryDirectory(dir=self._folder) as given:
+            folder = Path(given)
+            staged = await asyncio.to_thread(self._stage, folder, job, [result, *others])
+            parts = {RESULT: blend.weight, **{_staged_name(job, row): blend.others[row.job_id] for row in others}}
+            file = f"blend{blend.format.suffix}"
+            limits = {"name": file, "parts": parts, "bytes": _BLEND_SIZE * result.size + _HEADER_BYTES}
+            await self._ask("blend", folder, job, staged, limits, size)
+            await asyncio.to_thread(self._publish, job, result, {blend.name: folder / file}, quotas)
+
+    def _check_count(self, job: JobRow) -> None:
+        if sum(row.name.startswith(_BLENDS) for row in self._store.jobs.artifacts(job.id)) >= MOST_BLENDS:
+            raise TooManyBlendsError(job.id, MOST_BLENDS)
+
+    # --- both -----------------------------------------------------------------------------------------------------
+
+    def _stage(self, folder: Path, job: JobRow, results: list[ArtifactRow]) -> Staged:
+        """Stage the job's inputs, with results beside them."""
+        rows = self._store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
+        staged = stage(folder, job.inputs, self._blobs.fetch(rows, folder))
+        for result in results:
+            self._artifacts.fetch(result.location, folder / _staged_name(job, result), result.sha256)
+        return staged
+
+    async def _ask(
+        self, work: str, folder: Path, job: JobRow, staged: Staged, limits: dict[str, Any], size: int
+    ) -> dict[str, Any]:
+        """Return the findings of the inspecting process about scenes of `size` bytes in total."""
+        request = {
+            "work": work,
+            "folder": str(folder),
+            "staged": staged.as_json(),
+            "parameters": stored_parameters(job.parameters).model_dump(mode="json"),
+            "limits": limits,
+            "seconds": self._settings.inspection_seconds + _SECONDS_PER_BYTE * size,
+            "bytes": self._settings.inspection_bytes + MEMORY_PER_BYTE * size,
+        }
+        return findings_of(await self._process.ask(request))
+
+    def _publish(self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas = NO_QUOTAS) -> None:
+        """Store files and make them visible.
+
+        Raises:
+            QuotaError: If they exceed the owner's quota of stored bytes; they are removed.
+        """
+        # later than the epoch of the last lease, so that the files are not swept as leftovers of an attempt
+        epoch = job.lease_epoch + 1
+        put = [self._artifacts.put(job.id, epoch, name, path, final=True) for name, path in files.items()]
+        unused = [file.location for file in put]
+        try:
+            unused = self._store.jobs.add_derived(result, put, job.owner, quotas)
+        finally:
+            for location in unused:
+                self._artifacts.remove(location)
+
+    async def close(self) -> None:
+        """Stop the process, which also aborts any work in progress."""
+        await self._process.close()
+
+
+def _staged_name(job: JobRow, result: ArtifactRow) -> str:
+    """Return the name of a staged result; those of other jobs are named by the job."""
+    return RESULT if result.job_id == job.id else f"{result.job_id}.ply"
