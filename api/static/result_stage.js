@@ -2,6 +2,7 @@
 /** Results of one scene in 3D: the original and the colors of each run, two of them on the sides of the wipe. */
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
+import { Blend } from "./blend.js";
 import { h, put } from "./dom.js";
 import { labels } from "./names.js";
 import { Stage } from "./stage.js";
@@ -24,7 +25,9 @@ export class ResultStage {
     this.left = this.chooser(say.left);
     this.right = this.chooser(say.right);
     this.pickers = h("div.row.sides", { hidden: jobs.length < 2 }, this.left.element, this.right.element);
-    this.element = h("div.result-stage", this.pickers, this.stage.element);
+    this.blend = new Blend(jobs, labels(jobs), () => this.showBlend());
+    this.blend.element.hidden = true;
+    this.element = h("div.result-stage", this.pickers, this.stage.element, this.blend.element);
     /** Choices for each side of the wipe. @type {Map<string, {name: string, side: Side}>} */
     this.choices = new Map();
     if (this.stage.viewer) {
@@ -45,6 +48,7 @@ export class ResultStage {
     for (const { side } of this.choices.values()) side.scene.worker.terminate(); // workers of a lost GPU context
     this.choices.clear();
     this.original = undefined;
+    this.stage.original = null;
     viewer.background = first.parameters.background ?? [0, 0, 0];
     viewer.camera.near = first.parameters.near ?? 0.2;
     this.stage.message(words.page.loading);
@@ -78,6 +82,7 @@ export class ResultStage {
       header.rendering = requestedRendering(header.rendering, job.parameters);
       scene.ready.then(() => this.standFirst(), (error) => this.tell(error));
       this.original = scene;
+      this.stage.original = { scene, colors: "own" };
       this.choices.set("original", { name: say.original, side: { scene, colors: "own" } });
     } catch {
       scene.end(); // this format cannot be shown in a browser: only the result is
@@ -112,14 +117,34 @@ export class ResultStage {
     await scene.headerRead;
   }
 
+  /** Offer the blend if the viewer has all its color sets. */
+  offerBlend() {
+    const { original, blend, jobs } = this;
+    if (!original || !jobs.every(({ id }) => original.colors.has(id))) return;
+    const side = { scene: original, colors: "own", blend: blend.parts };
+    this.choices.set(jobs.length > 1 ? "blend" : jobs[0].id, { name: jobs.length > 1 ? words.blend.title : blend.name, side });
+    blend.element.hidden = false;
+  }
+
+  /** Show the blend after a change: on the right if it is on no side yet. */
+  showBlend() {
+    const key = this.jobs.length > 1 ? "blend" : this.jobs[0].id, choice = this.choices.get(key);
+    if (!choice) return;
+    if (this.jobs.length < 2) choice.name = this.blend.name;
+    if (![this.left.select.value, this.right.select.value].includes(key)) this.right.select.value = key;
+    this.showSides();
+  }
+
   offer() {
+    const runs = [...this.choices.keys()];
+    this.offerBlend();
     const all = [...this.choices];
     if (!all.length) return this.stage.message(words.job.noScene);
     const options = () => all.map(([key, { name }]) => h("option", { value: key }, name));
     put(this.left.select, options());
     put(this.right.select, options());
-    this.left.select.value = this.jobs.length > 1 ? (all.at(-2)?.[0] ?? all[0][0]) : all[0][0];
-    this.right.select.value = all[all.length - 1][0];
+    this.left.select.value = this.jobs.length > 1 ? (runs.at(-2) ?? runs[0]) : runs[0];
+    this.right.select.value = runs[runs.length - 1];
     this.showSides();
   }
 

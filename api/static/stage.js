@@ -32,6 +32,10 @@ export class Stage {
     this.stood = -1;
     /** @type {[string, string] | null} */
     this.names = null;
+    /** Side that is shown while a key is held. @type {Side | null} */
+    this.original = null;
+    /** Sides that are shown again when the key is released. @type {{left: Side, right: Side} | null} */
+    this.covered = null;
     /** @type {Viewer | null} */
     this.viewer = null;
     this.hasFrames = false;
@@ -44,7 +48,7 @@ export class Stage {
       this.message(error instanceof Error ? error.message : String(error));
       return;
     }
-    this.controls = new Controls(this.viewer, { toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home() });
+    this.controls = new Controls(this.viewer, { toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home(), hold: (held) => this.hold(held) });
     this.makeTools();
     this.canvas.addEventListener("pointerdown", () => this.leaveCamera());
     this.divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => event.buttons && this.wipeTo(event.clientX));
@@ -97,12 +101,27 @@ export class Stage {
   show(left, right, names) {
     if (!this.viewer) return;
     this.names = right && names ? names : null;
+    this.covered = null;
     this.viewer.camera.up = this.up;
     this.viewer.show(left, right ?? left);
     for (const part of [this.wipe, this.divider, this.leftName, this.rightName]) part.hidden = !this.names;
     if (names) [this.leftName.textContent, this.rightName.textContent] = names;
     if (this.names) this.setWipe(this.share ?? 0.5);
     else this.viewer.wipe(0);
+  }
+
+  /**
+   * Show the original on both sides while a key is held.
+   *
+   * @param {boolean} held
+   */
+  hold(held) {
+    const { viewer, original } = this;
+    if (!viewer?.sides || !original || held === !!this.covered) return;
+    const sides = this.covered ?? { left: original, right: original };
+    this.covered = held ? viewer.sides : null;
+    viewer.show(sides.left, sides.right);
+    if (held) announce(say.original);
   }
 
   /** @param {number} share fraction of the width that shows the left side */

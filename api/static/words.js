@@ -66,7 +66,7 @@ export const words = {
     noWebGL: "The 3D view needs WebGL 2, which this browser doesn't support. Everything else works.",
     noPicture: "Couldn't save the image.",
     lost: "The graphics card was reset. The view will return shortly.",
-    name: "3D view", view: "view", instructions: "Arrow keys orbit, W A S D Q E move, + and - zoom, comma and period switch cameras, Space swaps before and after, Home resets the view.",
+    name: "3D view", view: "view", instructions: "Arrow keys orbit, W A S D Q E move, + and - zoom, comma and period switch cameras, Space swaps before and after, holding O shows the original, Home resets the view.",
     wipe: "Wipe", wipeAt: (/** @type {string} */ left, /** @type {string} */ right, /** @type {number} */ share) => `${percent(share)} ${left}, the rest ${right}`,
     original: "Original", stylized: "Stylized", left: "Left", right: "Right",
     toggle: "Swap before and after", orbit: "Orbit", fly: "Fly", movement: "Movement", home: "Reset view", screenshot: "Save image", full: "Full screen", keys: "Keyboard and gestures",
@@ -74,8 +74,13 @@ export const words = {
     previous: "Previous camera", next: "Next camera",
     help: [
       ["Drag, or arrow keys", "orbit"], ["Right drag, two fingers, or A D Q E", "pan"], ["Wheel, pinch, or + −", "zoom"],
-      ["W S", "forward, back"], [", .", "previous and next camera"], ["Space", "swap before and after"], ["Home", "reset view"],
+      ["W S", "forward, back"], [", .", "previous and next camera"], ["Space", "swap before and after"], ["Hold O", "show the original"], ["Home", "reset view"],
     ],
+  },
+  blend: {
+    title: "Blend", style: "Amount of style", between: (/** @type {string} */ first, /** @type {string} */ second) => `${first} to ${second}`,
+    percent: (/** @type {number} */ share) => `${Math.round(100 * share)}%`, amount: (/** @type {number} */ share) => `${Math.round(100 * share)}% style`,
+    save: "Save this blend", saveAs: "Save as", saving: "Saving…", saved: "Saved:",
   },
   cameras: {
     notReadHere: "These cameras can't be previewed. The service reads them after upload.",

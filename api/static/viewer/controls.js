@@ -11,7 +11,7 @@ const STEPS = { a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0], w: [0,
 export class Controls {
   /**
    * @param {Viewer} viewer
-   * @param {{toggle?: () => void, camera?: (by: number) => void, home?: () => void}} keys actions of other keys
+   * @param {{toggle?: () => void, camera?: (by: number) => void, home?: () => void, hold?: (held: boolean) => void}} keys actions of other keys; `hold` is called when O is pressed and released
    */
   constructor(viewer, keys = {}) {
     this.viewer = viewer;
@@ -26,6 +26,8 @@ export class Controls {
     for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => this.hands.delete(/** @type {PointerEvent} */ (event).pointerId));
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("keydown", (event) => this.key(event));
+    canvas.addEventListener("keyup", (event) => event.key.toLowerCase() === "o" && this.keys.hold?.(false));
+    canvas.addEventListener("blur", () => this.keys.hold?.(false));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   }
 
@@ -98,6 +100,7 @@ export class Controls {
     else if (key === "+" || key === "=") this.approach(0.9);
     else if (key === "-") this.approach(1 / 0.9);
     else if (key === " ") return this.other(event, this.keys.toggle);
+    else if (key === "o") return this.other(event, () => event.repeat || this.keys.hold?.(true));
     else if (key === "Home") return this.other(event, this.keys.home);
     else if (key === "," || key === ".") return this.other(event, () => this.keys.camera?.(key === "," ? -1 : 1));
     else return;

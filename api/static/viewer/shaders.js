@@ -1,6 +1,6 @@
 // @ts-check
 /**
- * Shaders: EWA splatting as in `sgsst render`, drawn once with two colors.
+ * Shaders: EWA splatting as in `sgsst render`, drawn once with two colors, each a blend of up to three color sets.
  *
  * Gaussians are blurred by 0.3 square pixels, or as their file states; if it is antialiased, their opacity is
  * compensated for that. Alpha is clamped between 1/255 and 0.99, and slopes are clamped at 1.3 times half the field of
@@ -45,7 +45,8 @@ precision highp float; precision highp int; precision highp sampler2D; precision
 layout(location = 0) in vec2 corner;
 layout(location = 1) in uint index;
 uniform usampler2D geometry, harmonics;
-uniform sampler2D leftColors, rightColors;
+uniform sampler2D leftColors, left1, left2, rightColors, right1, right2;
+uniform vec3 leftWeights, rightWeights;   // of three color sets each
 uniform mat3 axes;          // columns: right, down, forward
 uniform vec3 eye;
 uniform vec2 focal, size, fade;
@@ -58,6 +59,12 @@ ivec2 place(int texel) { return ivec2(texel & ${(1 << bits) - 1}, texel >> ${bit
 vec2 fractions(uint both) { return max(vec2(ivec2(int(both << 16) >> 16, int(both) >> 16)) / 32767., -1.); }
 ${directional(degree)}
 float deviation(uint stored) { return exp(${SCALE_LOW}. + float(stored) * ${SCALE_RANGE / 65535}); }
+vec3 blended(sampler2D first, sampler2D second, sampler2D third, vec3 weights, ivec2 where) {
+  vec3 sum = weights.x * texelFetch(first, where, 0).rgb;
+  if (weights.y != 0.) sum += weights.y * texelFetch(second, where, 0).rgb;
+  if (weights.z != 0.) sum += weights.z * texelFetch(third, where, 0).rgb;
+  return sum;
+}
 void main() {
   gl_Position = vec4(2, 2, 2, 1);
   int i = int(index);
@@ -89,8 +96,8 @@ void main() {
   at = corner * reach;
   vec3 rest = directional(i, normalize(away));
   ivec2 where = place(i);
-  leftColor = max(0.5 + fade.x * rest + 0.28209479177387814 * texelFetch(leftColors, where, 0).rgb, 0.);
-  rightColor = max(0.5 + fade.y * rest + 0.28209479177387814 * texelFetch(rightColors, where, 0).rgb, 0.);
+  leftColor = max(0.5 + fade.x * rest + 0.28209479177387814 * blended(leftColors, left1, left2, leftWeights, where), 0.);
+  rightColor = max(0.5 + fade.y * rest + 0.28209479177387814 * blended(rightColors, right1, right2, rightWeights, where), 0.);
 }`;
 
 export const splatFragment = `#version 300 es

@@ -6,7 +6,8 @@ import { lineFragment, lineVertex, overBackground, splatFragment, splatVertex, w
 import { SplatScene } from "./splat_scene.js";
 import { words } from "../words.js";
 
-/** @typedef {{scene: SplatScene, colors: string, fade?: number}} Side what is shown on one side of the wipe */
+/** @typedef {{colors: string, weight: number}} Part color set of a blend; the weights of all parts add up to 1 */
+/** @typedef {{scene: SplatScene, colors: string, fade?: number, blend?: Part[]}} Side what is shown on one side of the wipe; a `blend` of up to three color sets replaces `colors` */
 /** @typedef {{program: WebGLProgram, at: (name: string) => WebGLUniformLocation | null}} Program */
 
 /** Milliseconds of a frame above which a moving view is drawn at a half, or at a quarter, of the resolution. */
@@ -314,13 +315,18 @@ export class Viewer {
     const { antialiased, eps2d } = scene.header?.rendering ?? CLASSIC;
     gl.uniform1f(at("eps2d"), eps2d);
     gl.uniform1i(at("antialiased"), Number(antialiased));
-    const textures = { geometry: scene.geometry, leftColors: scene.colors.get(left.colors) ?? own, rightColors: scene.colors.get(right.colors) ?? own, harmonics: scene.harmonics };
-    Object.entries(textures).forEach(([name, texture], unit) => {
+    const textures = Object.entries({ geometry: scene.geometry, harmonics: scene.harmonics });
+    for (const [name, side] of /** @type {[string, Side][]} */ ([["left", left], ["right", right]])) {
+      const parts = side.blend ?? [{ colors: side.colors, weight: 1 }];
+      gl.uniform3fv(at(`${name}Weights`), [0, 1, 2].map((i) => parts[i]?.weight ?? 0));
+      [`${name}Colors`, `${name}1`, `${name}2`].forEach((sampler, i) => textures.push([sampler, scene.colors.get(parts[i]?.colors ?? "own") ?? own]));
+    }
+    textures.forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture ?? null);
       gl.uniform1i(at(name), unit);
     });
-    gl.activeTexture(gl.TEXTURE0 + 7);
+    gl.activeTexture(gl.TEXTURE0 + textures.length);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.corners ?? null);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
