@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 
 from benchmarks.machine import write_result
-from benchmarks.pictures import picture
+from benchmarks.pictures import grainy_photo
 from sgsst_core.budget import device_peak, forget_device_peak
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork, use_whole_float32
@@ -30,12 +30,12 @@ def main() -> None:
     size = (arguments.height, arguments.width)
     network = FeatureNetwork(load_network_weights("auto"), device=arguments.device)
     loss = SosLoss(network, memory=int(arguments.memory * 1e9))
-    targets = loss.targets.of_style(Style.of(picture("immunohistochemistry", *size)), size)
-    view = loss.targets.of_view(picture("coffee", *size))
+    targets = loss.targets.of_style(Style.of(grainy_photo("immunohistochemistry", *size)), size)
+    view = loss.targets.of_view(grainy_photo("coffee", *size))
     forget_device_peak(network.device)
     timer = Timer(network.device)
     with timer("gradient"):
-        result = loss.evaluate(picture("astronaut", *size), targets, view)
+        result = loss.evaluate(grainy_photo("astronaut", *size), targets, view)
     seconds = timer.read()["gradient"]
     peak = peak_memory() / 1e9
     on_device = device_peak(network.device)

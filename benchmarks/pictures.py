@@ -8,7 +8,7 @@ from skimage import data
 from torch import Tensor
 
 
-def picture(name: str, height: int, width: int) -> Tensor:
+def grainy_photo(name: str, height: int, width: int) -> Tensor:
     """Return a photo of scikit-image, e.g. "astronaut", as [height, width, 3] from 0 to 1, with fine grain added.
 
     Without grain, enlarged photos have no detail at full size, unlike real views.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.block_method import block_gradient
 from benchmarks.machine import write_result
-from benchmarks.pictures import picture
+from benchmarks.pictures import grainy_photo
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
@@ -32,8 +32,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     size = arguments.size
-    image, content = picture("astronaut", size, size), picture("coffee", size, size)
-    style_image = picture("immunohistochemistry", size, size)
+    image, content = grainy_photo("astronaut", size, size), grainy_photo("coffee", size, size)
+    style_image = grainy_photo("immunohistochemistry", size, size)
     weights = load_network_weights("auto")
     methods: dict[str, Callable[[], Tensor]] = {}
 

@@ -33,7 +33,7 @@ class Style:
         images: Images, [H_i, W_i, 3] in 0..1 each.
         weights: Weights above 0 that add up to 1.
         names: Display names of the images; empty if they have none.
-        notes: What was not used when the images were read, such as a broken color profile.
+        notes: Parts of the image files that are not used, such as a broken color profile.
     """
 
     images: tuple[Tensor, ...]

@@ -151,7 +151,7 @@ def _refine(
 
 
 def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:
-    """Return the plan of a resumed job, or None if there is none or it cannot be used here.
+    """Return the plan of a resumed job; None if the job is new or the plan cannot be used on this machine.
 
     A plan made for another device or for fewer ranks cannot be used. If the plan uses a GPU rasterizer, its kernels are
     compiled and checked here: compiling may take longer than ranks wait for each other during a step.

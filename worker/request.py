@@ -70,7 +70,7 @@ class Outputs:
 
     Attributes:
         ply: Stylized scene.
-        packed: Stylized scene in a compressed format, which the file name's ending determines; None if not requested.
+        packed: Stylized scene in another format, which the suffix of its name determines; None if not requested.
     """
 
     ply: Path
@@ -98,17 +98,17 @@ class Outputs:
 
     @property
     def report(self) -> Path:
-        """Return the path of the report as JSON."""
+        """Return the path of the JSON report."""
         return self._beside(".report.json")
 
     @property
     def page(self) -> Path:
-        """Return the path of the report as an HTML page."""
+        """Return the path of the HTML report."""
         return self._beside(".report.html")
 
     @property
     def plan(self) -> Path:
-        """Return the path of the plan as JSON."""
+        """Return the path of the JSON plan."""
         return self._beside(".plan.json")
 
     @property
@@ -215,10 +215,10 @@ def check_request(request: StylizeRequest) -> Outputs:
 
 
 def result_format(out: Path) -> SceneFormat:
-    """Return the format that the name of a scene to write determines.
+    """Return the format of a scene to write, by its file name.
 
     Raises:
-        OutputError: If the name does not end in a suffix of a format that can be written, or is that of a folder.
+        OutputError: If the name does not end in a suffix of a format that can be written, or the path is a folder.
     """
     format = format_of_name(out.name)
     if format is None or format.write is None or out.is_dir():
@@ -235,7 +235,7 @@ def check_is_not_scene(out: Path, scene: Path, remark: str = "") -> None:
         remark: Text about the output for the message.
 
     Raises:
-        OutputError: If it is.
+        OutputError: If both are the same file.
     """
     if out.exists() and scene.exists() and out.samefile(scene):
         raise OutputError(f"{out}{remark}: is the scene itself, which would be overwritten. Give another file name.")
@@ -245,7 +245,7 @@ def check_folder(folder: Path) -> None:
     """Check that a folder is writable or can be created, without creating it.
 
     Raises:
-        OutputError: If it is neither.
+        OutputError: If the folder cannot be written or created.
     """
     while not (folder.exists() or folder.is_symlink()) and folder != folder.parent:
         folder = folder.parent

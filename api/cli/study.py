@@ -75,7 +75,7 @@ def _render(source: SceneRequest, cameras: Sequence[Camera], background: tuple[f
 
 
 def share_table(shares: Sequence[Share]) -> Table:
-    """Return a table with each variant's share of the votes and its 95 % interval."""
+    """Return a table with each variant's fraction of the votes and its 95 % interval."""
     table = Table("variant", "votes", "share", "95 % interval", title=f"{shares[0].total} votes")
     for share in shares:
         interval = f"{share.low:.1%} to {share.high:.1%}"

@@ -69,7 +69,7 @@ class ForeignSiteError(ServiceError):
 
 
 class CrossOriginError(ServiceError):
-    """A request with a session cookie that would change something, but does not come from a page of this service."""
+    """Request that would change something by a session cookie, but was not sent by a page of this service."""
 
     code, status = "cross-origin", 403
     example = ("Pages of 'https://example.com' may not use the sessions of this service.",)

@@ -185,15 +185,15 @@ def _check_region_masks(names: Sequence[str], regions: Sequence[RegionRequest]) 
             continue
         folder = region.selection.kind == "masks"
         sent = {name: Path("mask", name) for name in names}
-        found = {name for name, file in sent.items() if (path in file.parents if folder else path == file)}
-        if not found:
+        matching = {name for name, file in sent.items() if (path in file.parents if folder else path == file)}
+        if not matching:
             raise RefusedInputError(
                 f"Region {region.name!r} is selected by {region.selection.text}, but no file 'mask' has that "
                 f"{'folder' if folder else 'name'}. Send it, or correct the name.",
                 "invalid-request",
                 input="mask",
             )
-        unused -= found
+        unused -= matching
     if unused:
         raise RefusedInputError(
             f"The mask {min(unused)!r} belongs to no region. Select a region by mask=NAME or masks=FOLDER, or leave "

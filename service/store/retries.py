@@ -1,4 +1,4 @@
-"""Pure functions that decide about a job whose attempt ended without a result; `service.store.leases` calls them."""
+"""Retry policy for jobs whose attempt ended without a result, as pure functions for `service.store.leases`."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class RetryPolicy:
         *,
         permanent: bool = False,
     ) -> Verdict:
-        """Decide about a job after an attempt that failed, was lost or was released.
+        """Decide whether a job is retried after an attempt that failed, was lost or was released.
 
         Args:
             outcome: Outcome of the attempt.
@@ -92,14 +92,14 @@ class RetryPolicy:
         return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else self._wait(count.failures))
 
     def after_outage(self, status: JobStatus, count: FailureCount, outages: int) -> Verdict:
-        """Decide about a job after an attempt that failed because of a machine, a network or the file store.
+        """Decide when a job is retried after a machine, the network or the file store failed.
 
         This does not count as a failure of the job. It is retried with growing delays until it succeeds or is canceled.
 
         Args:
             status: Status of the job while the attempt ran.
             count: Count of failures before this attempt; it does not change.
-            outages: Number of consecutive attempts that ended by an outage, including this one.
+            outages: Number of consecutive attempts that ended in an outage, including this one.
         """
         if status == JobStatus.CANCELING:
             return Verdict(Transition.STOP, count)

@@ -173,7 +173,7 @@ def compare_quality(
     blend_weights = stylizer.job.plan.survey.total_blend_weights
     transferred = warm_start(scene.sh_dc, blend_weights, Style.of(style))
     outcomes = [
-        outcome(UNSTYLIZED, "the scene as it came", scene.sh_dc),
+        outcome(UNSTYLIZED, "the unstylized scene", scene.sh_dc),
         outcome(TRANSFER, "the style's distribution of colors, no step", transferred),
     ]
     curves = error_time(scene, cameras, style, variants, seconds, weights=weights, progress=progress, **settings)

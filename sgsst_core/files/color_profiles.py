@@ -99,7 +99,7 @@ def _without_float_conversions(data: bytes) -> bytes:
 
 @functools.cache
 def _srgb() -> ImageCms.ImageCmsProfile:
-    """Return the profile of sRGB, as one of version 2.
+    """Return an sRGB profile of ICC version 2.
 
     With version 4, the perceptual intent would map the darkest ink of a printing process to black. ImageMagick and most
     viewers do not.

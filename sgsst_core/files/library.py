@@ -83,7 +83,7 @@ def save(path: str | Path, scene: AnyScene) -> None:
 
     Args:
         path: Path of the file to write.
-        scene: Scene in any form.
+        scene: Scene in any of the accepted types.
 
     Raises:
         SceneError: If the scene cannot be used, or its file has changed since it was read.
@@ -111,10 +111,10 @@ def save(path: str | Path, scene: AnyScene) -> None:
 
 
 def as_scene(scene: AnyScene) -> Scene:
-    """Return the Gaussians of a scene in any form.
+    """Return the Gaussians of a scene of any accepted type.
 
     Raises:
-        SceneError: If it is none of them, or a value is wrong.
+        SceneError: If the type is not accepted, or a value is wrong.
     """
     if isinstance(scene, SceneFile | TrainerCheckpoint):
         return scene.scene
@@ -129,7 +129,7 @@ def as_scene(scene: AnyScene) -> Scene:
 
 
 def stylized(given: AnyScene, scene: Scene, refinement: Refinement | None, sh_attenuation: float) -> AnyScene:
-    """Return a stylized scene in the form in which the unstylized one was given.
+    """Return a stylized scene as the type of the given one.
 
     Args:
         given: Unstylized scene.

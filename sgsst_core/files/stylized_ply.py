@@ -271,7 +271,7 @@ def _write_text(
 def _changed_line(
     line: str, slots: list[tuple[int, str]], values: NDArray[Any], attenuation: _ShAttenuation | None
 ) -> str:
-    """Return a row of text with new values. Tokens whose value does not change, and all spacing, stay as they are.
+    """Return a row of text with new values. Tokens whose value does not change, and all spacing, are copied.
 
     Args:
         line: Row of text.

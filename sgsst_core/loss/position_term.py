@@ -40,13 +40,13 @@ class ScaledView:
         return self.image.shape[0], self.image.shape[1]
 
     def weights(self, layer: str, cells: Rectangle, pyramid: PositionWeights) -> Tensor | None:
-        """Return the weights [h, w] of some cells of a layer, as box averages; None for equal weights."""
+        """Return the weights [h, w] of a block of cells of a layer, as box averages; None for equal weights."""
         if pyramid is None:
             return None
         return pyramid[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
 
     def count(self, layer: str, pyramid: PositionWeights) -> Tensor:
-        """Return the number of cells of a layer in the whole scale, or the sum of their weights, float64 scalar."""
+        """Return the sum of the weights of all cells of a layer, float64 scalar; their number for equal weights."""
         stride = layer_stride(layer)
         cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
         weights = self.weights(layer, cells, pyramid)
@@ -71,7 +71,7 @@ class Objective:
 
 
 class StyledRegion(NamedTuple):
-    """Positions of a view, and the style that they are compared with."""
+    """Region of a view, and the style that its features are compared with."""
 
     style: StyleTarget
     weights: PositionWeights

@@ -209,7 +209,7 @@ class StatisticsTerms:
         self._gradients: dict[str, list[tuple[StyleGradient, StyledRegion]]] = {}
 
     def zero(self) -> list[LayerStatistics]:
-        """Return the statistics of no tile."""
+        """Return statistics of zero pixels, to which those of tiles are added."""
         network, device = self._network, self._view.image.device
         return [LayerStatistics.zero(network.channels(layer), device) for _ in self._regions for layer in self._layers]
 

@@ -65,7 +65,8 @@ class Up:
 def find_up(subject: Subject) -> Up:
     """Estimate the up direction.
 
-    It follows from the ground plane, else from the subject's long axis and its wider end, else from convention (-y).
+    The ground plane determines it. Without one, the long axis of the subject and its wider end do; else it is -y, the
+    usual convention.
     """
     axes = _principal_axes(subject)
     ground = _ground(subject, [*axes.T, *torch.eye(3, dtype=torch.float64)])
@@ -94,7 +95,7 @@ def _times(larger: float, smaller: float) -> str:
 
 
 def _habit(direction: Tensor) -> float:
-    """Return a positive number if a direction has the usual sense along its axis: -y (COLMAP), +z (Blender) or +x."""
+    """Return a positive number if a direction is the usual one of its axis: -y (COLMAP), +z (Blender) or +x."""
     x, y, z = (float(value) for value in direction)
     return -y if abs(y) >= max(abs(x), abs(z)) else z if abs(z) >= abs(x) else x
 
@@ -176,7 +177,7 @@ def _layer(subject: Subject, up: Tensor) -> tuple[Tensor, float]:
 
 
 def _covered_fraction(points: Tensor, up: Tensor, rows: Tensor) -> float:
-    """Return the fraction of the area of points [P, 3], seen from above, that the points `rows` ([P] bool) cover.
+    """Return the area of some of the points [P, 3] (`rows` [P] bool) as a fraction of the area of all, seen from above.
 
     Areas are counted in grid cells.
     """
@@ -191,7 +192,7 @@ def _covered_fraction(points: Tensor, up: Tensor, rows: Tensor) -> float:
 
 
 def _foot(subject: Subject, up: Tensor) -> float:
-    """Return the convex hull area of the lowest points relative to the whole subject's, both seen from above."""
+    """Return the area of the lowest points as a fraction of the subject's area: convex hulls, seen from above."""
     heights = subject.points @ up
     flat = subject.points @ _across(up)
     # quantiles, so that a few strays do not count as a foot

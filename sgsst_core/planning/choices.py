@@ -1,7 +1,7 @@
-"""Choices of a plan, each with the lines that state its reasons to users.
+"""Choices of a plan, with the plan lines that state their reasons.
 
-Some of them follow from the settings and a first measurement alone. Later measurements depend on these, so the probe
-makes them too.
+Some choices depend only on the settings and a first measurement. Later measurements depend on these choices, so the
+probe makes them too.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ANOTHER_LOSS = "differs from the paper's loss"
 
 
 def rendered_gaussians(survey: Survey, settings: Settings) -> Tensor:
-    """Return the mask [N] bool of Gaussians that are rendered: those that a view shows, or all if requested."""
+    """Return the mask [N] bool of rendered Gaussians: those that any view shows, or all of them if requested."""
     visible = survey.total_blend_weights > 0
     return torch.ones_like(visible) if "unseen" in settings.keep else visible
 
@@ -337,7 +337,7 @@ def precision_of(asked: Precision, ratio: float | None) -> Precision:
 
 
 def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decision]]:
-    """Choose the network's precision; there is no line if float32 was requested."""
+    """Choose the network's precision. The plan has no line about it if float32 was requested."""
     asked, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
     chosen = precision_of(asked, ratio)
     if asked == "float32":
@@ -407,7 +407,7 @@ def _launch_times(cost: LaunchCost) -> str:
 
 
 def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[CachedWeights, Decision]:
-    """Choose the format of cached blend weights: float32 if they fit, else half precision; none if it does not pay."""
+    """Choose the format of cached blend weights: float32 or half precision, as fits; none if it saves no time."""
     raster, item = probe.raster, "blend weights"
     why_not = _why_not_cached(probe, settings, visits)
     if why_not is not None:
@@ -429,7 +429,7 @@ def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[Cac
 
 
 def _why_not_cached(probe: Probe, settings: Settings, visits: Visits) -> str | None:
-    """Return the reason for caching no blend weights; None if they are cached."""
+    """Return the reason why blend weights are not cached; None if they are."""
     raster, visited = probe.raster, f"a view is visited {visits.of_a_view:.1f} times"
     if settings.cached_weights == "none" or "blend-weights" in settings.keep:
         return "requested"

@@ -79,7 +79,7 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
     Views are rendered only if they show few Gaussians.
 
     Raises:
-        CameraError: If they see nearly nothing of it.
+        CameraError: If the cameras show almost nothing of the scene.
     """
     shown = shown_by(scene.means, cameras, near)
     if shown.typical >= _LITTLE_SHOWN:

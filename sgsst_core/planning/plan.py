@@ -111,7 +111,7 @@ class Plan:
     prediction: Prediction | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return decisions and prediction in a JSON-serializable form."""
+        """Return decisions and prediction as JSON-serializable values."""
         return {
             "decisions": [asdict(decision) for decision in self.decisions],
             "prediction": asdict(self.prediction) if self.prediction else None,

@@ -101,7 +101,7 @@ class Share:
         variant: Name of the variant.
         votes: Number of its votes.
         total: Number of all votes.
-        low: Lower end of the 95 % Wilson interval of the share.
+        low: Lower end of the 95 % Wilson interval of the fraction.
         high: Upper end of this interval.
     """
 
@@ -167,7 +167,7 @@ def write_study(
 
 
 def count_votes(key: Path, files: Sequence[Path]) -> list[Share]:
-    """Return the share of each variant, the most chosen first.
+    """Return the fraction of votes of each variant, in descending order.
 
     A file that was saved twice counts once: the longer one of the same voter.
 

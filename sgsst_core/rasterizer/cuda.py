@@ -90,7 +90,7 @@ class CudaRasterizer(Rasterizer):
         """Validate a CUDA device and return it.
 
         Raises:
-            SettingsError: If it is no GPU, or there is none.
+            SettingsError: If `device` is not a GPU, or this machine has no GPU.
         """
         chosen = torch.device(device or "cuda")
         if chosen.type != "cuda" or not torch.cuda.is_available():

@@ -1,1 +1,1 @@
-"""Regions of a scene: their definition, their selection by masks, and their share of every pixel."""
+"""Regions of a scene: their definition, their selection by masks, and their weights in every pixel."""

@@ -62,13 +62,13 @@ class CameraPath:
             raise CameraError("A camera path needs at least one camera. Give some.")
         self._width, self._height = mode((camera.width, camera.height) for camera in cameras)
         changes = _changes(cameras)
-        kept = [0, *(index + 1 for index, change in enumerate(changes) if change > _NO_CHANGE)]
-        self.cameras = [cameras[index] for index in kept]
+        distinct = [0, *(index + 1 for index, change in enumerate(changes) if change > _NO_CHANGE)]
+        self.cameras = [cameras[index] for index in distinct]
         self.knots: NDArray[np.float64] = np.concatenate(
-            [[0.0], np.cumsum(np.sqrt([changes[index - 1] for index in kept[1:]]))]
+            [[0.0], np.cumsum(np.sqrt([changes[index - 1] for index in distinct[1:]]))]
         )
         self._intrinsics = np.stack([_relative_intrinsics(camera) for camera in self.cameras])
-        if len(kept) > 1:
+        if len(distinct) > 1:
             centers = _centers(self.cameras)
             self._positions = CubicHermiteSpline(self.knots, centers, catmull_rom_tangents(self.knots, centers))
             self._rotations = Slerp(self.knots, Rotation.from_matrix(_rotations(self.cameras)))

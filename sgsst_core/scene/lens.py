@@ -32,8 +32,8 @@ class Lens:
 
     Attributes:
         model: Name of the camera model in the camera file.
-        kind: Formula: "radial" for the rational model, "fisheye" for the equidistant one; None if there is none here,
-            so that photos cannot be undistorted.
+        kind: Formula: "radial" for the rational model, "fisheye" for the equidistant one; None if the model is not
+            implemented, so photos cannot be undistorted.
         coefficients: Coefficients in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 for a fisheye.
         width, height: Size of the photos in pixels.
         fx, fy, cx, cy: Intrinsics of the photos in pixels.
@@ -98,18 +98,18 @@ def fisheye_lens(
 
 
 def other_lens(model: str, size: tuple[int, int], pinhole: tuple[float, float, float, float]) -> Lens:
-    """Return a lens whose photos cannot be undistorted here."""
+    """Return a lens of a model that is not implemented, so its photos cannot be undistorted."""
     return Lens(model, None, (), *size, *pinhole)
 
 
 def undistorted(camera: Camera) -> Camera:
-    """Return the camera whose frame an undistorted photo fills without black borders.
+    """Return the pinhole camera that undistorted photos fill without black borders.
 
-    Focal lengths stay, so pixels keep their size in the photo's center, as in COLMAP's `image_undistorter`. The frame
-    is reduced around the principal point, in its own aspect ratio, and never enlarged.
+    Focal lengths do not change, so pixels keep their size in the photo's center, as in COLMAP's `image_undistorter`.
+    The frame is cropped around the principal point with its aspect ratio. It is never enlarged.
 
     Raises:
-        CameraError: If the lens has no formula here, or its coefficients leave less than a tenth of the frame.
+        CameraError: If the lens model is not implemented, or less than a tenth of the frame remains.
     """
     lens = camera.lens
     if lens is None:
@@ -133,7 +133,7 @@ def undistorted(camera: Camera) -> Camera:
 
 @functools.lru_cache(maxsize=1024)  # most cameras of a capture share their lens
 def _largest_scale(lens: Lens, size: tuple[int, int], intrinsics: tuple[float, float, float, float]) -> float:
-    """Return the largest factor, at most 1, by which a frame has to be reduced to lie inside the photo."""
+    """Return the largest factor, at most 1, by which a cropped frame lies inside the photo."""
     low, high = 0.0, 1.0
     if _fills(lens, size, intrinsics, high):
         return high
@@ -144,7 +144,7 @@ def _largest_scale(lens: Lens, size: tuple[int, int], intrinsics: tuple[float, f
 
 
 def _fills(lens: Lens, size: tuple[int, int], intrinsics: tuple[float, float, float, float], scale: float) -> bool:
-    """Return whether a frame reduced by a factor lies inside the photo, which maps to it without folds."""
+    """Return whether a frame scaled by a factor lies inside the photo, and the distortion has no fold there."""
     fx, fy, cx, cy = intrinsics
     along = torch.linspace(0, 1, _NODES, dtype=torch.float64)
     x, y = scale * (along * size[0] - cx) / fx, scale * (along * size[1] - cy) / fy

@@ -46,7 +46,7 @@ class Rendering:
     def requested(self, mode: RenderMode, eps2d: float | None) -> Rendering:
         """Return the rendering for a requested mode and blur, where None and "auto" stand for this rendering's own.
 
-        Another mode than this one's has the usual blur. Flat Gaussians stay flat in classic mode.
+        If the mode changes, the blur is that mode's default. Flat Gaussians stay flat in classic mode.
 
         Raises:
             SettingsError: If there is no such mode, or the blur is out of range.

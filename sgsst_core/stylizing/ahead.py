@@ -50,7 +50,7 @@ class PhotosAhead:
         """Return a photo [H, W, 3] on the device; it is read now unless it has been prefetched.
 
         Raises:
-            ImageError: If reading fails, in the thread or here.
+            ImageError: If reading fails.
         """
         if self._next is not None and self._next[0] == index:
             photo, self._next = self._next[1], None

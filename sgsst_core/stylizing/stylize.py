@@ -39,7 +39,7 @@ def stylize(
     weights: BackboneWeights | None = None,
     **settings: Any,
 ) -> F:
-    """Stylize a scene from start to finish. The given scene stays as it is.
+    """Stylize a scene from start to finish. The given scene is not changed.
 
     Args:
         scene: Result of `load_scene`, a `Scene`, or a dictionary of tensors of gsplat (`scene_of_splats`).
@@ -57,7 +57,7 @@ def stylize(
         settings: Further fields of `Settings`, such as `steps_sos=100`.
 
     Returns:
-        Stylized scene in the form in which it was given. `save` writes it to a file.
+        Stylized scene, of the type of the given one. `save` writes it to a file.
 
     Raises:
         InvalidInputError: If an input or a setting cannot be used.

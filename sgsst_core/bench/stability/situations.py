@@ -227,7 +227,7 @@ def _rounding_of_features(
 
 
 class _Rounded(DecisionsOf):
-    """Float64 network that rounds the features of every layer as float32 does: equal values to equal values.
+    """Float64 network whose features are rounded after every layer, slightly more than in float32.
 
     Images are rounded too, because the pixels of coarser scales are averages.
     """

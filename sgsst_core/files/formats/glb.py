@@ -74,7 +74,7 @@ _WRONG_JSON = (ValueError, TypeError, KeyError, IndexError, AttributeError, Recu
 
 @dataclass(frozen=True)
 class Accessor:
-    """Checked place of an attribute's values in the file.
+    """Checked location of an attribute's values in the file.
 
     Attributes:
         offset: Byte offset of the first value.

@@ -67,7 +67,7 @@ def _read_header(start: FileStart) -> PlySceneHeader:
 
 
 def _notes(above: bool, sources: dict[str, str]) -> tuple[str, ...]:
-    """Return notes on a PLY with SH bands above degree 3, or of a variant."""
+    """Return notes on SH bands above degree 3 and on the properties of PLY variants."""
     notes = ["SH bands above degree 3 are not drawn; only a stylized PLY keeps them"] if above else []
     if sources:
         notes.append(f"{', '.join(dict.fromkeys(sources.values()))} become the usual properties of a stylized PLY")

@@ -103,7 +103,7 @@ class PlyHeader:
 
 
 def comment_of(line: bytes) -> str | None:
-    """Return the comment in a line of a header, without its keyword; None if the line is none."""
+    """Return the text of a comment line of a header; None if the line is not a comment."""
     keyword, _, comment = line.strip().partition(b" ")
     return comment.decode("latin-1").strip() if keyword == b"comment" else None
 

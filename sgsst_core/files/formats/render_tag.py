@@ -1,4 +1,4 @@
-"""Render mode that a scene's file states, in comments of a PLY or in a field of another format.
+"""Render modes that scene files state: as comments of a PLY, or as a field of another format.
 
 Comments are Brush's `SplatRenderMode: mip` (also of splat-transform and gsplat), Postshot's `antialiased 1`, fVDB's
 `fvdb_ply_af_8198767135antialias|int64|1` and `...eps2d|double|0.3`, and our own `eps2d 0.1`.
@@ -30,12 +30,12 @@ _UNSCENTED = re.compile(r"\b3dgr?ut\b|\b3dgrt\b|\bunscented", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class RenderTag:
-    """Statement of a scene's file about its render mode.
+    """Render mode that a scene file states.
 
     Attributes:
         rendering: Stated render mode, else classic.
-        reason: Where the file states it; empty if it does not.
-        warnings: Pairs of how the scene is drawn, and why renders may differ from those of its trainer.
+        reason: Part of the file that states it, such as "the file's flag"; empty if none does.
+        warnings: Pairs of texts: how the scene is drawn, and why renders may differ from those of its trainer.
     """
 
     rendering: Rendering = CLASSIC
@@ -88,9 +88,9 @@ def stated(mode: str, reason: str, eps2d: float | None = None, warnings: tuple[t
     """Return the tag of a file that states a render mode, with a warning if the scene can only be approximated.
 
     Args:
-        mode: One of `Rendering.mode`; others are classic, with a warning.
-        reason: Where the file states it.
-        eps2d: Stated blur; None for the usual one.
+        mode: Stated mode, one of `Rendering.mode`. Any other is read as classic, with a warning.
+        reason: Part of the file that states it.
+        eps2d: Stated blur; None for the default.
         warnings: Further warnings.
     """
     if mode not in ("classic", "antialiased", "2dgs"):
@@ -103,11 +103,11 @@ def stated(mode: str, reason: str, eps2d: float | None = None, warnings: tuple[t
 
 
 def extras_tag(extras: object, where: str) -> RenderTag:
-    """Return the render mode that fields of a JSON document state, as `extras_of` writes them.
+    """Return the render mode that a JSON document states in the fields that `extras_of` writes.
 
     Args:
         extras: Value that should be a JSON object.
-        where: Name of the document, for texts.
+        where: Name of the document in messages.
     """
     members = extras if isinstance(extras, dict) else {}
     model, eps2d = members.get("model", "default"), members.get("eps2d")
@@ -118,7 +118,7 @@ def extras_tag(extras: object, where: str) -> RenderTag:
 
 
 def extras_of(rendering: Rendering) -> dict[str, Any]:
-    """Return fields of a JSON document that state a render mode; none for the usual one."""
+    """Return the fields of a JSON document that state a render mode; empty for the default mode."""
     model = {} if rendering.mode == CLASSIC.mode else {"model": rendering.mode}
     return model if rendering.eps2d == EPS2D else {**model, "eps2d": rendering.eps2d}
 
@@ -131,7 +131,7 @@ def _unscented(where: str) -> tuple[str, str]:
 
 
 def _usable_eps2d(value: Any) -> float | None:
-    """Return a stated blur as a number; None if it is none, or out of range."""
+    """Return a stated blur as a float; None if it is not a number or out of range."""
     try:
         number = float(value)
     except (ValueError, OverflowError):
@@ -140,13 +140,13 @@ def _usable_eps2d(value: Any) -> float | None:
 
 
 def comment_lines(rendering: Rendering) -> list[str]:
-    """Return the lines of a PLY header that state a render mode; none for the usual one."""
+    """Return the lines of a PLY header that state a render mode; empty for the default mode."""
     mode, eps2d = _stating(rendering)
     return [*([] if rendering.mode == "classic" else [mode]), *([] if rendering.eps2d == EPS2D else [eps2d])]
 
 
 def retagged(raw: bytes, header: PlyHeader, rendering: Rendering) -> bytes:
-    """Return the bytes of a PLY header with comments that state a render mode; unchanged if the header states it.
+    """Add comments that state a render mode to the bytes of a PLY header, unless the header already states that mode.
 
     Args:
         raw: Bytes of the header, which may differ from those of `header` in the number of Gaussians.

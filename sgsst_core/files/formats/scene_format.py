@@ -1,4 +1,4 @@
-"""Entry of a scene format in the registry, and what its functions exchange."""
+"""Registry entry of a scene format, and the types of its functions' arguments."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ class OpenScene(Protocol):
     path: Path
 
     def read(self, offset: int, buffer: NDArray[np.uint8]) -> None:
-        """Fill a buffer with the bytes of the file from `offset` on."""
+        """Read bytes of the file, starting at `offset`, until a buffer is full."""
 
 
 @dataclass(frozen=True)
 class SceneHeader:
-    """Checked header of a scene file. Formats add what their readers need in subclasses.
+    """Checked header of a scene file. Formats subclass it to add fields for their readers.
 
     Attributes:
         format: Format of the file.
         count: Number of Gaussians.
         coefficients: SH coefficients per color channel above degree 0.
-        notes: Notes on what is not read, or read in another way than stored.
+        notes: Notes on contents that are not read, or not read as stored.
         tag: Render mode that the file states.
     """
 
@@ -72,20 +72,19 @@ class SceneFormat:
     options, messages and the page.
 
     Attributes:
-        name: File name suffix without its first dot. It names the format in options, reports and the REST API.
-        title: Name of the format in texts.
-        matches: Whether a file has this format, by its content.
+        name: File name suffix without its first dot. It is also the name in options, reports and the REST API.
+        title: Name of the format in messages.
+        matches: Check whether the content of a file has this format.
         read_header: Header check: reads the header without allocating memory for the data, and compares it with the
             size of the file. Raises a SceneError if the header is wrong or the file is truncated. It runs in the API
             process.
         bytes_per_gaussian: Typical size of a Gaussian of SH degree 3 in a file.
-        read: Reader, which fills the arrays of a scene, allocated for the header's numbers, and may return notes beyond
-            the header's. It need not check for non-finite values. None for PLY, whose scenes are written back with all
-            other data (`scene_file`).
+        read: Reader. It fills arrays that were allocated by the header, and may return further notes. It need not check
+            for non-finite values. None for PLY, which `scene_file` reads, because its other data is written back.
         write: Writer of a scene's arrays and its render mode, if the format can state one. It raises an OutputError
             without path if it cannot represent the arrays. None if the format is only read.
         shown: Whether the page shows scenes of this format (`api/static/viewer`).
-        magic: First bytes of all files of a format that the page does not show, so that it can say so.
+        magic: First bytes of all files of a format that the page detects but cannot show.
         media_type: Media type of downloads.
     """
 

@@ -260,7 +260,7 @@ def _dimensions(path: Path, files: _Files, name: str, least: int, most: int | No
         files: Files of the scene.
         name: Name of the image.
         least: Minimum number of pixels.
-        most: Maximum number of pixels; None for what writers need for `least` Gaussians.
+        most: Maximum number of pixels; None for the largest image that a writer would create for `least` Gaussians.
     """
     head = files.load(name, 30, whole=False).ljust(30, b"\0")
     kind, size = head[12:16], None

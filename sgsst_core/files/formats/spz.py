@@ -213,7 +213,7 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
 
 
 def _tag(flags: int, *, believed: bool) -> RenderTag:
-    """Return the render mode that flags state, with a warning instead if they are not believed."""
+    """Return the render mode that the flags state; if the flag is ignored, return the default mode with a warning."""
     if not flags & _ANTIALIASED:
         return UNTAGGED
     if believed:
@@ -226,7 +226,10 @@ def _tag(flags: int, *, believed: bool) -> RenderTag:
 
 
 def _extension_records(data: bytes) -> list[tuple[int, bytes]]:
-    """Return type and content of whole extension records: type and length in bytes (uint32), then the content."""
+    """Return type and content of each complete extension record.
+
+    A record is its type (uint32), its length in bytes (uint32) and its content.
+    """
     records, position = [], 0
     while position + 8 <= len(data):
         kind, length = struct.unpack_from("<II", data, position)

@@ -57,7 +57,7 @@ def _is_obj(head: bytes) -> bool:
 
 
 def refuse_folder(folder: Path) -> NoReturn:
-    """Raise the SceneError for a folder in the place of a scene, which names the scene in it or how to export one."""
+    """Raise a SceneError about a folder given as a scene: it names the scene in the folder, or how to export one."""
     for pattern in _SCENES:
         scene = max(folder.glob(pattern), key=_numbers, default=None)
         if scene is not None:

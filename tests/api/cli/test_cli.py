@@ -908,8 +908,8 @@ def test_render_writes_a_video_whose_frames_are_the_renders(
     assert len(decoded) == len(list(images.parent.iterdir())) == 8
     rendered = [np.asarray(Image.open(path)).astype(float) for path in sorted(images.parent.iterdir())]
     for index, frame in enumerate(decoded):
-        found = frame.reformat(format="rgb24", src_colorspace="ITU709", dst_color_range="JPEG").to_ndarray()
-        errors = [np.abs(found - image[: frame.height, : frame.width]).mean() for image in rendered]
+        pixels = frame.reformat(format="rgb24", src_colorspace="ITU709", dst_color_range="JPEG").to_ndarray()
+        errors = [np.abs(pixels - image[: frame.height, : frame.width]).mean() for image in rendered]
         assert abs(int(np.argmin(errors)) - index) <= 1
         assert errors[index] < 10  # H.264 halves the resolution of colors, which matters at this size
 

@@ -57,8 +57,8 @@ def test_masks_of_regions_are_sent(
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "mask.bin").write_bytes(content)
     Image.new("L", (64, 48), 255).save(tmp_path / "a" / "view_0.png")
-    told = [f"--region=one:mask={tmp_path}/a/mask.bin", f"--region=two:mask={tmp_path}/b/mask.bin"]
-    job_id = submit(files, capsys, *told, f"--region=three:masks={tmp_path}/a")
+    masked = [f"--region=one:mask={tmp_path}/a/mask.bin", f"--region=two:mask={tmp_path}/b/mask.bin"]
+    job_id = submit(files, capsys, *masked, f"--region=three:masks={tmp_path}/a")
     with service.client() as client:
         job = client.get(f"/v1/jobs/{job_id}").json()
         second = client.get(f"/v1/jobs/{job_id}/inputs/mask:1").content

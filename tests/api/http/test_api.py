@@ -284,8 +284,8 @@ def test_masks_select_regions(client: httpx.Client, files: dict[str, bytes]) -> 
     by_view = [("mask", (f"right/view_{i}.png", views.getvalue())) for i in range(2)]
     parts = [*form(files), ("mask", ("left.bin", LEFT)), *by_view]
     regions = [{"name": "right", "select": "masks=right"}, {"name": "left", "select": "mask=left.bin", "freeze": True}]
-    told = {"parameters": json.dumps({"regions": regions, "preset": "preview"})}
-    good = client.post("/v1/jobs?dry_run=true", files=parts, data=told)
+    data = {"parameters": json.dumps({"regions": regions, "preset": "preview"})}
+    good = client.post("/v1/jobs?dry_run=true", files=parts, data=data)
     assert good.status_code == 200, good.text
     decisions = {each["item"]: each["decision"] for each in good.json()["plan"]["decisions"]}
     assert "308 Gaussians stay unchanged" in decisions["region left"]

@@ -440,7 +440,7 @@ def jpeg_of_scans(count: int) -> bytes:
     return data[:-2] + data[data.rindex(b"\xff\xda") : -2] * count + data[-2:]
 
 
-def picture(format_: str, width: int, height: int) -> bytes:
+def image_bytes(format_: str, width: int, height: int) -> bytes:
     file = io.BytesIO()
     Image.new("L", (width, height)).save(file, format_)
     return file.getvalue()
@@ -470,18 +470,21 @@ IMAGES: list[tuple[str, Make]] = [
     ("PNG with broken EXIF", lambda f: tagged()),
     ("JPEG bomb", lambda f: jpeg(65_500, 65_500)),
     ("JPEG of no height", lambda f: jpeg(100, 0)),
-    ("JPEG truncated", lambda f: picture("JPEG", 500, 500)[:-900]),
-    ("GIF bomb", lambda f: picture("GIF", 8, 8)[:6] + struct.pack("<HH", 65_535, 65_535) + picture("GIF", 8, 8)[10:]),
+    ("JPEG truncated", lambda f: image_bytes("JPEG", 500, 500)[:-900]),
+    (
+        "GIF bomb",
+        lambda f: image_bytes("GIF", 8, 8)[:6] + struct.pack("<HH", 65_535, 65_535) + image_bytes("GIF", 8, 8)[10:],
+    ),
     (
         "TIFF bomb",
-        lambda f: picture("TIFF", 8, 8).replace(
+        lambda f: image_bytes("TIFF", 8, 8).replace(
             struct.pack("<HHII", 256, 4, 1, 8), struct.pack("<HHII", 256, 4, 1, 2**31)
         )[:200],
     ),
     ("JPEG of 400 scans", lambda f: jpeg_of_scans(400)),
     ("PPM of endless comments", lambda f: b"P3 10 10 255\n" + b"#\n" * 2 * MB + b"1 " * 300),
-    ("JPEG 2000", lambda f: picture("JPEG2000", 64, 64)),
-    ("WebP cut off", lambda f: picture("WEBP", 64, 64)[:20]),
+    ("JPEG 2000", lambda f: image_bytes("JPEG2000", 64, 64)),
+    ("WebP cut off", lambda f: image_bytes("WEBP", 64, 64)[:20]),
     (
         "PostScript",
         lambda f: b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n%%EndComments\n(/etc/passwd) run\nshowpage\n",
@@ -587,7 +590,9 @@ def test_false_colmap_models_are_rejected(client: httpx.Client, files: Files, na
     assert answer.status_code == 202 or answer.json()["detail"].startswith("None of the 1 cameras sees"), answer.text
 
 
-@pytest.mark.parametrize("photos", [[], [("photos", ("other.png", picture("PNG", 64, 48)))]], ids=["none", "others"])
+@pytest.mark.parametrize(
+    "photos", [[], [("photos", ("other.png", image_bytes("PNG", 64, 48)))]], ids=["none", "others"]
+)
 def test_camera_files_cannot_read_server_files(
     client: httpx.Client, files: Files, tmp_path: Path, photos: list[tuple[str, tuple[str, bytes]]]
 ) -> None:
@@ -645,10 +650,10 @@ NAMES = [
 @pytest.mark.parametrize("role", ["scene", "style", pytest.param("photos", marks=pytest.mark.slow)])
 def test_file_names_cannot_escape_folder(client: httpx.Client, service: Service, files: Files, role: str) -> None:
     before = {path for path in service.data.parent.rglob("*") if "blobs" not in path.parts}
-    photos = [("photos", (f"view_{i}.png", picture("PNG", 64, 48))) for i in range(3)] if role == "photos" else []
+    photos = [("photos", (f"view_{i}.png", image_bytes("PNG", 64, 48))) for i in range(3)] if role == "photos" else []
     for name in NAMES:
         encoded = name.encode().replace(b'"', b"%22").replace(b"\r", b"%0D").replace(b"\n", b"%0A")
-        content = files.get(role, picture("PNG", 64, 48))
+        content = files.get(role, image_bytes("PNG", 64, 48))
         body = [*((r, c) for r, c in form(files) if r != role), *photos]
         request = client.build_request("POST", "/v1/jobs", files=[*body, (role, ("NAME", content))])
         data = request.read().replace(b'filename="NAME"', b'filename="' + encoded + b'"')

@@ -43,9 +43,9 @@ def test_array_selects_its_rows(tmp_path: Path, file: SceneFile, kind: type) -> 
 
 def test_lowest_bit_of_a_byte_is_its_first_gaussian(tmp_path: Path, file: SceneFile) -> None:
     (tmp_path / "m.BIN").write_bytes(bytes([0b00000011, 0b10000000, 0b00001000]))
-    found = read_mask(tmp_path / "m.BIN", file)
-    assert found.dtype == torch.bool
-    assert found.nonzero().flatten().tolist() == [0, 1, 15, 19]
+    mask = read_mask(tmp_path / "m.BIN", file)
+    assert mask.dtype == torch.bool
+    assert mask.nonzero().flatten().tolist() == [0, 1, 15, 19]
 
 
 @pytest.mark.parametrize("rows", [1, 7, 8, 9, 20])

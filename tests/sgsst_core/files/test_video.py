@@ -39,7 +39,7 @@ def decoded(out, codec=None):
         if codec is None:
             return list(container.decode(stream)), stream
         decoder = av.CodecContext.create(codec, "r")
-        return [found for packet in container.demux(stream) for found in decoder.decode(packet)], stream
+        return [frame for packet in container.demux(stream) for frame in decoder.decode(packet)], stream
 
 
 def psnr(image, expected):
@@ -54,9 +54,9 @@ def test_decoded_frames_are_the_written_ones(tmp_path, name, codec):
     frames, stream = decoded(out)
     assert (stream.codec_context.name, stream.codec_context.pix_fmt) == (codec, "yuv420p")
     assert stream.average_rate == Fraction(25)
-    assert [float(found.time) for found in frames] == pytest.approx([index / 25 for index in range(COUNT)], abs=1e-3)
-    for index, found in enumerate(frames):
-        rgb = found.reformat(format="rgb24", src_colorspace="ITU709", dst_color_range="JPEG").to_ndarray()
+    assert [float(each.time) for each in frames] == pytest.approx([index / 25 for index in range(COUNT)], abs=1e-3)
+    for index, each in enumerate(frames):
+        rgb = each.reformat(format="rgb24", src_colorspace="ITU709", dst_color_range="JPEG").to_ndarray()
         assert psnr(rgb, frame(index)) > 35
     context = stream.codec_context
     assert (context.color_primaries, context.color_trc, context.colorspace, context.color_range) == (1, 13, 1, 1)
@@ -73,8 +73,8 @@ def test_webm_has_an_alpha_channel(tmp_path):
     write(tmp_path / "video.webm", alpha=True)
     frames, stream = decoded(tmp_path / "video.webm", "libvpx-vp9")
     assert stream.metadata["alpha_mode"] == "1"
-    found = frames[5].to_ndarray(format="rgba").astype(int)
-    assert np.abs(found[:, :, 3] - frame(5, alpha=True)[:, :, 3])[[10, 30, 50]].max() <= 3
+    pixels = frames[5].to_ndarray(format="rgba").astype(int)
+    assert np.abs(pixels[:, :, 3] - frame(5, alpha=True)[:, :, 3])[[10, 30, 50]].max() <= 3
 
 
 @pytest.mark.parametrize("alpha", [False, True])

@@ -132,13 +132,13 @@ def test_page_is_complete_and_self_contained() -> None:
 
 
 def test_sheet_is_embedded_unchanged() -> None:
-    def pictures(sheet: bytes | None) -> list[str]:
+    def images_of(sheet: bytes | None) -> list[str]:
         page = parsed(sample_report(0, 0), sheet)
         return [attributes["src"] or "" for tag, attributes in page.elements if tag == "img"]
 
-    (source,) = pictures(sample_sheet())
+    (source,) = images_of(sample_sheet())
     assert base64.b64decode(source.removeprefix("data:image/jpeg;base64,")) == sample_sheet()
-    assert pictures(None) == []
+    assert images_of(None) == []
 
 
 def test_sections_are_in_order() -> None:

@@ -58,10 +58,10 @@ def poses(cameras):
 def test_path_passes_through_the_cameras():
     cameras = some_cameras()
     path = CameraPath(cameras)
-    found = path.at(path.knots)
-    assert np.allclose(poses(found), poses(cameras), rtol=0, atol=1e-12)
-    assert np.allclose([c.fx for c in found], [c.fx for c in cameras], rtol=1e-12)
-    assert {c.world_to_camera.dtype for c in found} == {torch.float64}
+    positions_at_knots = path.at(path.knots)
+    assert np.allclose(poses(positions_at_knots), poses(cameras), rtol=0, atol=1e-12)
+    assert np.allclose([c.fx for c in positions_at_knots], [c.fx for c in cameras], rtol=1e-12)
+    assert {c.world_to_camera.dtype for c in positions_at_knots} == {torch.float64}
 
 
 def test_positions_are_those_of_the_barry_goldman_pyramid():
@@ -167,9 +167,9 @@ def test_no_cameras_are_refused():
 )
 def test_any_cameras_make_a_finite_path(given_poses):
     path = CameraPath([camera(center, turned(angle)) for center, angle in given_poses])
-    found = poses(path.evenly(20))
-    assert np.isfinite(found).all()
-    assert np.allclose(found[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-9)
+    path_poses = poses(path.evenly(20))
+    assert np.isfinite(path_poses).all()
+    assert np.allclose(path_poses[:, :3, :3] @ path_poses[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-9)
 
 
 def test_tangents_of_points_on_a_parabola_are_exact():

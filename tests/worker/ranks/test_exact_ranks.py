@@ -61,9 +61,9 @@ def gradient(
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     survey = survey_views(scene, [camera], rasterizer)
     weighted = survey.uncovered_share > 0.01
-    picture_ = Style.of(synthetic_image(90, 110, seed=4, dtype=dtype))
+    style_images = Style.of(synthetic_image(90, 110, seed=4, dtype=dtype))
     regions = regions and regions.resolved(survey.total_blend_weights)
-    styles = JobStyles.prepared(picture_, regions, make_settings(), scene.sh_dc, survey.total_blend_weights)
+    styles = JobStyles.prepared(style_images, regions, make_settings(), scene.sh_dc, survey.total_blend_weights)
     views = Views(
         scene,
         [camera],
@@ -108,18 +108,18 @@ def test_gradient_matches_one_rank(
     camera = cameras(1, width, height)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, dtype, tile_size)
     results = on_ranks(ranks, gradient, scene, camera, dtype, tile_size)
-    for actual, found_loss, _ in results:
+    for actual, actual_loss, _ in results:
         assert relative_error(actual, expected) < BOUNDS[dtype]
-        assert found_loss == pytest.approx(loss, rel=BOUNDS[dtype])
+        assert actual_loss == pytest.approx(loss, rel=BOUNDS[dtype])
         assert torch.equal(actual, results[0][0])
 
 
 def test_division_by_speed_preserves_the_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, None)
-    for actual, found_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
+    for actual, actual_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
         assert relative_error(actual, expected) < 1e-9
-        assert found_loss == pytest.approx(loss, rel=1e-9)
+        assert actual_loss == pytest.approx(loss, rel=1e-9)
 
 
 @pytest.mark.parametrize("style_loss", ["sos", "mixed"])
@@ -132,9 +132,9 @@ def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> No
     regions = Regions(every, labels.clamp(max=2))
     arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss, regions
     expected, loss, _ = gradient(ALONE, *arguments)
-    for actual, found_loss, _ in on_ranks(3, gradient, *arguments):
+    for actual, actual_loss, _ in on_ranks(3, gradient, *arguments):
         assert relative_error(actual, expected) < 1e-9
-        assert found_loss == pytest.approx(loss, rel=1e-9)
+        assert actual_loss == pytest.approx(loss, rel=1e-9)
 
 
 def test_partly_cached_activations_preserve_the_gradient() -> None:
@@ -143,9 +143,9 @@ def test_partly_cached_activations_preserve_the_gradient() -> None:
     memory = int(30_000 * FeatureNetwork(tiny_weights(), dtype=torch.float64).held_bytes_per_pixel())
     results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, memory)
     assert set(results[0][2]) == {True, False}
-    for actual, found_loss, _ in results:
+    for actual, actual_loss, _ in results:
         assert relative_error(actual, expected) < 1e-9
-        assert found_loss == pytest.approx(loss, rel=1e-9)
+        assert actual_loss == pytest.approx(loss, rel=1e-9)
 
 
 @pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
@@ -154,9 +154,9 @@ def test_gradient_of_matched_features_matches_one_rank(style_loss: StyleLossName
     scene, camera = ball(), cameras(1, 128, 96)[0]
     arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss
     expected, loss, _ = gradient(ALONE, *arguments)
-    for actual, found_loss, _ in on_ranks(3, gradient, *arguments):
+    for actual, actual_loss, _ in on_ranks(3, gradient, *arguments):
         assert relative_error(actual, expected) < 1e-9
-        assert found_loss == pytest.approx(loss, rel=1e-9)
+        assert actual_loss == pytest.approx(loss, rel=1e-9)
 
 
 def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str, Any]) -> dict[str, Any]:
