@@ -3,7 +3,9 @@
     python -m benchmarks.triton_targets [--name triton_targets]
 
 Triton's interpreter accepts code that does not compile, so both are needed: tests in the interpreter check the kernels'
-results, and this benchmark checks that they compile. Registers and spills are read from the compilers' output.
+results, and this benchmark checks that they compile. Registers and spills are read from the compilers' output, and the
+instructions that the compositing kernels execute for each pixel of a pair of Gaussian and raster tile from NVIDIA's
+disassembler.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ TARGETS = {
     "sm_100": GPUTarget("cuda", 100, 32),
     "gfx942": GPUTarget("hip", "gfx942", 64),
 }
-_CUTS = {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN, "K": kernels.BLENDED.value}
+_CUTS = {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN}
 _BLOCK = kernels.PROJECTED.value
 #: Types of the arguments that are not constants, as `sgsst_core.rasterizer.triton` passes them.
 _TYPES = {
@@ -84,7 +86,7 @@ def _of_cached_weights(form: str) -> dict[str, Target]:
     scale, weights = _FORMS[form]
     types = {"weights": weights, "gaussians": "*i32"}
     read = {"SCALE": scale, "P": cached_kernels.PIECES.value}
-    keep = Target(cached_kernels.store_pieces, {**_CUTS, "SCALE": scale}, 8, {"weights": weights})
+    keep = Target(cached_kernels.store_pieces, {**_CUTS, "SCALE": scale}, kernels.PIXEL_WARPS, {"weights": weights})
     return {
         f"store_pieces_{form}": keep,
         f"apply_pieces_{form}": Target(cached_kernels.apply_pieces, read, 1, types),
@@ -133,6 +135,8 @@ def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
     }
 
 
+#: Registers of a multiprocessor for each lane, and its largest number of programs, of compute capabilities 8.0 to 10.0.
+WARP_REGISTERS, MAX_PROGRAMS = 2048, 32
 #: Number of channels of the widest layers, and number of color channels.
 _WIDEST, _PIXELS = 512, 3
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -145,8 +149,8 @@ KERNELS: dict[str, Target] = {
         4,
     ),
     "list_tiles": Target(kernels.list_tiles, {"SUPPORT": 8.0, "BLOCK": _BLOCK}, 4),
-    "render": Target(kernels.render, _CUTS, 8),
-    "slot_gradients": Target(kernels.slot_gradients, _CUTS, 8),
+    "render": Target(kernels.render, _CUTS, kernels.PIXEL_WARPS),
+    "slot_gradients": Target(kernels.slot_gradients, _CUTS, kernels.SUMMING_WARPS),
     "add_slots": Target(kernels.add_slots, _ADDED, 4, {"slots": "*fp32"}),
     **{
         f"max_pool_backward_{form}": Target(
@@ -157,9 +161,9 @@ KERNELS: dict[str, Target] = {
         )
         for form, integers, types in (("float32", torch.int32, "*i32"), ("bfloat16", torch.int16, "*i16"))
     },
-    "survey": Target(kernels.survey, _CUTS, 8, {"height": "i32"}),
+    "survey": Target(kernels.survey, _CUTS, kernels.SUMMING_WARPS, {"height": "i32"}),
     "add_slot_weights": Target(kernels.add_slot_weights, _ADDED, 4, {"slots": "*fp32"}),
-    "count_pieces": Target(cached_kernels.count_pieces, _CUTS, 8),
+    "count_pieces": Target(cached_kernels.count_pieces, _CUTS, kernels.SUMMING_WARPS),
     **_of_cached_weights("float32"),
     **_of_cached_weights("half"),
     **_of_features("float32", _WIDEST, "float32"),
@@ -187,19 +191,60 @@ def compile_kernel(name: str, target: str) -> dict[str, Any]:
     started = time.perf_counter()
     compiled = triton.compile(source, target=TARGETS[target], options={"num_warps": kernel.warps})
     seconds = time.perf_counter() - started
-    used = _of_nvidia(compiled.asm["cubin"]) if "cubin" in compiled.asm else _of_amd(compiled.asm["amdgcn"])
+    if "cubin" in compiled.asm:
+        used = _of_nvidia(compiled.asm["cubin"], kernel.warps)
+    else:
+        used = _of_amd(compiled.asm["amdgcn"])
     return {**used, "shared_bytes": compiled.metadata.shared, "seconds": round(seconds, 2)}
 
 
-def _of_nvidia(binary: bytes) -> dict[str, int]:
-    """Read the resource usage from a binary with `cuobjdump`, which comes with Triton."""
-    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+def _of_nvidia(binary: bytes, warps: int) -> dict[str, Any]:
+    """Read registers and spills from a binary with the tools that come with Triton.
+
+    For a compositing kernel, add the warps per multiprocessor and `pixel_instructions`.
+
+    Args:
+        binary: Compiled kernel.
+        warps: Warps per program.
+    """
+    usage = _tool(binary, "cuobjdump", "--dump-resource-usage")
+    fields = dict(re.findall(r"(REG|STACK|LOCAL):(\d+)", usage))
+    registers = int(fields["REG"])
+    used: dict[str, Any] = {"registers": registers, "spilled": int(fields["STACK"]) + int(fields["LOCAL"])}
+    instructions = pixel_instructions(_tool(binary, "nvdisasm", "-c"))
+    if instructions is not None:
+        programs = min(WARP_REGISTERS // (-(-registers // 8) * 8) // warps, MAX_PROGRAMS)
+        used |= {"warps": programs * warps, "pixel_instructions": instructions}
+    return used
+
+
+def _tool(binary: bytes, name: str, option: str) -> str:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "kernel.cubin"
         file.write_bytes(binary)
-        said = subprocess.run([tool, "--dump-resource-usage", file], capture_output=True, text=True, check=True).stdout
-    fields = dict(re.findall(r"(REG|STACK|LOCAL):(\d+)", said))
-    return {"registers": int(fields["REG"]), "spilled": int(fields["STACK"]) + int(fields["LOCAL"])}
+        tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / name
+        return subprocess.run([tool, option, file], capture_output=True, text=True, check=True).stdout
+
+
+def pixel_instructions(assembly: str) -> float | None:
+    """Return the instructions of a thread per pixel and pair, without those outside of the loop over pairs.
+
+    That loop is the shortest one with exponentials, of which each pixel needs one; None if there is no such loop.
+    """
+    labels: dict[str, int] = {}
+    instructions: list[str] = []
+    for line in assembly.splitlines():
+        if label := re.match(r"\s*(\.L_x_\d+):", line):
+            labels[label[1]] = len(instructions)
+        elif code := re.match(r"\s+/\*[0-9a-f]+\*/\s+(.*?);", line):
+            instructions.append(code[1])
+    loops = []
+    for position, instruction in enumerate(instructions):
+        target = re.search(r"\bBRA\b.*(\.L_x_\d+)", instruction)
+        if target and (start := labels[target[1]]) <= position:
+            loop = instructions[start : position + 1]
+            loops.append((len(loop), sum("MUFU.EX2" in each for each in loop)))
+    return min((round(length / pixels, 1) for length, pixels in loops if pixels), default=None)
 
 
 def _of_amd(assembly: str) -> dict[str, int]:

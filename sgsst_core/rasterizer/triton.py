@@ -195,7 +195,7 @@ class TritonRasterizer(Rasterizer):
             kernels.slot_gradients[(tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, image_gradient, slots,
                 camera.width, *band, across,
-                **self.cuts(),
+                **self.cuts(kernels.SUMMING_WARPS),
             )  # fmt: skip
         add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
         return gradient
@@ -216,7 +216,7 @@ class TritonRasterizer(Rasterizer):
             kernels.survey[(tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, slots, transmittance,
                 camera.width, camera.height, across,
-                **self.cuts(),
+                **self.cuts(kernels.SUMMING_WARPS),
             )  # fmt: skip
         visible, block = len(isects.gaussians), kernels.ADDED.value
         if visible:
@@ -240,21 +240,13 @@ class TritonRasterizer(Rasterizer):
             kernels.render[(tiles,)](
                 isects.ranks, isects.starts, isects.gaussians, isects.values, colors, self.background,
                 image, transmittance, camera.width, *band, across,
-                **self.cuts(),
+                **self.cuts(kernels.PIXEL_WARPS),
             )  # fmt: skip
         return image, transmittance
 
-    def cuts(self) -> dict[str, float | int]:
-        """Return the compile-time constants of the blending kernels."""
-        from sgsst_core.rasterizer import triton_kernels as kernels
-
-        return {
-            "ALPHA_MAX": self.alpha_max,
-            "ALPHA_MIN": ALPHA_MIN,
-            "STOP": TRANSMITTANCE_MIN,
-            "K": kernels.BLENDED.value,
-            "num_warps": 8,
-        }
+    def cuts(self, warps: int) -> dict[str, float | int]:
+        """Return the compile-time constants of a compositing kernel with this number of warps per program."""
+        return {"ALPHA_MAX": self.alpha_max, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN, "num_warps": warps}
 
     def _build(self, camera: Camera) -> DeviceIntersections:
         """Project and sort the Gaussians and compute tile intersections; synchronizes with the device once."""

@@ -33,6 +33,7 @@ class CountedPieces:
 
     def __init__(self, rasterizer: TritonRasterizer, camera: Camera, band: Rows) -> None:
         from sgsst_core.rasterizer import triton_cached_kernels as kernels
+        from sgsst_core.rasterizer.triton_kernels import SUMMING_WARPS
 
         self.rasterizer, self.camera, self.band = rasterizer, camera, band
         self.intersections = isects = rasterizer.intersections(camera)
@@ -46,7 +47,7 @@ class CountedPieces:
             kernels.count_pieces[(self.tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces,
                 self.block_pieces, self.ends, camera.width, *band, self.across,
-                **rasterizer.cuts(),
+                **rasterizer.cuts(SUMMING_WARPS),
             )  # fmt: skip
         self.pieces = int(self.block_pieces.sum())
 
@@ -85,6 +86,7 @@ class WeightPieces:
 
     def __init__(self, counted: CountedPieces, precision: Precision) -> None:
         from sgsst_core.rasterizer import triton_cached_kernels as kernels
+        from sgsst_core.rasterizer.triton_kernels import PIXEL_WARPS
 
         rasterizer, isects, index_type = counted.rasterizer, counted.intersections, counted.index_type
         self._rasterizer, self.camera, self.band = rasterizer, counted.camera, counted.band
@@ -106,7 +108,7 @@ class WeightPieces:
                 isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
                 slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights,
                 self.transmittance, self.camera.width, *self.band, counted.across,
-                **rasterizer.cuts(), SCALE=self.scale,
+                **rasterizer.cuts(PIXEL_WARPS), SCALE=self.scale,
             )  # fmt: skip
 
     @property

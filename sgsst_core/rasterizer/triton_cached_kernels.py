@@ -5,7 +5,7 @@ order, and two indices. The pieces of a block are contiguous, front to back, so 
 needs, as one stream, and accumulates in registers. Blocks of 4 x 4 have the least overhead of padding and indices: on
 trained scenes, larger blocks take up to a third more memory, and smaller blocks do not take less.
 
-Weights are those of `triton_kernels.blend_weights`. They are computed twice, by two kernels whose rounding may differ
+Weights are those of `triton_kernels.blend`. They are computed twice, by two kernels whose rounding may differ
 after compilation. Therefore only `count_pieces` decides which blocks have a weight, and `store_pieces` uses its masks.
 In float16, weights are multiplied by `HALF_SCALE`, which makes even the smallest weight (4e-7) a normal number, with a
 relative error of at most 2^-11.
@@ -21,7 +21,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sgsst_core.rasterizer.triton_kernels import blend_weights
+from sgsst_core.rasterizer.triton_kernels import PAIRS, blend, load_pairs, tile_pixels
 
 #: Blocks per raster tile, weights per piece, and pieces that a program reads per step.
 BLOCKS, PIECE, PIECES = tl.constexpr(16), tl.constexpr(16), tl.constexpr(16)
@@ -31,16 +31,6 @@ HALF_SCALE = 2.0**14
 _TILE: tl.constexpr = tl.constexpr(16)
 _PIXELS: tl.constexpr = tl.constexpr(256)
 _SIDE: tl.constexpr = tl.constexpr(4)
-
-
-@triton.jit
-def _tile_pixels(tile, width, first_row, last_row, across):
-    """Return the corner of a raster tile, which of its 256 pixels are in the band, and their indices in it."""
-    x0, y0 = tile % across * _TILE, tile // across * _TILE
-    pixel = tl.arange(0, _PIXELS)
-    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
-    inside = (x < width) & (y >= first_row) & (y < last_row)
-    return x0, y0, inside, (y - first_row).to(tl.int64) * width + x
 
 
 @triton.jit
@@ -55,16 +45,25 @@ def _block_pixels(block, width, first_row, last_row, across):
 
 
 @triton.jit
-def _by_block(weights, K: tl.constexpr):
-    """Reshape the weights [K, 256] of a tile's pixels to [K, 16, 16]: block, pixel within the block."""
-    split = tl.reshape(weights, [K, _SIDE, _SIDE, _SIDE, _SIDE])  # block row, row, block column, column
-    return tl.reshape(tl.permute(split, (0, 1, 3, 2, 4)), [K, BLOCKS, PIECE])
+def _cells():
+    """Return the block of each of a tile's pixels [8, 32], and the index of the pixel within its block."""
+    pixel = tl.arange(0, _PIXELS // PAIRS)[:, None] * PAIRS + tl.arange(0, PAIRS)[None, :]
+    column, row = pixel % _TILE, pixel // _TILE
+    return row // _SIDE * _SIDE + column // _SIDE, row % _SIDE * _SIDE + column % _SIDE
+
+
+@triton.jit
+def _present_blocks(weight):
+    """Return a bit mask of the blocks in which a pair has weights [8, 32]."""
+    rows = tl.max(tl.reshape(weight, [_SIDE, _SIDE, _SIDE, _SIDE]), 3)  # block row, row, block column
+    block = tl.arange(0, _SIDE)[:, None] * _SIDE + tl.arange(0, _SIDE)[None, :]
+    return tl.sum(tl.where(tl.max(rows, 1) > 0, 1 << block, 0))
 
 
 @triton.jit
 def count_pieces(
     ranks, slots, starts, values, masks, slot_pieces, block_pieces, ends, width, first_row, last_row, across,
-    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
 ):  # fmt: skip
     """Find the blocks in which each (Gaussian, raster tile) pair has weights; one program per raster tile of the band.
 
@@ -75,22 +74,24 @@ def count_pieces(
         ends: Output [tiles] int64, entry of each of the band's tiles after which all pixels are finished.
     """
     tile = first_row // _TILE * across + tl.program_id(0)
-    x0, y0, inside, _ = _tile_pixels(tile, width, first_row, last_row, across)
-    block = tl.arange(0, BLOCKS)
+    x, y, _pixel, inside = tile_pixels(tile, across, width, first_row, last_row)
     left = tl.where(inside, 1.0, 0.0)
+    block, pair = tl.arange(0, BLOCKS), tl.arange(0, PAIRS)
     pieces = tl.zeros([BLOCKS], tl.int32)
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
-    going = tl.max(left, 0)
-    while (k < end) & (going > 0):
-        weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
-        present = (tl.max(_by_block(weights, K), 2) > 0).to(tl.int32)  # [K, 16]
-        j = k + tl.arange(0, K)
-        there = j < end
-        tl.store(masks + j, tl.sum(present << block[None, :], 1), mask=there)
-        tl.store(slot_pieces + tl.load(slots + j, mask=there, other=0), tl.sum(present, 1), mask=there)
+    while (k < end) & (tl.max(left) > 0):
+        there = k + pair < end
+        pairs = load_pairs(ranks, values, k + pair, there, tile, across)
+        bits = tl.zeros([PAIRS], tl.int32)
+        for i in range(tl.minimum(end - k, PAIRS).to(tl.int32)):
+            lane = tl.full([PAIRS], i, tl.int32)
+            weight, left, _final = blend(pairs, lane, x, y, left, left, ALPHA_MAX, ALPHA_MIN, STOP)
+            bits = tl.where(pair == lane, _present_blocks(weight), bits)
+        present = (bits[:, None] >> block[None, :]) & 1  # [32, 16]
+        tl.store(masks + k + pair, bits, mask=there)
+        tl.store(slot_pieces + tl.load(slots + k + pair, mask=there, other=0), tl.sum(present, 1), mask=there)
         pieces += tl.sum(present, 0)
-        going = tl.max(left, 0)
-        k += K
+        k += PAIRS
     tl.store(block_pieces + tl.program_id(0) * BLOCKS + block, pieces)
     tl.store(ends + tl.program_id(0), tl.minimum(k, end))
 
@@ -99,7 +100,7 @@ def count_pieces(
 def store_pieces(
     ranks, slots, starts, values, gaussians, masks, ends, slot_starts, block_starts, piece_gaussians, piece_slots,
     weights, transmittances, width, first_row, last_row, across,
-    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr, SCALE: tl.constexpr,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, SCALE: tl.constexpr,
 ):  # fmt: skip
     """Store the pieces counted by `count_pieces`, and the final transmittance [h, width] of the band.
 
@@ -111,29 +112,38 @@ def store_pieces(
         weights: Output [16 P] float32, or float16 multiplied by SCALE.
     """
     tile = first_row // _TILE * across + tl.program_id(0)
-    x0, y0, inside, pixel = _tile_pixels(tile, width, first_row, last_row, across)
-    block = tl.arange(0, BLOCKS)
+    x, y, pixel, inside = tile_pixels(tile, across, width, first_row, last_row)
     left = tl.where(inside, 1.0, 0.0)
-    piece = tl.load(block_starts + tl.program_id(0) * BLOCKS + block).to(tl.int64)
+    final = left
+    block, pair = tl.arange(0, BLOCKS), tl.arange(0, PAIRS)
+    own_block, cell = _cells()
+    tile_starts = block_starts + tl.program_id(0) * BLOCKS
+    piece, own_piece = tl.load(tile_starts + block).to(tl.int64), tl.load(tile_starts + own_block).to(tl.int64)
     k, end = tl.load(starts + tile), tl.load(ends + tl.program_id(0))
     while k < end:
-        blended, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
-        j = k + tl.arange(0, K)
+        j = k + pair
         there = j < end
-        present = (tl.load(masks + j, mask=there, other=0)[:, None] >> block[None, :]) & 1  # [K, 16]
+        pairs = load_pairs(ranks, values, j, there, tile, across)
+        bits = tl.load(masks + j, mask=there, other=0)
+        for i in range(tl.minimum(end - k, PAIRS).to(tl.int32)):
+            lane = tl.full([PAIRS], i, tl.int32)
+            weight, left, final = blend(pairs, lane, x, y, left, final, ALPHA_MAX, ALPHA_MIN, STOP)
+            has_own = (tl.gather(bits, lane, 0) >> own_block) & 1
+            scaled = (weight * SCALE).to(weights.dtype.element_ty)
+            tl.store(weights + PIECE * own_piece + cell, scaled, mask=has_own > 0)
+            own_piece += has_own
+        present = (bits[:, None] >> block[None, :]) & 1  # [32, 16]
         has_piece = present > 0
         target = piece[None, :] + tl.cumsum(present, 0) - present
         gaussian = tl.load(gaussians + tl.load(ranks + j, mask=there, other=0), mask=there, other=0)
         first_slot = tl.load(slot_starts + tl.load(slots + j, mask=there, other=0), mask=there, other=0)
         slot = first_slot[:, None] + tl.cumsum(present, 1) - present
-        tl.store(piece_gaussians + target, tl.broadcast_to(gaussian[:, None], [K, BLOCKS]).to(tl.int32), mask=has_piece)
+        owners = tl.broadcast_to(gaussian[:, None], [PAIRS, BLOCKS]).to(tl.int32)
+        tl.store(piece_gaussians + target, owners, mask=has_piece)
         tl.store(piece_slots + target, slot.to(piece_slots.dtype.element_ty), mask=has_piece)
-        cells = weights + PIECE * target[:, :, None] + tl.arange(0, PIECE)[None, None, :]
-        scaled = (_by_block(blended, K) * SCALE).to(weights.dtype.element_ty)
-        tl.store(cells, scaled, mask=tl.broadcast_to(has_piece[:, :, None], [K, BLOCKS, PIECE]))
         piece += tl.sum(present, 0)
-        k += K
-    tl.store(transmittances + pixel, tl.abs(left), mask=inside)
+        k += PAIRS
+    tl.store(transmittances + pixel, final, mask=inside)
 
 
 @triton.jit

@@ -1,10 +1,13 @@
 """GPU kernels of the `triton` rasterizer: projection, tile intersections, compositing and its transpose.
 
 The source runs on NVIDIA and AMD GPUs, and in Triton's interpreter on the CPU (set TRITON_INTERPRET=1 before the first
-import). Numerics follow `projection` and `vectors`: geometry, including the offset of a pixel row from a Gaussian's
-axis, is computed in float64; alpha and all later values in float32. Compositing and its transpose go front to back, so
-transmittance never has to be recovered by repeated division by 1 - alpha. There are no atomics, so results are
-reproducible bit for bit.
+import). Geometry, including the offset of a raster tile from a Gaussian's axes, is computed in float64; alpha and all
+later values in float32. Compositing and its transpose go front to back, so transmittance never has to be recovered by
+repeated division by 1 - alpha. There are no atomics, so results are reproducible bit for bit.
+
+Compositing kernels have one program per raster tile. Each lane of a warp prepares one of the next 32 pairs of Gaussian
+and tile, and the pairs are then broadcast to all lanes one after another. So the loop over pairs has neither float64
+instructions nor memory accesses.
 """
 
 # Arguments are untyped: Triton compiles one version per argument type.
@@ -15,8 +18,11 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-#: Gaussians projected per program, and Gaussians blended per step.
-PROJECTED, BLENDED = tl.constexpr(128), tl.constexpr(32)
+#: Gaussians projected per program, and pairs of Gaussian and tile that are prepared at once: one per lane of a warp.
+PROJECTED, PAIRS = tl.constexpr(128), tl.constexpr(32)
+#: Warps per program of compositing kernels that sum over the pixels of a tile, and of the others. Sums stay within a
+#: warp. Without sums, two warps take fewer registers per thread, so more warps fit on a multiprocessor.
+SUMMING_WARPS, PIXEL_WARPS = 1, 2
 #: Gaussians per program of `add_slots`, and slots per Gaussian that it reads per step.
 ADDED, SLOTS = tl.constexpr(32), tl.constexpr(16)
 _TILE: tl.constexpr = tl.constexpr(16)
@@ -230,104 +236,130 @@ def list_tiles(
 
 
 @triton.jit
-def blend_weights(
-    ranks, values, k, end, x0, y0, transmittance,
-    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
-):  # fmt: skip
-    """Return the blend weights [K, 256] of the next K entries of a tile, and the transmittance [256] behind them.
+def load_pairs(ranks, values, j, there, tile, across):
+    """Return power, offsets and slopes of some (Gaussian, raster tile) pairs: six tensors [32] float32.
 
-    A finished pixel has a transmittance of 0 or less, which is its negated final transmittance. `values` is indexed by
-    rank.
+    The power at column x and row y, relative to the center of the tile, is p - (u + x u_x + y u_y)^2 - (w + y w_y)^2.
+    Offsets from a Gaussian are computed in float64, because they may be large and cancel. What remains is at most a few
+    tiles long wherever the Gaussian is visible, since no slope exceeds 1 / sqrt(2 ln 2 eps2d).
     """
-    j = k + tl.arange(0, K)
-    there = j < end
-    rank = tl.load(ranks + j, mask=there, other=0).to(tl.int64)
-    row = values + 8 * rank
-    dx = x0.to(tl.float64) + 0.5 - tl.load(row, mask=there, other=0.0)
-    dy = (y0 + tl.arange(0, _TILE)).to(tl.float64)[None, :] + 0.5 - tl.load(row + 1, mask=there, other=0.0)[:, None]
+    row = values + 8 * tl.load(ranks + j, mask=there, other=0).to(tl.int64)
+    x = (tile % across * _TILE + _TILE // 2).to(tl.float64) - tl.load(row, mask=there, other=0.0)
+    y = (tile // across * _TILE + _TILE // 2).to(tl.float64) - tl.load(row + 1, mask=there, other=0.0)
     skew, u_scale = tl.load(row + 2, mask=there, other=0.0), tl.load(row + 3, mask=there, other=0.0)
-    w = dy * tl.load(row + 4, mask=there, other=0.0)[:, None]
-    top = (tl.load(row + 5, mask=there, other=0.0)[:, None] - w * w).to(tl.float32)  # [K, 16]
-    u0 = ((dx[:, None] - skew[:, None] * dy) * u_scale[:, None]).to(tl.float32)
-    columns = tl.arange(0, _TILE).to(tl.float32)[None, None, :]
-    u = u0[:, :, None] + columns * u_scale.to(tl.float32)[:, None, None]  # [K, 16, 16]
-    alpha = tl.reshape(tl.minimum(tl.exp2(top[:, :, None] - u * u), ALPHA_MAX), [K, _PIXELS])
-    alpha = tl.where(there[:, None] & (alpha >= ALPHA_MIN), alpha, 0.0)
-    going = tl.maximum(transmittance, 0.0)
-    after = going[None, :] * tl.cumprod(1 - alpha, 0)
-    blended = (alpha > 0) & (after > STOP)
-    weights = tl.where(blended, after / (1 - alpha) * alpha, 0.0)
-    left = tl.min(tl.where(blended, after, going[None, :]), 0)
-    ended = tl.min(after, 0) <= STOP
-    left = tl.where(transmittance > 0, tl.where(ended, -left, left), transmittance)
-    return weights, left
+    w_scale, opacity = tl.load(row + 4, mask=there, other=0.0), tl.load(row + 5, mask=there, other=0.0)
+    return (
+        opacity.to(tl.float32),
+        ((x - skew * y) * u_scale).to(tl.float32),
+        u_scale.to(tl.float32),
+        (-skew * u_scale).to(tl.float32),
+        (y * w_scale).to(tl.float32),
+        w_scale.to(tl.float32),
+    )
+
+
+@triton.jit
+def blend(
+    pairs, lane, x, y, left, final,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
+):  # fmt: skip
+    """Return the weights [8, 32] of a pair in a tile, and the updated `left` and `final`.
+
+    Args:
+        pairs: Result of `load_pairs`.
+        lane: [32] int32, index of the pair in all elements, so that each gather is one shuffle.
+        x, y: Columns and rows of the pixels relative to the center of the tile.
+        left: Transmittance, 0 once a pixel is finished.
+        final: Transmittance, unchanged once a pixel is finished.
+    """
+    power, u, u_x, u_y, w, w_y = pairs
+    u = tl.gather(u, lane, 0) + x * tl.gather(u_x, lane, 0) + y * tl.gather(u_y, lane, 0)
+    w = tl.gather(w, lane, 0) + y * tl.gather(w_y, lane, 0)
+    alpha = tl.minimum(tl.exp2(tl.gather(power, lane, 0) - w * w - u * u), ALPHA_MAX)
+    weight = left * tl.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    after = left - weight
+    is_blended = after > STOP
+    return tl.where(is_blended, weight, 0.0), tl.where(is_blended, after, 0.0), tl.where(is_blended, after, final)
 
 
 @triton.jit
 def tile_pixels(tile, across, width, first_row, last_row):
-    """Return the corner (x0, y0) of a raster tile, x and y of its pixels [256], and which pixels are in the band."""
-    x0, y0 = tile % across * _TILE, tile // across * _TILE
-    pixel = tl.arange(0, _PIXELS)
-    x, y = x0 + pixel % _TILE, y0 + pixel // _TILE
-    return x0, y0, x, y, (x < width) & (y >= first_row) & (y < last_row)
+    """Return columns and rows of a tile's pixels [8, 32] relative to its center, their indices, and which exist.
+
+    Indices are those in the band; a pixel outside the band or the image does not exist.
+    """
+    pixel = tl.arange(0, _PIXELS // PAIRS)[:, None] * PAIRS + tl.arange(0, PAIRS)[None, :]
+    column, row = pixel % _TILE, pixel // _TILE
+    x, y = tile % across * _TILE + column, tile // across * _TILE + row
+    inside = (x < width) & (y >= first_row) & (y < last_row)
+    center = (_TILE - 1) / 2
+    return column - center, row - center, (y - first_row).to(tl.int64) * width + x, inside
 
 
 @triton.jit
 def render(
     ranks, starts, gaussians, values, colors, background, image, transmittances, width, first_row, last_row, across,
-    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
 ):  # fmt: skip
     """Render the image [h, width, 3] and final transmittance [h, width] of a band; one program per raster tile."""
     tile = first_row // _TILE * across + tl.program_id(0)
-    x0, y0, x, y, inside = tile_pixels(tile, across, width, first_row, last_row)
+    x, y, pixel, inside = tile_pixels(tile, across, width, first_row, last_row)
     left = tl.where(inside, 1.0, 0.0)
-    red, green, blue = tl.zeros([_PIXELS], tl.float32), tl.zeros([_PIXELS], tl.float32), tl.zeros([_PIXELS], tl.float32)
+    final = left
+    red, green, blue = tl.zeros_like(left), tl.zeros_like(left), tl.zeros_like(left)
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
-    going = tl.max(left, 0)
-    while (k < end) & (going > 0):
-        weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
-        j = k + tl.arange(0, K)
+    while (k < end) & (tl.max(left) > 0):
+        j = k + tl.arange(0, PAIRS)
         there = j < end
+        pairs = load_pairs(ranks, values, j, there, tile, across)
         gaussian = tl.load(gaussians + tl.load(ranks + j, mask=there, other=0), mask=there, other=0)
-        # Three channels are too few for matrix units, which would also multiply in less than float32.
-        red += tl.sum(weights * tl.load(colors + 3 * gaussian, mask=there, other=0.0)[:, None], 0)
-        green += tl.sum(weights * tl.load(colors + 3 * gaussian + 1, mask=there, other=0.0)[:, None], 0)
-        blue += tl.sum(weights * tl.load(colors + 3 * gaussian + 2, mask=there, other=0.0)[:, None], 0)
-        going = tl.max(left, 0)
-        k += K
-    left = tl.abs(left)
-    pixel = (y - first_row).to(tl.int64) * width + x
-    tl.store(image + 3 * pixel, red + left * tl.load(background), mask=inside)
-    tl.store(image + 3 * pixel + 1, green + left * tl.load(background + 1), mask=inside)
-    tl.store(image + 3 * pixel + 2, blue + left * tl.load(background + 2), mask=inside)
-    tl.store(transmittances + pixel, left, mask=inside)
+        reds = tl.load(colors + 3 * gaussian, mask=there, other=0.0)
+        greens = tl.load(colors + 3 * gaussian + 1, mask=there, other=0.0)
+        blues = tl.load(colors + 3 * gaussian + 2, mask=there, other=0.0)
+        for i in range(tl.minimum(end - k, PAIRS).to(tl.int32)):
+            lane = tl.full([PAIRS], i, tl.int32)
+            weight, left, final = blend(pairs, lane, x, y, left, final, ALPHA_MAX, ALPHA_MIN, STOP)
+            # Three channels are too few for matrix units, which would also multiply in less than float32.
+            red += weight * tl.gather(reds, lane, 0)
+            green += weight * tl.gather(greens, lane, 0)
+            blue += weight * tl.gather(blues, lane, 0)
+        k += PAIRS
+    tl.store(image + 3 * pixel, red + final * tl.load(background), mask=inside)
+    tl.store(image + 3 * pixel + 1, green + final * tl.load(background + 1), mask=inside)
+    tl.store(image + 3 * pixel + 2, blue + final * tl.load(background + 2), mask=inside)
+    tl.store(transmittances + pixel, final, mask=inside)
 
 
 @triton.jit
 def slot_gradients(
     ranks, slots, starts, values, image_gradient, out, width, first_row, last_row, across,
-    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
 ):  # fmt: skip
     """Write dL/dcolor of every (Gaussian, tile) pair to its slot [E, 3], which must be zero on entry."""
     tile = first_row // _TILE * across + tl.program_id(0)
-    x0, y0, x, y, inside = tile_pixels(tile, across, width, first_row, last_row)
-    pixel = (y - first_row).to(tl.int64) * width + x
+    x, y, pixel, inside = tile_pixels(tile, across, width, first_row, last_row)
     red = tl.load(image_gradient + 3 * pixel, mask=inside, other=0.0)
     green = tl.load(image_gradient + 3 * pixel + 1, mask=inside, other=0.0)
     blue = tl.load(image_gradient + 3 * pixel + 2, mask=inside, other=0.0)
     left = tl.where(inside, 1.0, 0.0)
+    pair = tl.arange(0, PAIRS)
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
-    going = tl.max(left, 0)
-    while (k < end) & (going > 0):
-        weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
-        j = k + tl.arange(0, K)
-        there = j < end
-        slot = out + 3 * tl.load(slots + j, mask=there, other=0).to(tl.int64)
-        tl.store(slot, tl.sum(weights * red[None, :], 1), mask=there)
-        tl.store(slot + 1, tl.sum(weights * green[None, :], 1), mask=there)
-        tl.store(slot + 2, tl.sum(weights * blue[None, :], 1), mask=there)
-        going = tl.max(left, 0)
-        k += K
+    while (k < end) & (tl.max(left) > 0):
+        there = k + pair < end
+        pairs = load_pairs(ranks, values, k + pair, there, tile, across)
+        reds = tl.zeros([PAIRS], tl.float32)
+        greens, blues = reds, reds
+        for i in range(tl.minimum(end - k, PAIRS).to(tl.int32)):
+            lane = tl.full([PAIRS], i, tl.int32)
+            weight, left, _final = blend(pairs, lane, x, y, left, left, ALPHA_MAX, ALPHA_MIN, STOP)
+            reds = tl.where(pair == lane, tl.sum(weight * red), reds)
+            greens = tl.where(pair == lane, tl.sum(weight * green), greens)
+            blues = tl.where(pair == lane, tl.sum(weight * blue), blues)
+        slot = out + 3 * tl.load(slots + k + pair, mask=there, other=0).to(tl.int64)
+        tl.store(slot, reds, mask=there)
+        tl.store(slot + 1, greens, mask=there)
+        tl.store(slot + 2, blues, mask=there)
+        k += PAIRS
 
 
 @triton.jit
@@ -358,7 +390,7 @@ def add_slots(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, 
 @triton.jit
 def survey(
     ranks, slots, starts, values, out, transmittances, width, height, across,
-    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, K: tl.constexpr,
+    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
 ):  # fmt: skip
     """Compute the final transmittance [h, width] of a whole view, and the sum of weights of each pair in its slot [E].
 
@@ -366,19 +398,22 @@ def survey(
     ones, but take only one pass. There is one program per raster tile.
     """
     tile = tl.program_id(0)
-    x0, y0, x, y, inside = tile_pixels(tile, across, width, 0, height)
+    x, y, pixel, inside = tile_pixels(tile, across, width, 0, height)
     left = tl.where(inside, 1.0, 0.0)
+    final = left
+    pair = tl.arange(0, PAIRS)
     k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
-    going = tl.max(left, 0)
-    while (k < end) & (going > 0):
-        weights, left = blend_weights(ranks, values, k, end, x0, y0, left, ALPHA_MAX, ALPHA_MIN, STOP, K)
-        j = k + tl.arange(0, K)
-        there = j < end
-        slot = tl.load(slots + j, mask=there, other=0).to(tl.int64)
-        tl.store(out + slot, tl.sum(weights, 1), mask=there)
-        going = tl.max(left, 0)
-        k += K
-    tl.store(transmittances + y.to(tl.int64) * width + x, tl.abs(left), mask=inside)
+    while (k < end) & (tl.max(left) > 0):
+        there = k + pair < end
+        pairs = load_pairs(ranks, values, k + pair, there, tile, across)
+        sums = tl.zeros([PAIRS], tl.float32)
+        for i in range(tl.minimum(end - k, PAIRS).to(tl.int32)):
+            lane = tl.full([PAIRS], i, tl.int32)
+            weight, left, final = blend(pairs, lane, x, y, left, final, ALPHA_MAX, ALPHA_MIN, STOP)
+            sums = tl.where(pair == lane, tl.sum(weight), sums)
+        tl.store(out + tl.load(slots + k + pair, mask=there, other=0).to(tl.int64), sums, mask=there)
+        k += PAIRS
+    tl.store(transmittances + pixel, final, mask=inside)
 
 
 @triton.jit

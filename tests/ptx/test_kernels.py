@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -14,10 +15,12 @@ from sgsst_core.features.statistics import fused_statistics, layer_statistics_re
 from sgsst_core.loss.statistics_terms import fused_add_style_gradient
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.triton_kernels import PAIRS
 from sgsst_core.scene.rendering import CLASSIC, Rendering
 from tests.ptx.driver import PtxDriver, compiled_kernels
 from tests.ptx.machine import Kernel
 from tests.ptx.memory import FaultError
+from tests.ptx.program import Instruction
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras
 
@@ -100,38 +103,58 @@ def statistics_kernel(driver: PtxDriver, features: Tensor) -> Kernel:
     return driver.kernels["shifted_moments"]
 
 
+def without_barrier(instruction: Instruction) -> Instruction | None:
+    """Replace a barrier of a program by one of a warp."""
+    return replace(instruction, opcode=("bar", "warp", "sync")) if instruction.opcode[:2] == ("bar", "sync") else None
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_every_removed_barrier_is_reported(dtype: torch.dtype) -> None:
     features = torch.randn((5, 29, 64), generator=torch.Generator().manual_seed(0)).to(dtype)
     with compiled_kernels(80) as driver:
         kernel = statistics_kernel(driver, features)
         barriers = [
-            number for number, one in enumerate(kernel.program.instructions) if one.opcode[:2] == ("bar", "sync")
+            (number, mutated)
+            for number, one in enumerate(kernel.program.instructions)
+            if (mutated := without_barrier(one))
         ]
         assert len(barriers) > 2
-        for number in barriers:
-            none = replace(kernel.program.instructions[number], opcode=("bar", "warp", "sync"))
-            with kernel.changed(number, none), pytest.raises(FaultError, match="race in shared memory"):
+        for number, mutated in barriers:
+            with kernel.changed(number, mutated), pytest.raises(FaultError, match="race in shared memory"):
                 fused_statistics(features)
         fused_statistics(features)
+
+
+def reports(
+    kernel: Kernel, mutate: Callable[[Instruction], Instruction | None], run: Callable[[], Tensor]
+) -> list[bool]:
+    """Return for each mutated instruction whether it causes a fault or another result."""
+    exact, reported = run(), []
+    for number, instruction in enumerate(kernel.program.instructions):
+        mutated = mutate(instruction)
+        if mutated is None:
+            continue
+        with kernel.changed(number, mutated):
+            try:
+                reported.append(not torch.equal(run(), exact))
+            except FaultError:
+                reported.append(True)
+    return reported
+
+
+def shifted(instruction: Instruction) -> Instruction | None:
+    """Let a comparison accept one position more."""
+    if instruction.opcode[:2] != ("setp", "lt"):
+        return None
+    return replace(instruction, opcode=("setp", "le", *instruction.opcode[2:]))
 
 
 def test_shifted_masks_are_reported() -> None:
     """Comparisons with one position too many let the kernel read or write beyond the end of a tensor."""
     features = torch.randn((5, 29, 16), generator=torch.Generator().manual_seed(0)).contiguous()
-    reported = 0
     with compiled_kernels(80) as driver:
         kernel = statistics_kernel(driver, features)
-        exact = fused_statistics(features)
-        for number, instruction in enumerate(kernel.program.instructions):
-            if instruction.opcode[:2] != ("setp", "lt"):
-                continue
-            with kernel.changed(number, replace(instruction, opcode=("setp", "le", *instruction.opcode[2:]))):
-                try:
-                    reported += not torch.equal(fused_statistics(features).centered, exact.centered)
-                except FaultError:
-                    reported += 1
-    assert reported >= 3
+        assert sum(reports(kernel, shifted, lambda: fused_statistics(features).centered)) >= 3
 
 
 def test_shifted_masks_of_pooling_are_reported() -> None:
@@ -139,19 +162,50 @@ def test_shifted_masks_of_pooling_are_reported() -> None:
     generator = torch.Generator().manual_seed(0)
     source = torch.randn((1, 7, 5, 16), generator=generator).permute(0, 3, 1, 2).relu_()
     gradient = torch.randn((1, 3, 2, 16), generator=generator).permute(0, 3, 1, 2)
-    reported = 0
     with compiled_kernels(80) as driver:
-        exact = fused_max_pool_backward(gradient, source)
+        fused_max_pool_backward(gradient, source)
         kernel = driver.kernels["max_pool_backward"]
-        for number, instruction in enumerate(kernel.program.instructions):
-            if instruction.opcode[:2] != ("setp", "lt"):
-                continue
-            with kernel.changed(number, replace(instruction, opcode=("setp", "le", *instruction.opcode[2:]))):
-                try:
-                    reported += not torch.equal(fused_max_pool_backward(gradient, source), exact)
-                except FaultError:
-                    reported += 1
-    assert reported >= 3
+        assert sum(reports(kernel, shifted, lambda: fused_max_pool_backward(gradient, source))) >= 3
+
+
+def other_lane(instruction: Instruction) -> Instruction | None:
+    """Let a broadcast of a pair's values read from the first pair of the step."""
+    if instruction.opcode[:3] != ("shfl", "sync", "idx"):
+        return None
+    target, source, _, *rest = instruction.operands
+    return replace(instruction, operands=(target, source, "0", *rest))
+
+
+@pytest.mark.parametrize("name", ["render", "slot_gradients"])
+def test_mutations_of_compositing_are_reported(name: str) -> None:
+    """Raster tiles at the border have pixels outside of the view, and more Gaussians than are prepared at once."""
+    scene, camera = replace(ball(60), opacities=torch.linspace(-2, 3, 60)), cameras(1, 19, 17)[0]
+    colors, image_gradient = torch.rand((len(scene), 3)), torch.rand((camera.height, camera.width, 3))
+    with compiled_kernels(90) as driver:
+        rasterizer = make_rasterizer("triton", scene)
+        assert int(rasterizer.intersections(camera).starts.diff().max()) > PAIRS.value  # type: ignore[attr-defined]
+        run = {
+            "render": lambda: rasterizer.render(colors, camera),
+            "slot_gradients": lambda: rasterizer.color_gradient(image_gradient, camera),
+        }[name]
+        run()
+        kernel = driver.kernels[name]
+        broadcasts = reports(kernel, other_lane, run)
+        assert len(broadcasts) >= {"render": 9, "slot_gradients": 6}[name]
+        assert all(broadcasts)
+        assert sum(reports(kernel, shifted, run)) >= 3
+
+
+def test_every_removed_barrier_of_rendering_is_reported() -> None:
+    scene, camera = ball(60), cameras(1, 19, 17)[0]
+    colors = torch.rand((len(scene), 3))
+    with compiled_kernels(90) as driver:
+        rasterizer = make_rasterizer("triton", scene)
+        rasterizer.render(colors, camera)
+        kernel = driver.kernels["render"]
+        reported = reports(kernel, without_barrier, lambda: rasterizer.render(colors, camera))
+    assert len(reported) >= 2
+    assert all(reported)
 
 
 def test_memory_faults_are_reported() -> None:

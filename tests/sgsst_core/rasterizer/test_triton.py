@@ -273,3 +273,9 @@ def test_kernels_compile_for_gpus_within_their_registers() -> None:
     for kernel, target, registers, spilled in lines:
         assert int(registers) <= 256, (kernel, target)
         assert int(spilled) <= (128 if target.startswith("gfx") else 0), (kernel, target)
+    counted = re.findall(r"^(\w+) +sm_90 .* warps (\d+) +pixel_instructions ([\d.]+)", ended.stdout, flags=re.M)
+    compositing = {kernel: (int(warps), float(instructions)) for kernel, warps, instructions in counted}
+    for kernel, most in (("render", 21), ("slot_gradients", 23), ("survey", 19), ("count_pieces", 24)):
+        warps, instructions = compositing[kernel]
+        assert warps >= 20, kernel
+        assert instructions <= most, kernel
