@@ -34,6 +34,20 @@ def memory_for(use: Literal["activations", "views", "rasterizer"], memory: int) 
     return int(memory * _FRACTIONS[use])
 
 
+def content_fraction(device: str, *, weighted: bool, has_maps: bool) -> float:
+    """Return the fraction of the memory for data of views that content may use.
+
+    A quarter is for colors, one for coverage and one for region maps. On a GPU, content also uses the quarter for
+    coverage if there are no position weights.
+
+    Args:
+        device: "cpu" or "cuda".
+        weighted: Whether statistics are weighted by rendered coverage.
+        has_maps: Whether the scene has regions.
+    """
+    return 0.5 - 0.25 * has_maps + 0.25 * (device != "cpu" and not weighted)
+
+
 def least_intersection_memory(memory: int) -> int:
     """Return the memory in bytes reserved for tile intersections if blend weights are cached too, given a rank's limit.
 

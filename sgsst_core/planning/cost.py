@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from sgsst_core.budget import least_intersection_memory, measuring_memory, memory_for
+from sgsst_core.budget import content_fraction, least_intersection_memory, measuring_memory, memory_for
 from sgsst_core.features.partition import (
     Rectangle,
     cached_tiles,
@@ -338,7 +338,8 @@ class ViewCosts:
             weights = ViewData(seconds, size, raster_budget, views)
         rendered = _RENDER * raster.seconds if settings.content_weight else 0.0
         forward = probe.network.rate.forward if settings.content_weight else 0.0
-        content_budget = 0 if "content" in settings.keep else view_budget / (4 if probe.maps else 2)
+        fraction = content_fraction(probe.machine.device, weighted=plan.weighted, has_maps=bool(probe.maps))
+        content_budget = 0 if "content" in settings.keep else view_budget * fraction
         pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
         images = ViewData(0.0)
         if plan.training_background != "background" and settings.content_weight:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
-from sgsst_core.budget import Cache, tensor_bytes
+from sgsst_core.budget import Cache, content_fraction, tensor_bytes
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.targets import ContentFeatures, ViewTarget
@@ -32,8 +32,8 @@ class ViewTargets:
         weighted: Whether statistics are weighted by rendered coverage.
         photos: Function that loads the content image [H, W, 3] of a view by its index; None for unstylized renders.
             With a GPU it is also called in a thread, see `prefetch`.
-        memory: Memory budget in bytes for everything that is cached about views. A quarter of it is for colors
-            (`Views`), a quarter for coverage, and the rest for content and region maps.
+        memory: Memory budget in bytes for everything that is cached about views, see `content_fraction`. A quarter of
+            it is for colors (`Views`).
         cache_content: Whether to cache content features that fit; False recomputes them at each visit, for comparison.
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
         background: Background color of the rasterizer.
@@ -67,8 +67,7 @@ class ViewTargets:
         self._drawn = drawn
         self._maps = maps
         self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
-        #: Budget for content, half of which goes to region maps if there are any.
-        content = memory // 2 if maps is None else memory // 4
+        content = int(memory * content_fraction(device.type, weighted=weighted, has_maps=maps is not None))
         self._region_weights: Cache[int, list[list[Tensor]]] = Cache(
             0 if maps is None else memory // 4, lambda every: sum(map(_pyramid_bytes, every))
         )

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from sgsst_core.budget import least_intersection_memory, measuring_memory, memory_for
+from sgsst_core.budget import content_fraction, least_intersection_memory, measuring_memory, memory_for
 from sgsst_core.planning.cost import (
     BUILDING_BYTES,
     MEASURING_BYTES,
@@ -103,6 +103,29 @@ def test_budgets_add_up_to_the_memory_limit(device: str, precision: str, weights
     # The steps, and on a GPU also the float32 reference, fit in what remains for activations.
     assert (plan.spare == 0) is (device == "cpu")
     assert activations > HEIGHT * WIDTH * 3000 * (2 if precision == "bfloat16" and measured else 1)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("has_maps", [False, True])
+def test_fractions_of_the_memory_for_views_add_up_to_one(device: str, weighted: bool, has_maps: bool) -> None:
+    colors, maps = 0.25, 0.25 * has_maps
+    coverage = 0.25 if device == "cpu" or weighted else 0.0
+    assert content_fraction(device, weighted=weighted, has_maps=has_maps) + colors + coverage + maps == 1
+
+
+@pytest.mark.parametrize(
+    ("device", "weights", "fraction"), [("cuda", "off", 0.75), ("cuda", "on", 0.5), ("cpu", "off", 0.5)]
+)
+def test_content_on_a_gpu_uses_the_memory_of_unneeded_coverage(device: str, weights: str, fraction: float) -> None:
+    rasterizer = "cpu" if device == "cpu" else "triton"
+    taken = []
+    for cell in (0, GIGABYTE):
+        measurements = probe(device=device, rasterizer=rasterizer, content_bytes=cell)
+        plan = plan_of(measurements, position_weights=weights, steps_sos=4000)
+        assert plan.prediction is not None
+        taken.append(plan.prediction.peak_bytes if device == "cpu" else plan.prediction.device_bytes)
+    assert taken[1] - taken[0] == int(fraction * view_memory(plan, 10 * GIGABYTE))  # type: ignore[operator]
 
 
 def test_gpu_memory_includes_rasterizer_and_measurements() -> None:
