@@ -174,6 +174,16 @@ class UnknownUploadError(RefusedInputError):
         )
 
 
+class UnknownInputError(RefusedInputError):
+    """Reference to an input that no job of the caller has, or that its job has released when it expired."""
+
+    code, status = "unknown-input", 422
+    example = (JOB_ID, "style:1", "style")
+
+    def __init__(self, job_id: str, name: str, role: str) -> None:
+        super().__init__(f"Job {job_id} has no input {name!r} (any more). Upload the file again.", input=role)
+
+
 class UnfinishedUploadError(RefusedInputError):
     """Upload that is not complete yet."""
 
@@ -220,6 +230,15 @@ class CancelError(ConflictError):
 
     def __init__(self, status: str) -> None:
         super().__init__(f"The job has {status} and cannot be canceled.", job_status=status)
+
+
+class FinishError(ConflictError):
+    """Job that is not running, so that it has no colors to keep, or has already ended."""
+
+    example = ("queued",)
+
+    def __init__(self, status: str) -> None:
+        super().__init__(f"The job has status {status}; only a running job can be finished early.", job_status=status)
 
 
 class RetryError(ConflictError):

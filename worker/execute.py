@@ -74,6 +74,7 @@ def execute(
     progress: Callable[[Progress], None],
     stop: Callable[[], bool],
     warn: Warn,
+    finish: Callable[[], bool] = lambda: False,
     preview: Previews | None = None,
     saved: Callable[[int], None] = lambda step: None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
@@ -88,6 +89,7 @@ def execute(
         job: Prepared job.
         progress: Callback for the progress of the steps.
         stop: Callback that returns True to interrupt the job.
+        finish: Callback that returns True to end the job after a step, with its present colors as the result.
         warn: Callback for warnings, such as a checkpoint that cannot be written while the job runs.
         preview: Writer of previews after every step, and of the thumbnail at the end. None writes neither.
         saved: Callback that receives the step of each checkpoint.
@@ -110,7 +112,7 @@ def execute(
     checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), saved, warn)
     callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds)
     if first:
-        callbacks.progress, callbacks.stop = progress, stop
+        callbacks.progress, callbacks.stop, callbacks.finish = progress, stop, finish
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
         callbacks.preview_seconds = 0.0  # `Previews` itself limits how often a preview is written
     stopped = run(stylizer, callbacks)

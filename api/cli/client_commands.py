@@ -204,6 +204,12 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def finish(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
+    """End a running job after its current step, and keep its result so far."""
+    with _client(url, key) as client:
+        _print_job(client.finish(job), as_json)
+
+
 def cancel(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
     """Cancel a job."""
     with _client(url, key) as client:
@@ -247,7 +253,7 @@ def jobs(
     console.print(table)
 
 
-COMMANDS = (submit, status, watch, download, cancel, retry, delete, jobs)
+COMMANDS = (submit, status, watch, download, finish, cancel, retry, delete, jobs)
 
 # --- shared --------------------------------------------------------------------------------------------------------
 

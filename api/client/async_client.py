@@ -217,6 +217,10 @@ class AsyncClient:
         """Change the display name of a job; an empty name restores the names of scene and style."""
         return Job.of((await self._transport.call("PATCH", f"/v1/jobs/{job_id}", json={"name": name})).json())
 
+    async def finish(self, job_id: str) -> Job:
+        """End a running job after its current step, and keep its result so far."""
+        return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/finish")).json())
+
     async def cancel(self, job_id: str) -> Job:
         """Cancel a job."""
         return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/cancel")).json())

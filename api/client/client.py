@@ -112,6 +112,7 @@ class Client:
     download = _blocking(AsyncClient.download)
     blend = _blocking(AsyncClient.blend)
     rename = _blocking(AsyncClient.rename)
+    finish = _blocking(AsyncClient.finish)
     cancel = _blocking(AsyncClient.cancel)
     retry = _blocking(AsyncClient.retry)
     delete = _blocking(AsyncClient.delete)

@@ -31,6 +31,7 @@ from service.errors import (
     TooManyPixelsError,
     TooManyViewsError,
     UnfinishedUploadError,
+    UnknownInputError,
     UnknownUploadError,
     WebhooksOffError,
 )
@@ -51,7 +52,11 @@ from sgsst_core.files.formats import TITLES
 
 
 class JobFromUploads(BaseModel):
-    """A job from files that are already uploaded (`POST /v1/uploads`)."""
+    """A job from files that the service already has.
+
+    Each file is named by the id of its upload (`POST /v1/uploads`), or by the path of an input of an earlier job, such
+    as `/v1/jobs/JOB/inputs/style:1`.
+    """
 
     model_config = ConfigDict(
         extra="forbid",
@@ -67,10 +72,10 @@ class JobFromUploads(BaseModel):
         },
     )
 
-    scene: str = Field(description=f"Id of the upload with the 3DGS scene: {TITLES}.")
+    scene: str = Field(description=f"Id of the upload with the 3DGS scene: {TITLES}; or the path of an input.")
     style: str | Annotated[list[str], Field(min_length=1, max_length=MOST_STYLES)] = Field(
-        description="Id of the upload with the style image; or a list of several, which are mixed by `style_weights`, "
-        "or belong to `regions`."
+        description="Id of the upload with the style image, or the path of an input; or a list of several, which are "
+        "mixed by `style_weights`, or belong to `regions`."
     )
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
@@ -84,13 +89,13 @@ _FORM = {
     "type": "object",
     "required": ["scene", "style"],
     "properties": {
-        "scene": {**_FILE, "description": f"3DGS scene: {TITLES}; or the id of an upload."},
+        "scene": {**_FILE, "description": f"3DGS scene: {TITLES}; or text, as for JSON."},
         "style": {
             "type": "array",
             "items": _FILE,
             "minItems": 1,
             "maxItems": MOST_STYLES,
-            "description": "Style image; or the id of an upload. Several are mixed by `style_weights`; those that "
+            "description": "Style image; or text, as for JSON. Several are mixed by `style_weights`; those that "
             "`regions` name belong to the regions.",
         },
         "cameras": {
@@ -161,6 +166,7 @@ REFUSALS: tuple[type[ServiceError] | ServiceError, ...] = (
     TooManyFilesError,
     InspectionLimitError,
     UnknownUploadError,
+    UnknownInputError,
     UnfinishedUploadError,
     WebhooksOffError,
     InvalidWebhookError,

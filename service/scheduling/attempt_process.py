@@ -2,7 +2,8 @@
 
 The folder contains the staged inputs and `task.json`; results go to its subfolder `out`. The process reports events as
 lines of JSON on stdout (`Message`), and logs for people on stderr. On SIGTERM it finishes the current step and saves a
-checkpoint. It dies with the dispatcher that started it, and so do the processes that it has started.
+checkpoint; on SIGUSR1 it finishes the current step and ends the job with its present colors as the result. It dies with
+the dispatcher that started it, and so do the processes that it has started.
 """
 
 from __future__ import annotations
@@ -84,11 +85,12 @@ class AttemptProcess:
 
     def __init__(self, task: Task) -> None:
         self._task = task
-        self._stopping = threading.Event()
+        self._stopping, self._finishing = threading.Event(), threading.Event()
 
     def run(self) -> None:
         """Run the attempt and report how it ended, whatever the reason."""
         signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
+        signal.signal(signal.SIGUSR1, lambda number, frame: self._finishing.set())
         send({"kind": "stage", "stage": "reading"})
         try:
             result = self._run_on_ranks() if self._task.workers > 1 or self._task.cluster else self._run_alone()
@@ -126,6 +128,7 @@ class AttemptProcess:
             job,
             progress=report_progress,
             stop=self._stopping.is_set,
+            finish=self._finishing.is_set,
             warn=log,
             preview=Previews(_PREVIEWS, self._task.preview_seconds, report_preview, log),
             checkpoint_seconds=self._task.checkpoint_seconds,
@@ -142,6 +145,7 @@ class AttemptProcess:
             happened=log,
             warn=log,
             stop=self._stopping.is_set,
+            finish=self._finishing.is_set,
             preview=report_preview,
             left_out=report_left_out,
             stored=report_stored,

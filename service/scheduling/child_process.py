@@ -46,6 +46,7 @@ class ChildProcess:
             )
         self._messages: queue.Queue[Message | None] = queue.Queue()
         self._deadline: float | None = None
+        self._finishing = False
         threading.Thread(target=self._listen, name=f"{folder.name}-out", daemon=True).start()
 
     def _listen(self) -> None:
@@ -62,6 +63,16 @@ class ChildProcess:
             queue.Empty: If no message arrives within this time.
         """
         return self._messages.get(timeout=seconds)
+
+    def finish(self) -> None:
+        """Ask the process to end its job after the current step, with the present colors as the result.
+
+        Call this only after the message `prepared`: earlier, the process may not handle the signal yet.
+        """
+        if not self._finishing:
+            self._finishing = True
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGUSR1)
 
     def stop(self, patience: float) -> None:
         """Ask the process to stop; calls after `patience` seconds kill it."""

@@ -61,6 +61,8 @@ class LeaseKeeper:
                 attempt.abandon()
             elif status == JobStatus.CANCELING:
                 attempt.cancel()
+            elif status == JobStatus.FINISHING:
+                attempt.finish()
 
     def _abandon_late(self) -> None:
         """Abandon jobs whose leases could not be renewed, before the leases expire.

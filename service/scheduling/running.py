@@ -54,6 +54,7 @@ class RunningAttempt:
         self._folder, self._settings, self._store, self._stager = folder, settings, store, stager
         self._process: ChildProcess | None = None
         self._stop_request: StopRequest | None = None
+        self._finish_requested = False
         self._publisher = Publisher(lease, folder, store, artifacts, settings.preview_seconds)
         self._progress = ProgressWriter(lease, store)
         self._thread = threading.Thread(target=self._run, name=lease.job_id, daemon=True)
@@ -80,6 +81,10 @@ class RunningAttempt:
     def cancel(self) -> None:
         """Cancel the job on behalf of its user."""
         self._stop_request = self._stop_request or StopRequest.CANCEL
+
+    def finish(self) -> None:
+        """End the job after its current step, with its present colors as the result, on behalf of its user."""
+        self._finish_requested = True
 
     def release(self) -> None:
         """Save the job's state and return it to the queue, because the dispatcher is shutting down."""
@@ -172,6 +177,8 @@ class RunningAttempt:
                 return None
             self._progress.write()
             self._publisher.publish_unfinished()
+            if self._finish_requested:
+                process.finish()
             if self._stop_request is not None:
                 process.stop(
                     _CANCEL_SECONDS if self._stop_request == StopRequest.CANCEL else self._settings.stop_seconds

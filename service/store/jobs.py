@@ -1,4 +1,4 @@
-"""Operations of users on their jobs and the files and events of those: create, list, rename, cancel, retry, delete."""
+"""Operations of users on their jobs: create, list, rename, finish, cancel, retry, delete; their files and events."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Float, Select, String, bindparam, func, inser
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service.errors import CancelError, DeleteError, NoJobError, NotFoundError, QueueFullError, RetryError
+from service.errors import CancelError, DeleteError, FinishError, NoJobError, NotFoundError, QueueFullError, RetryError
 from service.store.changes import add_status_event, end, forget, holder_name, move
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import Point, points
@@ -188,6 +188,25 @@ class Jobs:
         with self._database.reading_rows() as connection:
             return _queue_position(connection, job)
 
+    def finish(self, job_id: str, owner: str | None) -> JobRow:
+        """Make a running job end after its current step, with its present colors as the result.
+
+        The request is kept if the attempt fails: the next one ends in the same way. A job that is already finishing is
+        returned unchanged.
+
+        Raises:
+            FinishError: If the job is not running.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = _job_of_owner(session, job_id, owner, lock=True)
+            if not allowed(job.status, Transition.FINISH):
+                raise FinishError(job.status)
+            if job.status in ACTIONS[Transition.FINISH]:
+                job.finish_requested = True
+                move(session, job, Transition.FINISH, now)
+        return job
+
     def cancel(self, job_id: str, owner: str | None) -> JobRow:
         """Cancel a job: immediately if it is queued, otherwise as soon as its dispatcher notices.
 
@@ -229,6 +248,7 @@ class Jobs:
             check_bytes(session, job.owner, quotas)
             job.queued_at, job.not_before, job.failures, job.swept = now, now, 0, False
             job.finished_at = job.expires_at = job.error = job.progress = None
+            job.finish_requested = False
             move(session, job, Transition.RETRY, now)
         return job
 

@@ -227,12 +227,17 @@ class Leases:
     # --- while the job runs ----------------------------------------------------------------------------------------
 
     def start(self, lease: Lease) -> None:
-        """Mark a job as running once its inputs are read; a job that is being canceled keeps its status."""
+        """Mark a job as running once its inputs are read; a job that is being canceled keeps its status.
+
+        A job whose user wanted it to finish during an earlier attempt is marked as finishing again.
+        """
         now = self._database.clock()
         with self._database.writing() as session:
             job = self._require_lease(session, lease)
             if job.status == JobStatus.STARTING:
                 move(session, job, Transition.START, now)
+                if job.finish_requested:
+                    move(session, job, Transition.FINISH, now)
 
     def report_progress(self, lease: Lease, progress: dict[str, Any]) -> None:
         """Replace the job's progress and add it to the loss history (`history`).

@@ -12,6 +12,7 @@ class JobStatus(StrEnum):
     QUEUED = "queued"
     STARTING = "starting"
     RUNNING = "running"
+    FINISHING = "finishing"
     CANCELING = "canceling"
     SUCCEEDED = "succeeded"
     FAILED = "failed"
@@ -45,6 +46,8 @@ class Transition(StrEnum):
     REQUEUE = "requeue"
     #: The dispatcher has stopped the job.
     STOP = "stop"
+    #: The user ends the job early and keeps its result so far.
+    FINISH = "finish"
     #: The user cancels the job.
     CANCEL = "cancel"
     #: The user retries the job.
@@ -55,7 +58,7 @@ class Transition(StrEnum):
 
 _S = JobStatus
 #: States in which a dispatcher works on the job.
-ACTIVE = (_S.STARTING, _S.RUNNING, _S.CANCELING)
+ACTIVE = (_S.STARTING, _S.RUNNING, _S.FINISHING, _S.CANCELING)
 UNFINISHED = (_S.QUEUED, *ACTIVE)
 #: States of an ended job that still has its files.
 FINISHED = (_S.SUCCEEDED, _S.FAILED, _S.CANCELED)
@@ -70,16 +73,18 @@ TITLES: Mapping[JobStatus, str] = {
 #: Target state per transition and initial state; other combinations are not allowed. A job that is being canceled is
 #: stopped however its attempt ends, unless the attempt succeeds first.
 TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
-    Transition.TAKE: dict.fromkeys((_S.QUEUED, _S.STARTING, _S.RUNNING), _S.STARTING),
+    Transition.TAKE: dict.fromkeys((_S.QUEUED, _S.STARTING, _S.RUNNING, _S.FINISHING), _S.STARTING),
     Transition.START: {_S.STARTING: _S.RUNNING, _S.RUNNING: _S.RUNNING, _S.CANCELING: _S.CANCELING},
     Transition.SUCCEED: dict.fromkeys(ACTIVE, _S.SUCCEEDED),
-    Transition.FAIL: dict.fromkeys((_S.STARTING, _S.RUNNING), _S.FAILED),
-    Transition.REQUEUE: dict.fromkeys((_S.STARTING, _S.RUNNING), _S.QUEUED),
+    Transition.FAIL: dict.fromkeys((_S.STARTING, _S.RUNNING, _S.FINISHING), _S.FAILED),
+    Transition.REQUEUE: dict.fromkeys((_S.STARTING, _S.RUNNING, _S.FINISHING), _S.QUEUED),
     Transition.STOP: dict.fromkeys(ACTIVE, _S.CANCELED),
+    Transition.FINISH: {_S.RUNNING: _S.FINISHING, _S.FINISHING: _S.FINISHING},
     Transition.CANCEL: {
         _S.QUEUED: _S.CANCELED,
         _S.STARTING: _S.CANCELING,
         _S.RUNNING: _S.CANCELING,
+        _S.FINISHING: _S.CANCELING,
         _S.CANCELING: _S.CANCELING,
         _S.CANCELED: _S.CANCELED,
     },
@@ -91,7 +96,7 @@ TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
 #: page has a button for each.
 ACTIONS: Mapping[Transition, tuple[JobStatus, ...]] = {
     action: tuple(status for status, target in TRANSITIONS[action].items() if target is not status)
-    for action in (Transition.CANCEL, Transition.RETRY)
+    for action in (Transition.FINISH, Transition.CANCEL, Transition.RETRY)
 }
 
 

@@ -30,7 +30,8 @@ class JobRow(Base):
 
     `lease_epoch` counts its leases; every write of a dispatcher names the epoch that it holds. `failures` counts
     consecutive failed attempts without progress. `saved_step` is the step of the newest checkpoint, and `failed_step`
-    its value at the last failure. `swept` is set once the job has ended and has no files without database rows.
+    its value at the last failure. `finish_requested` is set once its user has ended the job early. `swept` is set once
+    the job has ended and has no files without database rows.
     """
 
     __tablename__ = "jobs"
@@ -52,6 +53,7 @@ class JobRow(Base):
     failures: Mapped[int] = mapped_column(Integer, default=0)
     saved_step: Mapped[int | None] = mapped_column(Integer)
     failed_step: Mapped[int | None] = mapped_column(Integer)
+    finish_requested: Mapped[bool] = mapped_column(Boolean, default=False, server_default=false())
     swept: Mapped[bool] = mapped_column(Boolean, default=False, server_default=false())
     progress: Mapped[dict[str, Any] | None]
     result: Mapped[dict[str, Any] | None]

@@ -37,6 +37,7 @@ _STOPPED = {
     "max-seconds": "stopped at the time limit",
     "target-loss": "stopped when the target loss was reached",
     "converged": "stopped when the loss had converged",
+    "on-request": "stopped on request, with the colors of that step",
     "interrupted": "interrupted",
 }
 _PARTS = {

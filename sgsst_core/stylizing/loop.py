@@ -17,7 +17,7 @@ from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, round_evaluat
 from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
 
-Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "interrupted"]
+Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "on-request", "interrupted"]
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ class Callbacks:
     Attributes:
         progress: Called after every iteration.
         stop: Called before every iteration; True ends the loop as "interrupted".
+        finish: Called before every iteration but the first; True ends the loop as "on-request".
         checkpoint: Called with the stylizer about every `checkpoint_seconds`, and once if the loop ends early.
         checkpoint_seconds: Seconds between checkpoints.
         preview: Called with the stylizer before the first step and about every `preview_seconds`.
@@ -88,6 +89,7 @@ class Callbacks:
 
     progress: Callable[[Progress], None] | None = None
     stop: Callable[[], bool] | None = None
+    finish: Callable[[], bool] | None = None
     checkpoint: Callable[[Stylizer], None] | None = None
     checkpoint_seconds: float = 300.0
     preview: Callable[[Stylizer], None] | None = None
@@ -141,6 +143,8 @@ def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
     """Return the reason if the user or the time limit ends the run before the next step. Ranks may disagree."""
     if callbacks.stop and callbacks.stop():
         return "interrupted"
+    if callbacks.finish and stylizer.step and callbacks.finish():
+        return "on-request"
     seconds = stylizer.job.settings.max_seconds
     return "max-seconds" if seconds and stylizer.seconds >= seconds else None
 

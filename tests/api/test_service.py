@@ -307,6 +307,36 @@ def test_retried_job_resumes_from_checkpoint(service: Service, files: dict[str, 
         assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
 
 
+@pytest.mark.slow
+def test_job_that_is_finished_early_keeps_its_colors(service: Service, files: dict[str, Path]) -> None:
+    """The request outlives the process of the attempt: the next one resumes, makes a step and writes its result."""
+    with service.client() as client:
+        job_id, cut = (submit(client, files, steps_sos=1_000_000) for _ in range(2))
+        wait_for_step(service, client, job_id, 5)
+        assert client.post(f"/v1/jobs/{job_id}/finish").json()["status"] == "finishing"
+        found = wait_until(service, client, job_id, "succeeded", "failed")
+        assert found["result"]["stopped"] == "on-request"
+        assert found["result"]["loss_after"] < found["result"]["loss_before"]
+        steps = found["result"]["steps"]
+        assert 5 <= steps < 1_000_000
+        report = client.get(f"/v1/jobs/{job_id}/artifacts/report.json").json()
+        assert report["stopped"] == "on-request"
+        assert sum(each["done"] for each in report["steps"].values()) == steps
+        assert "stopped on request" in client.get(f"/v1/jobs/{job_id}/artifacts/report.html").text
+        names = {each["name"] for each in client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]}
+        assert {"stylized.ply", "plan.json", "before_after.jpg", "colors.f16"} <= names
+        assert client.post(f"/v1/jobs/{job_id}/finish").status_code == 409
+        wait_for_step(service, client, cut, 5)
+        running = service.process("service.scheduling.attempt_process")
+        assert running is not None
+        running.suspend()
+        client.post(f"/v1/jobs/{cut}/finish")
+        running.kill()
+        found = wait_until(service, client, cut, "succeeded", "failed")
+        assert [attempt["outcome"] for attempt in found["attempts"]] == ["failed", "succeeded"]
+        assert found["result"]["stopped"] == "on-request"
+
+
 def test_queued_job_is_canceled_immediately(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
         first, second = submit(client, files), submit(client, files)

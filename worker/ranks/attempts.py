@@ -218,10 +218,14 @@ class _Attempts:
         first = self._group.handles[0]
         deadline: float | None = None
         done_at: float | None = None
+        finishing = False
         while True:
             if deadline is None and self._listener.stop():
                 deadline = time.monotonic() + STOP_SECONDS
                 first.actor.stop.remote()
+            if not finishing and self._listener.finish():
+                finishing = True
+                first.actor.finish.remote()
             if deadline is not None and time.monotonic() > deadline:
                 return None
             poll_ranks(self._group)

@@ -26,6 +26,8 @@ class Listener:
         happened: Called with a sentence about each lost or resumed attempt.
         warn: Called with each warning.
         stop: Called a few times per second; returns True to interrupt the job.
+        finish: Called a few times per second; returns True to end the job after a step, with its present colors as the
+            result.
         preview: Called with the path of each preview.
         left_out: Called with the GPUs that the job released because the plan does not use them, by their names in
             CUDA_VISIBLE_DEVICES on their machine.
@@ -39,6 +41,7 @@ class Listener:
     happened: Callable[[str], None] = lambda line: None
     warn: Callable[[str], None] = lambda line: None
     stop: Callable[[], bool] = lambda: False
+    finish: Callable[[], bool] = lambda: False
     preview: Callable[[Path], None] = lambda path: None
     left_out: Callable[[Sequence[str]], None] = lambda gpus: None
     stored: Callable[[Any], None] = lambda file: None

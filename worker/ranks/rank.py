@@ -142,7 +142,7 @@ class RankProcess:
 
     def __init__(self) -> None:
         self._status = RankStatus()
-        self._stop = threading.Event()
+        self._stop, self._finish = threading.Event(), threading.Event()
         self._lock = threading.Lock()
         self._listener: socket.socket | None = None
         die_with_parent()  # a suspended process would not notice the end of its parent, Ray's daemon
@@ -174,8 +174,12 @@ class RankProcess:
             return self._status
 
     def stop(self) -> None:
-        """Make the job end after the current step. The driver calls this on rank 0 only."""
+        """Interrupt the job after the current step. The driver calls this on rank 0 only."""
         self._stop.set()
+
+    def finish(self) -> None:
+        """End the job after a step, with its present colors as the result. The driver calls this on rank 0 only."""
+        self._finish.set()
 
     def _update(self, **changes: Any) -> None:
         with self._lock:
@@ -257,6 +261,7 @@ class RankProcess:
             job,
             progress=progress,
             stop=self._stop.is_set,
+            finish=self._finish.is_set,
             warn=self._add_warning,
             preview=Previews(task.preview_folder, task.preview_seconds, self._add_preview, self._add_warning)
             if task.preview_folder

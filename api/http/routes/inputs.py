@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import re
 from functools import partial
 from pathlib import PurePosixPath
 from typing import Annotated, Any
@@ -13,6 +12,7 @@ from fastapi.responses import StreamingResponse
 
 from api.http.context import Caller, CallerDep, Context, ContextDep
 from api.http.documentation import Responses, links, problems
+from api.http.input_references import input_entry
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import InputList, input_views
 from api.http.sending import (
@@ -26,7 +26,6 @@ from api.http.sending import (
 from service.errors import DamagedFileError, LostFileError, NoJobError, NotFoundError, StoreError
 from service.examples import JOB_ID
 from service.files.blobs import BLOBS
-from service.store.states import JobStatus
 from service.store.tables import BlobRow
 
 router = APIRouter(prefix="/v1/jobs", tags=["inputs"])
@@ -143,11 +142,8 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
         NoInputError: If the job has no such input, or has expired and released its inputs.
     """
     job = find(context, caller, job_id)
-    match = re.fullmatch(r"([a-z]{1,10})(?::(\d{1,6}))?", role, re.ASCII)
-    entries = [entry for entry in job.inputs if match is not None and entry["role"] == match[1]]
-    index = int(match[2] or 0) if match is not None else 0
-    if index < len(entries) and job.status != JobStatus.EXPIRED:
-        entry = entries[index]
+    entry = input_entry(job, role)
+    if entry is not None:
         row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
         if row is not None:
             return entry, row

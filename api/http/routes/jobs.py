@@ -1,4 +1,4 @@
-"""`/v1/jobs`: create, list, show, rename, cancel, retry and delete jobs."""
+"""`/v1/jobs`: create, list, show, rename, finish, cancel, retry and delete jobs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
+from api.http.input_references import input_entry, parse_reference
 from api.http.multipart import (
     BodyTypeError,
     NotUtf8Error,
@@ -48,6 +49,7 @@ from service.errors import (
     CancelError,
     DamagedWeightsError,
     DeleteError,
+    FinishError,
     NoJobError,
     QueueFullError,
     QuotaError,
@@ -55,6 +57,7 @@ from service.errors import (
     RetryError,
     TooLargeError,
     UnfinishedUploadError,
+    UnknownInputError,
     UnknownUploadError,
 )
 from service.examples import JOB_ID
@@ -91,6 +94,7 @@ _SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
 _FOLLOWING_OPERATIONS = (
     "get_job",
     "change_job",
+    "finish_job",
     "cancel_job",
     "retry_job",
     "delete_job",
@@ -240,23 +244,51 @@ def _resolve_inputs(
 ) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
     """Return the entries of all files of a job, and their blobs by digest.
 
-    The files come from the request and from earlier uploads. Their blobs are protected from deletion for some time.
+    The files come from the request, from earlier uploads and from inputs of earlier jobs. Their blobs are protected
+    from deletion for some time.
     """
     inputs = list(received.files)
-    ids = [upload_id for _, _, upload_id in received.uploads if is_id(upload_id)]
+    ids = [text for _, _, text in received.uploads if is_id(text)]
     uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
-    digests = []
-    for _, role, upload_id in received.uploads:
-        upload = uploads.get(upload_id)
+    jobs: dict[str, JobRow] = {}
+    found: list[tuple[str, str]] = []
+    for _, role, text in received.uploads:
+        reference = parse_reference(text)
+        if reference is not None:
+            entry = _referred_input(context, caller, *reference, role, jobs)
+            found.append((entry["name"], entry["sha256"]))
+            continue
+        upload = uploads.get(text)
         if upload is None:
-            raise UnknownUploadError(upload_id, role)
-        digests.append(_upload_digest(context, upload, role))
-    rows = context.store.inputs.hold(sorted({*digests, *(entry["sha256"] for entry in inputs)}))
-    for number, ((index, role, upload_id), sha256) in enumerate(zip(received.uploads, digests, strict=True)):
-        name = clean_name(role, uploads[upload_id].filename, number)
+            raise UnknownUploadError(text, role)
+        found.append((upload.filename, _upload_digest(context, upload, role)))
+    rows = context.store.inputs.hold(sorted({sha256 for _, sha256 in found} | {entry["sha256"] for entry in inputs}))
+    for number, ((index, role, _), (filename, sha256)) in enumerate(zip(received.uploads, found, strict=True)):
+        name = clean_name(role, filename, number)
         # Keep the order of the request: style weights follow the order of the styles.
         inputs.insert(index, {"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
     return inputs, rows
+
+
+def _referred_input(
+    context: Context, caller: Caller, job_id: str, name: str, role: str, jobs: dict[str, JobRow]
+) -> dict[str, Any]:
+    """Return the entry of an input of one of the caller's jobs.
+
+    Args:
+        jobs: Jobs that were read for other references, to which this one is added.
+
+    Raises:
+        UnknownInputError: If there is no such input, or no longer.
+    """
+    try:
+        job = jobs.setdefault(job_id, jobs.get(job_id) or find(context, caller, job_id))
+    except NoJobError:
+        raise UnknownInputError(job_id, name, role) from None
+    entry = input_entry(job, name)
+    if entry is None:
+        raise UnknownInputError(job_id, name, role)
+    return entry
 
 
 def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
@@ -375,6 +407,25 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Respons
 def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
     """Get the loss history of a job from its first step on, while it runs and after its end."""
     return progress_history(context.store.jobs.loss_history(find(context, caller, job_id), MOST_POINTS))
+
+
+@router.post(
+    "/{job_id}/finish",
+    response_model=JobDetail,
+    responses={
+        200: {
+            "headers": _SHOWN,
+            "links": links("get_job", "cancel_job", "watch_job", "list_artifacts", job_id="$response.body#/id"),
+        },
+        **problems(NoJobError, FinishError),
+    },
+    operation_id="finish_job",
+)
+def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+    """End a running job after its current step and keep its result so far (`finishing` until that is written)."""
+    check_id(job_id)
+    context.store.jobs.finish(job_id, caller.owner)
+    return _job_response(context, caller, job_id)
 
 
 @router.post(

@@ -90,6 +90,7 @@ def test_exit_codes_and_errors_as_json(files: list[str], capsys: pytest.CaptureF
     for command, code, kind in (
         (["status", MISSING], 3, "not-found"),
         (["retry", job_id], 4, "conflict"),
+        (["finish", job_id], 4, "conflict"),
         (["status"], 2, "usage"),
         (["jobs", "--limt", "3"], 2, "usage"),
         (["submit", files[0], "--style", "missing.png", "--orbit", "3"], 2, ""),

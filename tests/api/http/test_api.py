@@ -615,6 +615,7 @@ def test_keys_cannot_access_each_others_jobs(service: Service, client: httpx.Cli
         for caller in (you, client):
             for method, path in (
                 ("GET", ""),
+                ("POST", "/finish"),
                 ("POST", "/cancel"),
                 ("POST", "/retry"),
                 ("DELETE", ""),

@@ -230,3 +230,55 @@ def test_previews_and_loss_history(client: httpx.Client, files: dict[str, Path],
     assert last["updated_at"] == shown["progress"]["updated_at"]
     assert (last["attempt"], last["stage"], last["total"], last["seconds"]) == (1, "sos", 600, 30.0)
     assert (last["loss"], last["scales"]) == (100.0 / 30, [None, 100.0 / 30])
+
+
+# --- references ----------------------------------------------------------------------------------------------------
+
+
+def test_new_job_uses_inputs_of_an_earlier_one(
+    service: Service, store: Store, client: httpx.Client, files: dict[str, Path]
+) -> None:
+    first = submit(client, files, ["one.png", "two.png"])
+    used, blobs = client.get(f"/v1/jobs/{first}").json()["inputs"], store.inputs.locations()
+    at = f"/v1/jobs/{first}/inputs"
+    body = {"scene": f"{at}/scene", "cameras": [f"{at}/cameras:0"], "style": [f"{at}/style:1", f"{at}/style"]}
+    answer = client.post("/v1/jobs", json=body | {"parameters": {"style_weights": [3, 1]}})
+    assert answer.status_code == 202, answer.text
+    again = answer.json()
+    assert again["name"] == "scene \u00b7 two + one"
+    assert sorted(map(str, again["inputs"])) == sorted(map(str, used))
+    assert [each["name"] for each in again["inputs"] if each["role"] == "style"] == ["two.png", "one.png"]
+    form = [("scene", (None, f"{at}/scene")), ("cameras", (None, f"{at}/cameras"))]
+    style = ("style", (files["style"].name, files["style"].read_bytes()))
+    mixed = client.post("/v1/jobs", files=[*form, style])
+    assert mixed.status_code == 202, mixed.text
+    assert store.inputs.locations() >= blobs
+    assert [each["sha256"] for each in mixed.json()["inputs"] if each["role"] == "scene"] == [used[0]["sha256"]]
+    store.jobs.cancel(first, None)
+    client.delete(f"/v1/jobs/{first}")
+    assert client.get(f"/v1/jobs/{again['id']}/inputs/scene").content == files["scene"].read_bytes()
+    refused = client.post("/v1/jobs", json=body)
+    check_documented(refused)
+    assert (refused.status_code, refused.json()["code"], refused.json()["input"]) == (422, "unknown-input", "scene")
+    assert "Upload the file again." in refused.json()["detail"]
+
+
+@pytest.mark.parametrize("name", ["scene:1", "style:2", "photos", "style:-1", "style:1/..", "stylized.ply", "scene:x"])
+def test_reference_to_an_input_that_a_job_has_not_is_refused(
+    client: httpx.Client, files: dict[str, Path], name: str
+) -> None:
+    at = f"/v1/jobs/{submit(client, files, ['one.png', 'two.png'])}/inputs"
+    answer = client.post("/v1/jobs", json={"scene": f"{at}/{name}", "style": f"{at}/style", "cameras": [at]})
+    assert answer.status_code == 422
+    assert answer.json()["code"] in ("unknown-input", "unknown-upload")
+    assert answer.json()["input"] == "scene"
+
+
+def test_references_do_not_reach_jobs_of_other_keys(service: Service, store: Store, files: dict[str, Path]) -> None:
+    (_, mine), (_, other) = store.keys.create("mine"), store.keys.create("other")
+    with service.client(mine) as me, service.client(other) as you:
+        at = f"/v1/jobs/{submit(me, files, ['one.png'])}/inputs"
+        body = {"scene": f"{at}/scene", "style": f"{at}/style", "cameras": [f"{at}/cameras"]}
+        answer = you.post("/v1/jobs", json=body)
+        assert (answer.status_code, answer.json()["code"]) == (422, "unknown-input")
+        assert me.post("/v1/jobs", json=body).status_code == 202

@@ -23,15 +23,16 @@ from service.store.states import (
 
 #: Rows: initial states; columns: transitions. A dot marks a combination that is not allowed.
 EXPECTED = """
-            take      start     succeed    fail    requeue  stop      cancel     retry   expire
-queued      starting  .         .          .       .        .         canceled   .       .
-starting    starting  running   succeeded  failed  queued   canceled  canceling  .       .
-running     starting  running   succeeded  failed  queued   canceled  canceling  .       .
-canceling   .         canceling succeeded  .       .        canceled  canceling  .       .
-succeeded   .         .         .          .       .        .         .          .       expired
-failed      .         .         .          .       .        .         .          queued  expired
-canceled    .         .         .          .       .        .         canceled   queued  expired
-expired     .         .         .          .       .        .         .          .       .
+            take      start     succeed    fail    requeue  stop      finish     cancel     retry   expire
+queued      starting  .         .          .       .        .         .          canceled   .       .
+starting    starting  running   succeeded  failed  queued   canceled  .          canceling  .       .
+running     starting  running   succeeded  failed  queued   canceled  finishing  canceling  .       .
+finishing   starting  .         succeeded  failed  queued   canceled  finishing  canceling  .       .
+canceling   .         canceling succeeded  .       .        canceled  .          canceling  .       .
+succeeded   .         .         .          .       .        .         .          .          .       expired
+failed      .         .         .          .       .        .         .          .          queued  expired
+canceled    .         .         .          .       .        .         .          canceled   queued  expired
+expired     .         .         .          .       .        .         .          .          .       .
 """
 
 
@@ -76,7 +77,8 @@ def test_canceling_job_can_only_end() -> None:
 
 def test_actions_apply_to_states_that_they_change() -> None:
     assert ACTIONS == {
-        Transition.CANCEL: (JobStatus.QUEUED, JobStatus.STARTING, JobStatus.RUNNING),
+        Transition.FINISH: (JobStatus.RUNNING,),
+        Transition.CANCEL: (JobStatus.QUEUED, JobStatus.STARTING, JobStatus.RUNNING, JobStatus.FINISHING),
         Transition.RETRY: (JobStatus.FAILED, JobStatus.CANCELED),
     }
 

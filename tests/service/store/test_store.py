@@ -526,6 +526,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.held: dict[str, tuple[Lease, float]] = {}
         self.old: list[Lease] = []
         self.published: dict[str, int] = {}
+        self.finished_early: set[str] = set()
 
     def teardown(self) -> None:
         self.store.close()
@@ -583,7 +584,8 @@ class StoreMachine(RuleBasedStateMachine):
         canceling = self.status[job_id] == "canceling"
         if how == "running":
             leases.start(held)
-            self.status[job_id] = "canceling" if canceling else "running"
+            running = "finishing" if job_id in self.finished_early else "running"
+            self.status[job_id] = "canceling" if canceling else running
             return
         if how == "succeed":
             leases.succeed(held, [Published("stylized.ply", f"{held.epoch}", 1, SHA)], {})
@@ -612,13 +614,18 @@ class StoreMachine(RuleBasedStateMachine):
             self.store.leases.succeed(late, [Published("stylized.ply", "late", 1, SHA)], {})
 
     @precondition(lambda self: self.status)
-    @rule(data=st.data(), what=st.sampled_from(["cancel", "retry", "delete"]))
+    @rule(data=st.data(), what=st.sampled_from(["finish", "cancel", "retry", "delete"]))
     def ask(self, data: st.DataObject, what: str) -> None:
         job_id = data.draw(st.sampled_from(sorted(self.status)))
         before = self.status[job_id]
         jobs = self.store.jobs
         try:
-            if what == "cancel":
+            if what == "finish":
+                jobs.finish(job_id, None)
+                assert before in ("running", "finishing")
+                self.status[job_id] = "finishing"
+                self.finished_early.add(job_id)
+            elif what == "cancel":
                 jobs.cancel(job_id, None)
                 self.status[job_id] = {"queued": "canceled", "canceled": "canceled"}.get(before, "canceling")
                 assert before in ("queued", *ACTIVE, "canceled")
@@ -626,6 +633,7 @@ class StoreMachine(RuleBasedStateMachine):
                 jobs.retry(job_id, None, limit=1000)
                 assert before in ("failed", "canceled")
                 self.status[job_id] = "queued"
+                self.finished_early.discard(job_id)
             else:
                 jobs.delete(job_id, None)
                 assert before in FINISHED
@@ -633,7 +641,11 @@ class StoreMachine(RuleBasedStateMachine):
                 self.old = [lease for lease in self.old if lease.job_id != job_id]
                 self.published.pop(job_id, None)
         except ConflictError:
-            wrong = {"cancel": ("succeeded", "failed"), "delete": ("queued", *ACTIVE)}
+            wrong = {
+                "finish": ("queued", "starting", "canceling", *FINISHED),
+                "cancel": ("succeeded", "failed"),
+                "delete": ("queued", *ACTIVE),
+            }
             assert before in wrong.get(what, ("queued", "succeeded", *ACTIVE))
 
     @invariant()

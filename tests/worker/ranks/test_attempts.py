@@ -58,6 +58,7 @@ class EventRecorder:
     """Recorder of a job's events, which stops the job at step `stop_at`."""
 
     stop_at: int | None = None
+    finish_at: int | None = None
     planned: list[float] = field(default_factory=list)
     prepared: list[Prepared] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
@@ -69,8 +70,8 @@ class EventRecorder:
         def progress(current: Progress) -> None:
             self.steps.append(current.step)
 
-        def stop() -> bool:
-            return self.stop_at is not None and bool(self.steps) and self.steps[-1] >= self.stop_at
+        def reached(step: int | None) -> bool:
+            return step is not None and bool(self.steps) and self.steps[-1] >= step
 
         return Listener(
             planning=lambda now: self.planned.append(now.fraction),
@@ -78,7 +79,8 @@ class EventRecorder:
             progress=progress,
             happened=self.happened.append,
             warn=self.warnings.append,
-            stop=stop,
+            stop=lambda: reached(self.stop_at),
+            finish=lambda: reached(self.finish_at),
             preview=self.previews.append,
         )
 
@@ -201,6 +203,19 @@ def test_full_disk_skips_checkpoint_and_canceled_job_resumes(
     ended = run(replace(request, resume=True), cluster, heard)
     assert heard.prepared[0].step > 0
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
+
+
+@pytest.mark.slow
+def test_job_that_is_finished_early_keeps_its_colors(cluster: Cluster, tmp_path: Path) -> None:
+    request = small_request(tmp_path, 100_000)
+    ended = run(request, cluster, EventRecorder(finish_at=4))
+    assert not ended.interrupted
+    assert ended.result is not None
+    assert (ended.result.stopped, ended.result.report_error) == ("on-request", None)
+    assert 4 <= ended.step < 100_000
+    assert request.out.exists()
+    report = json.loads(request.out.with_name("s.report.json").read_text())
+    assert (report["stopped"], report["workers"]["used"]) == ("on-request", 2)
 
 
 @pytest.mark.slow

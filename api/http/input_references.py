@@ -1,0 +1,29 @@
+"""References to inputs of other jobs by their paths in the API, so that a new job needs no further upload."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from service.store.states import JobStatus
+from service.store.tables import JobRow
+
+#: Path of an input, as in the API. The groups are the id of the job, and the input.
+_PATH = re.compile(r"/v1/jobs/(job_[0-9a-f]{20,40})/inputs/([a-z]{1,10}(?::[0-9]{1,6})?)", re.ASCII)
+_INPUT = re.compile(r"([a-z]{1,10})(?::([0-9]{1,6}))?", re.ASCII)
+
+
+def parse_reference(text: str) -> tuple[str, str] | None:
+    """Return the job's id and the input that a path of the API refers to, or None if it is not such a path."""
+    match = _PATH.fullmatch(text)
+    return (match[1], match[2]) if match else None
+
+
+def input_entry(job: JobRow, name: str) -> dict[str, Any] | None:
+    """Return a job's entry for an input such as "scene" or "style:1"; None if it has none, or none any more."""
+    match = _INPUT.fullmatch(name)
+    if match is None or job.status == JobStatus.EXPIRED:
+        return None
+    entries = [entry for entry in job.inputs if entry["role"] == match[1]]
+    index = int(match[2] or 0)
+    return entries[index] if index < len(entries) else None
