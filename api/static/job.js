@@ -7,6 +7,7 @@ import { labels, nameOf } from "./names.js";
 import { decisions } from "./plan.js";
 import { ResultStage } from "./result_stage.js";
 import { resultFormats } from "./scene_formats.js";
+import { startFrom } from "./submit.js";
 import { actionsOf, titles, UNFINISHED } from "./statuses.js";
 import { size, time, words } from "./words.js";
 
@@ -239,7 +240,8 @@ export class JobView {
     if (this.shownFor === job.status) return;
     this.shownFor = job.status;
     put(this.actions,
-      actionsOf(job.status).map(({ name, title }) => button(title, () => ask("POST", `/v1/jobs/${this.id}/${name}`), UNFINISHED.has(job.status) ? "quiet" : "primary")));
+      actionsOf(job.status).map(({ name, title }) => button(say.actions[name] ?? title, () => ask("POST", `/v1/jobs/${this.id}/${name}`), UNFINISHED.has(job.status) ? "quiet" : "primary")),
+      UNFINISHED.has(job.status) ? null : [h("button.quiet", { type: "button", onclick: () => startFrom(this.job, { painting: false }) }, say.anotherPainting), h("button.quiet", { type: "button", onclick: () => startFrom(this.job) }, say.changed)]);
     put(this.deletion, UNFINISHED.has(job.status) ? null : deleteButton(say.remove, async () => {
         await ask("DELETE", `/v1/jobs/${this.id}`);
         location.hash = "#/jobs";

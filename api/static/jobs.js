@@ -76,7 +76,7 @@ export class JobsView {
     const before = [...this.list.children];
     if (before.length !== elements.length || before.some((each, i) => each !== elements[i])) put(this.list, elements);
     this.more.hidden = !this.cursor;
-    this.compare.disabled = this.chosen.size !== 2;
+    this.compare.disabled = this.chosen.size < 2;
   }
 
   /** Return the card of a job; it is rebuilt only if the job has changed. @param {any} job */
@@ -112,17 +112,17 @@ export class JobsView {
   choose(id, on) {
     if (on) this.chosen.add(id);
     else this.chosen.delete(id);
-    this.compare.disabled = this.chosen.size !== 2;
+    this.compare.disabled = this.chosen.size < 2;
   }
 
   compareChosen() {
-    const [a, b] = [...this.chosen], [first, second] = [a, b].map((id) => this.jobs.find((job) => job.id === id));
-    if (sceneOf(first) !== sceneOf(second)) {
+    const ids = [...this.chosen], scenes = new Set(ids.map((id) => sceneOf(this.jobs.find((job) => job.id === id))));
+    if (scenes.size > 1) {
       this.problem.hidden = false;
       this.problem.textContent = say.otherScenes;
       return;
     }
-    location.hash = `#/compare/${a}/${b}`;
+    location.hash = `#/compare/${ids.join("/")}`;
   }
 
   end() {

@@ -32,7 +32,7 @@ function viewOf() {
   if (name === "") return new SubmitView();
   if (name === "jobs" && !ids.length) return new JobsView();
   if (name === "jobs" && known && ids.length === 1) return new JobView(ids[0]);
-  if (name === "compare" && known && ids.length === 2) return new CompareView(ids);
+  if (name === "compare" && known && ids.length >= 2 && ids.length <= 20) return new CompareView(ids);
   return { title: "", element: h("div.empty", h("h1", say.missing), h("a.button.primary", { href: "#/" }, say.toNew)), end: () => {} };
 }
 

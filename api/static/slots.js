@@ -3,7 +3,10 @@
 import { h, icon, newId, put } from "./dom.js";
 import { showWrong } from "./options.js";
 import { sceneSuffix } from "./scene_formats.js";
+import { StoredFile } from "./stored.js";
 import { size, words } from "./words.js";
+
+/** @typedef {import("./stored.js").Chosen} Chosen */
 
 const say = words.submit;
 /** Number of files that a slot lists. */
@@ -12,8 +15,8 @@ const SHOWN = 12;
 /**
  * Add files to others; a file replaces one of the same name.
  *
- * @param {File[]} old
- * @param {File[]} more
+ * @param {Chosen[]} old
+ * @param {Chosen[]} more
  */
 export function withoutDoubles(old, more) {
   const names = new Set(more.map(({ name }) => name));
@@ -24,11 +27,11 @@ export function withoutDoubles(old, more) {
  * Add camera files to others. A JSON file holds all cameras, so it replaces what was there; the files of a COLMAP model
  * belong together.
  *
- * @param {File[]} old
- * @param {File[]} more
+ * @param {Chosen[]} old
+ * @param {Chosen[]} more
  */
 export function oneModel(old, more) {
-  const isJson = (/** @type {File} */ { name }) => /\.json$/i.test(name);
+  const isJson = (/** @type {Chosen} */ { name }) => /\.json$/i.test(name);
   return more.some(isJson) ? more : withoutDoubles(old.filter((file) => !isJson(file)), more);
 }
 
@@ -36,7 +39,7 @@ export class Slot {
   /**
    * @param {string} name
    * @param {string} hint
-   * @param {{accept?: string, multiple?: boolean, pictures?: boolean, add?: (old: File[], more: File[]) => File[], changed: () => void}} how
+   * @param {{accept?: string, multiple?: boolean, pictures?: boolean, add?: (old: Chosen[], more: Chosen[]) => Chosen[], changed: () => void}} how
    *   `add` returns the files after some were chosen
    */
   constructor(name, hint, { accept = "", multiple = false, pictures = false, add = withoutDoubles, changed }) {
@@ -45,7 +48,7 @@ export class Slot {
     this.pictures = pictures;
     this.changed = changed;
     this.combined = add;
-    /** @type {File[]} */
+    /** @type {Chosen[]} */
     this.files = [];
     /** @type {string[]} */
     this.urls = [];
@@ -59,7 +62,7 @@ export class Slot {
     this.element = h("div.slot", this.pick, this.thumbs, this.error);
   }
 
-  /** @param {File[]} files */
+  /** @param {Chosen[]} files */
   add(files) {
     if (!files.length) return;
     this.files = this.multiple ? this.combined(this.files, files) : [files[0]];
@@ -68,7 +71,7 @@ export class Slot {
     this.changed();
   }
 
-  /** @param {File} file */
+  /** @param {Chosen} file */
   remove(file) {
     this.files = this.files.filter((each) => each !== file);
     this.show();
@@ -96,11 +99,18 @@ export class Slot {
     this.input.focus();
   }
 
-  /** @param {File} file */
+  /** Ask for files that have expired on the service again. @param {string[]} names */
+  askAgain(names) {
+    this.hint = say.expired(names);
+    this.files = this.files.filter((file) => !(file instanceof StoredFile));
+    this.show();
+  }
+
+  /** @param {Chosen} file */
   thumb(file) {
     const remove = h("button.tool", { type: "button", "aria-label": say.remove(file.name), title: say.remove(file.name), onclick: () => this.remove(file) }, icon("close"));
     if (!this.pictures) return h("div.thumb.plain", h("span", file.name), remove);
-    const url = URL.createObjectURL(file);
+    const url = file instanceof StoredFile ? file.url : URL.createObjectURL(file);
     this.urls.push(url);
     return h("div.thumb", h("img", { src: url, alt: file.name }), remove);
   }

@@ -10,10 +10,12 @@ import { RegionList } from "./regions.js";
 import { accepted } from "./scene_formats.js";
 import { droppedFiles, oneModel, Slot, sorted } from "./slots.js";
 import { Stage } from "./stage.js";
+import { contentOf, StoredFile, storedInputs } from "./stored.js";
 import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
 import { percent, words } from "./words.js";
 
 /** @typedef {import("./options.js").Control} Control */
+/** @typedef {import("./stored.js").Chosen} Chosen */
 
 const say = words.submit;
 const ORBIT = ["orbit", "up", "elevation", "radius"];
@@ -26,9 +28,40 @@ const UPS = /** @type {Record<string, number[]>} */ ({ x: [1, 0, 0], "-x": [-1, 
  * Files, weights of the styles and regions of the form while another view is shown. The other inputs are in the
  * session's storage, which cannot hold files.
  *
- * @type {{files: Record<string, File[]>, weights: string[], regions: any[]} | null}
+ * @type {{files: Record<string, Chosen[]>, weights: string[], regions: any[], apart?: boolean | undefined, expired?: Record<string, Chosen[]>} | null}
  */
 let kept = null;
+
+/**
+ * Open the form with the inputs and parameters of a job, which replace what was entered before. Inputs that the service
+ * has deleted are asked for again.
+ *
+ * @param {any} job
+ * @param {{painting?: boolean}} [how] `painting`: whether to keep the job's paintings
+ */
+export function startFrom(job, { painting = true } = {}) {
+  const { style_weights: weights, regions, orbit, preset, name: _, ...values } = job.parameters, inputs = storedInputs(job);
+  const taken = new Set((regions ?? []).flatMap((/** @type {any} */ region) => region.style ?? []));
+  const own = inputs.style.filter(({ name }) => !taken.has(name)), gone = job.status === "expired";
+  if (!painting) inputs.style = inputs.style.filter(({ name }) => taken.has(name));
+  kept = {
+    files: gone ? { scene: [], style: [], cameras: [], photos: [] } : inputs, expired: gone ? inputs : {}, regions: regions ?? [],
+    weights: painting && weights ? inputs.style.map((file) => String(weights[own.indexOf(file)] ?? 1)) : [],
+  };
+  const draft = Object.fromEntries(Object.entries({ ...values, orbit }).filter(([, value]) => value !== null));
+  for (const color of ["background", "style_background"]) if (Array.isArray(draft[color])) draft[color] = draft[color].map((/** @type {number} */ part) => Math.round(255 * part));
+  storeDraft({ values: draft, preset, orbiting: orbit !== null && orbit !== undefined });
+  location.hash = "#/";
+}
+
+/** @param {{values: Record<string, any>, preset: string | undefined, orbiting: boolean}} draft */
+function storeDraft(draft) {
+  try {
+    sessionStorage.setItem(DRAFT, JSON.stringify(draft));
+  } catch {
+    // private windows may have no storage
+  }
+}
 
 /** Forget everything that was entered into the form. */
 export function forgetDraft() {
@@ -58,6 +91,8 @@ export class SubmitView {
     this.weights = [];
     this.regions = new RegionList();
     this.created = false;
+    /** Idempotency keys of requests for jobs, by their bodies. @type {Map<string, string>} */
+    this.keys = new Map();
     this.build();
     this.restoreFiles();
     this.loadOptions();
@@ -70,7 +105,10 @@ export class SubmitView {
     for (const [role, slot] of Object.entries(this.slots)) slot.add(kept.files[role]);
     this.regions.restore(kept.regions);
     this.regionFold.open = kept.regions.length > 0;
+    if (kept.apart && this.apart) this.apart.input.checked = true;
+    for (const [role, files] of Object.entries(kept.expired ?? {})) if (files.length) this.slots[/** @type {keyof typeof this.slots} */ (role)].askAgain(files.map(({ name }) => name));
     kept = null;
+    this.styleChanged();
   }
 
   build() {
@@ -83,6 +121,9 @@ export class SubmitView {
     this.fromFiles = this.choice("views", say.fromFiles, true);
     this.viewsBody = h("div.views-body");
     this.found = h("p.quiet");
+    this.blended = this.choice("paintings", say.blended, true, () => this.styleChanged());
+    this.apart = this.choice("paintings", say.apart, false, () => this.styleChanged());
+    this.together = h("fieldset.segments.wide", { hidden: true }, h("legend.away", say.paintings), this.blended.element, this.apart.element);
     this.shares = h("div.options.shares", { hidden: true });
     this.lookOptions = h("div.options");
     this.expertOptions = h("div.options");
@@ -100,7 +141,7 @@ export class SubmitView {
     this.unused = h("p.wrong.block", { hidden: true, role: "alert" });
     this.form = h("form.panel", { noValidate: true, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.act(false)) },
       h("header", h("h1", say.heading), h("p.lead", say.lead)), this.notice, this.name.element,
-      h("section", h("h2", say.files), this.unused, this.slots.scene.element, this.slots.style.element, this.shares),
+      h("section", h("h2", say.files), this.unused, this.slots.scene.element, this.slots.style.element, this.together, this.shares),
       h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.viewsBody, this.found),
       h("section", h("h2", say.essentials), this.presets, this.main),
       h("section", h("h2", say.more), this.search, this.none, h("div", this.lookFold, this.regionFold, this.expertFold)),
@@ -114,9 +155,10 @@ export class SubmitView {
    * @param {string} group
    * @param {string} name
    * @param {boolean} checked
+   * @param {() => void} [changed]
    */
-  choice(group, name, checked) {
-    const input = h("input", { type: "radio", name: group, checked, onchange: () => this.showViews() });
+  choice(group, name, checked, changed = () => this.showViews()) {
+    const input = h("input", { type: "radio", name: group, checked, onchange: changed });
     return { input, element: h("label", input, h("span", name)) };
   }
 
@@ -150,6 +192,7 @@ export class SubmitView {
       if (["name", "style_weights", "regions", "preset"].includes(name)) continue;
       this.controls.set(name, optionControl(name, each, name === "orbit" ? { title: say.howMany } : {}));
     }
+    this.schema = schema;
     this.makePresets(schema.preset);
     const elements = (/** @type {string[]} */ names) => names.map((name) => this.controls.get(name)?.element).filter(Boolean);
     put(this.main, ...elements(GROUPS.essentials));
@@ -193,11 +236,7 @@ export class SubmitView {
 
   saveDraft() {
     const values = Object.fromEntries([...this.controls].map(([name, control]) => [name, control.value()]).filter(([, value]) => value !== undefined));
-    try {
-      sessionStorage.setItem(DRAFT, JSON.stringify({ values, preset: this.preset, orbiting: this.orbiting }));
-    } catch {
-      // private windows may have no storage
-    }
+    storeDraft({ values, preset: this.preset, orbiting: this.orbiting });
   }
 
   restoreDraft() {
@@ -208,7 +247,8 @@ export class SubmitView {
       draft = null;
     }
     if (!draft) return;
-    for (const [name, value] of Object.entries(draft.values ?? {})) this.controls.get(name)?.set(Array.isArray(value) ? value.join(", ") : value);
+    const given = Object.entries(draft.values ?? {}).filter(([name, value]) => JSON.stringify(value) !== JSON.stringify(this.schema?.[name]?.default));
+    for (const [name, value] of given) this.controls.get(name)?.set(Array.isArray(value) ? value.join(", ") : value);
     const preset = [...this.presets.querySelectorAll("input")].find((/** @type {any} */ input) => input.value === draft.preset);
     if (preset) {
       /** @type {any} */ (preset).checked = true;
@@ -268,7 +308,7 @@ export class SubmitView {
       this.stage.message("");
       return viewer.draw();
     }
-    const scene = (this.opened = viewer.open(file));
+    const scene = (this.opened = viewer.open(file instanceof StoredFile ? file.url : file));
     viewer.onReload = () => this.sceneChanged();
     this.stage.show({ scene, colors: "own" });
     try {
@@ -293,8 +333,16 @@ export class SubmitView {
       const input = h("input", { type: "number", min: 0, step: "any", value: this.weights[i]?.value ?? "1", "aria-label": file.name });
       return input;
     }) : [];
-    this.shares.hidden = files.length < 2;
+    this.together.hidden = files.length < 2;
+    this.shares.hidden = files.length < 2 || !!this.apart?.input.checked;
+    this.startButton.textContent = this.jobs > 1 ? say.startAll(this.jobs) : say.start;
     put(this.shares, h("p.help", say.weights), files.length > 1 ? files.map((file, i) => h("div.option.inline", h("span", file.name), this.weights[i])) : null);
+  }
+
+  /** Number of jobs to create: one, or one per painting that belongs to no region. */
+  get jobs() {
+    const taken = new Set(this.regions.value().flatMap((region) => region.style ?? []));
+    return this.apart?.input.checked ? Math.max(1, this.slots.style.files.filter(({ name }) => !taken.has(name)).length) : 1;
   }
 
   async camerasChanged() {
@@ -304,7 +352,7 @@ export class SubmitView {
     if (this.orbiting) [cameras, told] = this.ringNow();
     else if (slot.files.length) {
       try {
-        cameras = await readCameras(slot.files.map((file) => ({ name: file.name, blob: file })));
+        cameras = await readCameras(await Promise.all(slot.files.map(async (file) => ({ name: file.name, blob: await contentOf(file) }))));
         told = words.cameras.found(cameras.length);
       } catch {
         told = words.cameras.notReadHere;
@@ -353,6 +401,7 @@ export class SubmitView {
     if (this.preset) values.preset = this.preset;
     const regions = this.regions.value(), taken = new Set(regions.flatMap((region) => region.style ?? []));
     if (regions.length) values.regions = regions;
+    if (this.jobs > 1) return values;
     const own = this.weights.filter((_, i) => !taken.has(this.slots.style.files[i]?.name)).map((input) => Number(input.value));
     if (own.length > 1 && own.some((weight) => weight !== own[0])) values.style_weights = own;
     return values;
@@ -374,7 +423,7 @@ export class SubmitView {
     const used = [...this.controls.values()].filter(({ name }) => this.orbiting || !ORBIT.includes(name));
     const wrong = used.filter((control) => control.problem());
     for (const control of [...wrong].reverse()) this.tell(control, control.problem());
-    const weight = this.weights.find((input) => !(Number(input.value) > 0) || !Number.isFinite(Number(input.value)));
+    const weight = this.jobs === 1 && this.weights.find((input) => !(Number(input.value) > 0) || !Number.isFinite(Number(input.value)));
     if (!weight) return wrong.length > 0;
     this.slots.style.wrong(words.refusals.weight(weight.getAttribute("aria-label")));
     weight.focus();
@@ -397,9 +446,9 @@ export class SubmitView {
     this.stopping = new AbortController();
     this.planningText = "";
     try {
-      const body = await this.send();
-      if (dry) await this.plan(body);
-      else await this.create(body);
+      const bodies = this.bodies(await this.send());
+      if (dry) await this.plan(bodies[0]);
+      else await this.create(bodies);
     } catch (error) {
       if (!this.leaving.signal.aborted && !this.stopped) this.refuse(error);
     } finally {
@@ -413,7 +462,7 @@ export class SubmitView {
     this.busy = busy;
     this.stopped = false;
     for (const button of [this.costButton, this.startButton]) button.disabled = busy;
-    this.startButton.textContent = busy && !dry ? say.starting : say.start;
+    this.startButton.textContent = busy && !dry ? say.starting : this.jobs > 1 ? say.startAll(this.jobs) : say.start;
     this.progress.hidden = !busy;
     if (busy) put(this.result);
   }
@@ -421,19 +470,27 @@ export class SubmitView {
   /** Upload the files that the service lacks, and return the body of `POST /v1/jobs`. */
   async send() {
     const { scene, style, cameras, photos } = this.slots, files = this.orbiting ? [] : [cameras.files, photos.files];
-    const all = [scene.files, style.files, ...files].flat();
+    const all = /** @type {File[]} */ ([scene.files, style.files, ...files].flat().filter((file) => !(file instanceof StoredFile)));
     for (const file of all) if (!this.uploads.has(file)) this.uploads.set(file, new Upload(file, () => this.showSending(all)));
     this.showSending(all);
     this.sending = all.map((file) => /** @type {Upload} */ (this.uploads.get(file)));
     for (const upload of this.sending) upload.over = false;
-    const ids = await sendAll(this.sending);
-    let at = 0;
-    const take = (/** @type {number} */ n) => ids.slice(at, (at += n));
-    const [sceneId] = take(1), styles = take(style.files.length);
+    const ids = await sendAll(this.sending), idOf = new Map(all.map((file, i) => [/** @type {Chosen} */ (file), ids[i]]));
+    const named = (/** @type {Chosen[]} */ chosen) => chosen.map((file) => (file instanceof StoredFile ? file.path : idOf.get(file)));
     return {
-      scene: sceneId, style: styles.length === 1 ? styles[0] : styles, cameras: this.orbiting ? [] : take(cameras.files.length),
-      photos: this.orbiting ? [] : take(photos.files.length), parameters: this.parameters(),
+      scene: named(scene.files)[0], style: named(style.files), cameras: this.orbiting ? [] : named(cameras.files),
+      photos: this.orbiting ? [] : named(photos.files), parameters: this.parameters(),
     };
+  }
+
+  /** Return the bodies of the jobs: the given one, or one per painting. Paintings of regions belong to all of them. @param {any} body */
+  bodies(body) {
+    if (this.jobs === 1) return [body];
+    const { files } = this.slots.style, taken = new Set(this.regions.value().flatMap((region) => region.style ?? []));
+    const shared = body.style.filter((/** @type {string} */ _, /** @type {number} */ i) => taken.has(files[i].name)), { name } = body.parameters;
+    return files.flatMap((file, i) => taken.has(file.name) ? [] : [{
+      ...body, style: [body.style[i], ...shared], parameters: { ...body.parameters, ...(name ? { name: defaultName(name, [file.name]).slice(0, 200) } : {}) },
+    }]);
   }
 
   /** @param {File[]} files */
@@ -468,16 +525,21 @@ export class SubmitView {
   async plan(body) {
     this.tellPlanning(say.planning);
     const answer = await ask("POST", "/v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: AbortSignal.any([this.leaving.signal, /** @type {AbortController} */ (this.stopping).signal]) });
-    if (!answer.headers.get("content-type")?.includes("event-stream")) return void put(this.result, costCard(await answer.json()));
+    if (!answer.headers.get("content-type")?.includes("event-stream")) return void this.showPlan(await answer.json());
     for await (const { event, data } of eventsOf(answer)) {
       if (event === "planning") this.tellPlanning(say.planned(data.step, data.total), data.fraction);
       else if (event === "problem") throw new Problem(data.status, data);
       else if (event === "plan") {
-        put(this.result, costCard(data));
+        this.showPlan(data);
         this.result.scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
       }
     }
     this.planningText = "";
+  }
+
+  /** @param {any} view */
+  showPlan(view) {
+    put(this.result, costCard(view), this.jobs > 1 ? h("p.help", say.eachTakes(this.jobs)) : null);
   }
 
   /** @param {string} text @param {number} [share] */
@@ -488,17 +550,26 @@ export class SubmitView {
     else this.sendingBar.removeAttribute("value");
   }
 
-  /** @param {any} body */
-  async create(body) {
+  /** @param {any[]} bodies */
+  async create(bodies) {
     this.tellPlanning(say.starting);
     this.stopButton.hidden = true; // the service may already have accepted the job
-    const key = (this.key ??= [randomKey(), JSON.stringify(body)]);
-    if (key[1] !== JSON.stringify(body)) this.key = [randomKey(), JSON.stringify(body)];
-    const job = await (await ask("POST", "/v1/jobs", { json: body, headers: { "Idempotency-Key": (this.key ?? key)[0] } })).json();
-    if (this.leaving.signal.aborted) return announce(say.created(job.name));
+    /** @type {any[]} */
+    const jobs = [];
+    for (const body of bodies) {
+      const text = JSON.stringify(body), key = this.keys.get(text) ?? randomKey();
+      this.keys.set(text, key); // a second attempt creates only those jobs that are missing
+      try {
+        jobs.push(await (await ask("POST", "/v1/jobs", { json: body, headers: { "Idempotency-Key": key } })).json());
+      } catch (error) {
+        if (jobs.length && error instanceof Error) error.message += ` ${say.createdSome(jobs.length, bodies.length)}`;
+        throw error;
+      }
+    }
+    if (this.leaving.signal.aborted) return announce(say.created(jobs.map(({ name }) => name).join(", ")));
     this.created = true;
     forgetDraft();
-    location.hash = `#/jobs/${job.id}`;
+    location.hash = jobs.length > 1 ? `#/compare/${jobs.map(({ id }) => id).join("/")}` : `#/jobs/${jobs[0].id}`;
   }
 
   /** Show an error beside the input that caused it. @param {unknown} error */
@@ -506,6 +577,7 @@ export class SubmitView {
     const text = error instanceof Error ? error.message : String(error);
     if (error instanceof Problem) {
       if (error.code === "unknown-upload") this.uploads.clear();
+      if (error.code === "unknown-input") this.askAgain(error.input);
       const [first] = error.errors, told = first ? plainly(first.message) : text;
       const region = this.regions.refuse(first?.at ?? "", told);
       if (region) return this.reveal(region, told);
@@ -515,6 +587,13 @@ export class SubmitView {
     this.problem.hidden = false;
     this.problem.textContent = text;
     this.problem.scrollIntoView({ block: "nearest" });
+  }
+
+  /** Ask for files of a slot that have expired on the service. @param {string | undefined} role */
+  askAgain(role) {
+    const slot = this.slots[/** @type {keyof typeof this.slots} */ (role)];
+    slot?.askAgain(slot.files.filter((file) => file instanceof StoredFile).map(({ name }) => name));
+    slot?.changed();
   }
 
   /** @param {Problem} problem @returns {Slot | Control | undefined} */
@@ -551,7 +630,7 @@ export class SubmitView {
   end() {
     if (!this.created) {
       const files = Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, slot.files]));
-      kept = { files, weights: this.weights.map((input) => input.value), regions: this.regions.value() };
+      kept = { files, weights: this.weights.map((input) => input.value), regions: this.regions.value(), apart: this.apart?.input.checked };
     }
     this.leaving.abort();
     for (const upload of this.uploads.values()) upload.stop();

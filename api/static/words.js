@@ -102,6 +102,9 @@ export const words = {
     cost: "Estimate time", start: "Start", starting: "Starting…", planning: "Analyzing views…", planned: (/** @type {number} */ step, /** @type {number} */ total) => `${count(step)} of ${several(total, "view")} analyzed`,
     needScene: "Choose a scene.", needStyle: "Choose a painting.", needCameras: "Choose camera files, or orbit the object.",
     resumable: (/** @type {string} */ name, /** @type {string} */ share) => `“${name}” was ${share} uploaded. Choose it again to finish.`, forget: "Discard",
+    blended: "Blend into one job", apart: "One job per painting", paintings: "Several paintings", startAll: (/** @type {number} */ n) => `Start ${n} jobs`, eachTakes: (/** @type {number} */ n) => `Each of the ${n} jobs takes about as long.`,
+    createdSome: (/** @type {number} */ n, /** @type {number} */ all) => `${n} of ${all} jobs were created; Start creates the rest.`,
+    expired: (/** @type {string[]} */ names) => `No longer on the service: ${names.slice(0, 3).join(", ")}${names.length > 3 ? "…" : ""}. Choose it again.`,
     stop: "Stop", created: (/** @type {string} */ name) => `Job “${name}” was created.`, refused: "Couldn't start the job.", unit: (/** @type {string} */ unit) => unit, unset: (/** @type {string} */ text) => text, on: "on", off: "off", byDefault: (/** @type {string} */ text) => `${text} (default)`,
   },
   refusals: {
@@ -151,18 +154,18 @@ export const words = {
     }),
     unnamed: "Unnamed job", rename: "Rename", newName: "New name", save: "Save", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`,
     left: (/** @type {number} */ s) => (s < 1 ? "almost done" : `about ${seconds(s)} left`), progress: "Progress", remove: "Delete", removeSure: "Delete this job and its results?", keep: "Cancel", deleted: "This job was deleted.",
-    lost: "Connection lost. Reconnecting…", back: "Reconnected.", loss: "Loss", noLoss: "The chart appears once painting starts.", preview: "Latest preview", noPreview: "The first preview will appear shortly.",
+    actions: /** @type {Record<string, string>} */ ({ finish: "Stop here and keep it" }), lost: "Connection lost. Reconnecting…", back: "Reconnected.", loss: "Loss", noLoss: "The chart appears once painting starts.", preview: "Latest preview", noPreview: "The first preview will appear shortly.",
     made: (/** @type {string} */ at) => `Created ${at}`, took: (/** @type {number} */ s) => `took ${seconds(s)}`, attempt: (/** @type {number} */ n) => `attempt ${n}`, expires: (/** @type {string} */ at) => `kept until ${at}`,
     threeD: "3D", sheet: "Before and after", report: "Report", result: "Result", download: "Download", format: "Format", converting: "Converted on the first download, which takes about 10 seconds for a million Gaussians.", files: "Files", settings: "Settings", inputs: "Inputs", openReport: "Open the report", noFiles: "Nothing yet.", noScene: "This scene can't be shown here.", view3d: "Result", compare: "Compare with another job", compareWith: "Another job of this scene", noOther: "No other finished job of this scene.",
-    sheetOf: (/** @type {string} */ name) => `Views of ${name} before and after`, failed: "The job failed", again: "Stylize this scene again", preparing: "Preparing…",
+    sheetOf: (/** @type {string} */ name) => `Views of ${name} before and after`, failed: "The job failed", anotherPainting: "Try another painting", changed: "Same with changes", preparing: "Preparing…",
   },
   chart: {
     seconds: "seconds", loss: "loss", all: "mean of all views", single: "single views", coarse: "coarse", scale: (/** @type {number} */ n) => (n ? `1/${2 ** n}` : "full size"),
     told: (/** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ s) => `Loss against seconds: from ${three.format(from)} to ${three.format(to)} in ${seconds(s)}`,
   },
   jobs: {
-    title: "Jobs", filter: "Filter", name: "Name", status: "Status", any: "Any status", empty: "No jobs yet", emptyLead: "Your jobs will appear here.", noMatch: "No matching jobs.", more: "Show more", choose: "Compare", select: (/** @type {string} */ name) => `Compare ${name}`, compare: "Compare", chooseTwo: "Select two finished jobs of the same scene.", remove: (/** @type {string} */ name) => `Delete ${name}`, removed: "Deleted.", otherScenes: "Those use different scenes.",
+    title: "Jobs", filter: "Filter", name: "Name", status: "Status", any: "Any status", empty: "No jobs yet", emptyLead: "Your jobs will appear here.", noMatch: "No matching jobs.", more: "Show more", choose: "Compare", select: (/** @type {string} */ name) => `Compare ${name}`, compare: "Compare", chooseTwo: "Select two or more finished jobs of the same scene.", remove: (/** @type {string} */ name) => `Delete ${name}`, removed: "Deleted.", otherScenes: "Those use different scenes.",
   },
-  compare: { title: "Compare", heading: (/** @type {string} */ a, /** @type {string} */ b) => `${a} and ${b}`, notThere: "One of these jobs is missing or unfinished." },
+  compare: { title: "Compare", heading: (/** @type {string} */ a, /** @type {string} */ b) => `${a} and ${b}`, several: (/** @type {number} */ n) => `${n} paintings of one scene`, notThere: "One of these jobs is missing or unfinished.", sheet: "Jobs side by side" },
   signIn: { title: "Sign in", heading: "Sign in", lead: "This service requires an API key.", expired: "Your session has expired, or you signed out in another tab. Sign in to continue where you were.", where: "Enter your API key. Ask your administrator for one.", key: "API key", go: "Sign in", wrong: "That key isn't valid.", out: "You signed out." },
 };

@@ -1,0 +1,140 @@
+"""Tests of going on from a job in a browser: other paintings, changes, several paintings at once, and an early end."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from PIL import Image
+
+from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, set_options, submit
+from tests.api.page.browser import Watched
+from tests.api.service import Service
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def night(tmp_path: Path) -> Path:
+    path = tmp_path / "night.png"
+    Image.new("RGB", (64, 48), (20, 30, 120)).save(path)
+    return path
+
+
+def uploads_of(watched: Watched) -> list[str]:
+    """Return a list to which the page's new uploads are added."""
+    found: list[str] = []
+    watched.page.on(
+        "request",
+        lambda request: (
+            found.append(request.url) if (request.method, request.url[-11:]) == ("POST", "/v1/uploads") else None
+        ),
+    )
+    return found
+
+
+def started(watched: Watched, service: Service, name: str = "Start") -> dict[str, Any]:
+    """Start the job of the form, and return it."""
+    with watched.page.expect_response(lambda answer: answer.url.endswith("/v1/jobs")) as answer:
+        watched.page.get_by_role("button", name=name, exact=True).click()
+    assert answer.value.status == 202, answer.value.text()
+    watched.page.wait_for_url(re.compile("#/jobs/job_"))
+    found: dict[str, Any] = httpx.get(f"{service.url}/v1/jobs/{answer.value.json()['id']}").json()
+    return found
+
+
+def digests(job: dict[str, Any], role: str) -> list[str]:
+    return [each["sha256"] for each in job["inputs"] if each["role"] == role]
+
+
+def test_another_painting_and_changes_send_nothing_again(
+    visit: Visit, service: Service, files: dict[str, Path], night: Path
+) -> None:
+    regions = [{"name": "top", "select": "half-space=0,1,0,0", "freeze": True}]
+    values = {"preset": "preview", "steps_coarse": 3, "background": "40,40,48", "regions": regions, "name": "mine"}
+    before = httpx.get(f"{service.url}/v1/jobs/{done(service, submit(service, files, **values))}").json()
+    watched = visit(f"/#/jobs/{before['id']}")
+    page, sent = watched.page, uploads_of(watched)
+    page.get_by_role("button", name="Try another painting").click()
+    page.get_by_role("button", name="Remove scene.ply").wait_for()
+    page.get_by_text("3 cameras shown in the scene").wait_for()
+    watched.settled()
+    assert page.locator(".slot", has_text="One painting").locator(".thumb").count() == 0
+    choose(watched, {"style": night})
+    other = started(watched, service)
+    assert len(sent) == 1, "only the painting is sent"
+    assert other["name"] == "scene · night"
+    for role in ("scene", "cameras"):
+        assert digests(other, role) == digests(before, role)
+    assert digests(other, "style") != digests(before, "style")
+    kept = {name: value for name, value in before["parameters"].items() if name not in ("name", "background")}
+    assert {name: other["parameters"][name] for name in kept} == kept
+    assert other["parameters"]["background"] == pytest.approx([40 / 255, 40 / 255, 48 / 255])
+
+    page.goto(f"{service.url}/#/jobs/{before['id']}")
+    page.get_by_role("button", name="Same with changes").click()
+    page.get_by_role("img", name="style.png").wait_for()
+    set_options(watched, steps_coarse=2)
+    again = started(watched, service)
+    assert len(sent) == 1, "nothing is sent"
+    assert digests(again, "style") == digests(before, "style")
+    assert (again["parameters"]["steps_coarse"], before["parameters"]["steps_coarse"]) == (2, 3)
+    watched.check()
+
+
+def test_input_that_is_gone_is_asked_for_at_its_field(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = done(service, submit(service, files, steps_sos=1))
+    watched = visit(f"/#/jobs/{job_id}")
+    page = watched.page
+    page.get_by_role("button", name="Same with changes").click()
+    page.get_by_role("img", name="style.png").wait_for()
+    watched.settled()
+    httpx.delete(f"{service.url}/v1/jobs/{job_id}").raise_for_status()
+    page.get_by_role("button", name="Start", exact=True).click()
+    slot = page.locator(".slot").first
+    slot.get_by_text("Upload the file again.").wait_for()
+    assert "No longer on the service: scene.ply. Choose it again." in slot.inner_text()
+    assert page.get_by_label("Scene", exact=True).get_attribute("aria-invalid") == "true"
+    watched.check(REFUSED, "404")
+
+
+def test_each_painting_can_be_a_job_of_its_own(
+    visit: Visit, service: Service, files: dict[str, Path], night: Path
+) -> None:
+    watched = visit(width=900, height=700)
+    page, sent = watched.page, uploads_of(watched)
+    choose(watched, files)
+    choose(watched, {"style": night})
+    set_options(watched, **(STEPS | {"steps_sos": 3}))
+    page.get_by_text("One job per painting").click()
+    assert page.get_by_label("night.png", exact=True).is_hidden(), "jobs of one painting blend nothing"
+    page.get_by_role("button", name="Start 2 jobs").click()
+    page.wait_for_url(re.compile("#/compare/job_[0-9a-f]+/job_[0-9a-f]+$"))
+    assert len(sent) == 4, "the scene is sent once for both"
+    ids = page.url.split("/")[-2:]
+    for job_id, name in zip(ids, ("scene · style", "scene · night"), strict=True):
+        found = httpx.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()
+        assert (found["name"], len(digests(found, "style"))) == (name, 1)
+    tiles = page.get_by_role("list", name="Jobs side by side").get_by_role("listitem")
+    assert tiles.count() == 2
+    watched.settled()
+    for tile, name in zip(tiles.all(), ("style", "night"), strict=True):
+        tile.locator("img[src$='thumbnail.jpg']").wait_for()
+        assert name in tile.inner_text()
+    assert page.get_by_label("Left", exact=True).locator("option").all_inner_texts() == ["Original", "style", "night"]
+    watched.check()
+
+
+def test_job_is_finished_early_on_the_page(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = submit(service, files, **LONG)
+    watched = visit(f"/#/jobs/{job_id}")
+    page = watched.page
+    page.get_by_text("Adding detail · step").wait_for()
+    page.get_by_role("button", name="Stop here and keep it").click()
+    page.locator(".badge", has_text="Done").wait_for()
+    page.get_by_role("link", name="Download", exact=True).wait_for()
+    assert httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["result"]["stopped"] == "on-request"
+    watched.check()
