@@ -422,7 +422,7 @@ def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> Progr
     operation_id="finish_job",
 )
 def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
-    """End a running job after its current step and keep its result so far (`finishing` until that is written)."""
+    """End a running job after its current step and keep its result so far. Until then, its status is `finishing`."""
     check_id(job_id)
     context.store.jobs.finish(job_id, caller.owner)
     return _job_response(context, caller, job_id)
