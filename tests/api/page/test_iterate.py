@@ -62,8 +62,9 @@ def test_another_painting_and_changes_send_nothing_again(
     page.get_by_role("button", name="Remove scene.ply").wait_for()
     page.get_by_text("3 cameras shown in the scene").wait_for()
     watched.settled()
-    assert page.locator(".slot", has_text="One painting").locator(".thumb").count() == 0
-    choose(watched, {"style": night})
+    slot = page.locator(".slot", has_text="One painting")
+    assert slot.locator(".thumb").count() == 0
+    slot.locator("input").set_input_files(night)
     other = started(watched, service)
     assert len(sent) == 1, "only the painting is sent"
     assert other["name"] == "scene · night"
@@ -109,7 +110,7 @@ def test_each_painting_can_be_a_job_of_its_own(
     choose(watched, files)
     choose(watched, {"style": night})
     set_options(watched, **(STEPS | {"steps_sos": 3}))
-    page.get_by_text("One job per painting").click()
+    page.get_by_label("One job per painting").check()
     assert page.get_by_label("night.png", exact=True).is_hidden(), "jobs of one painting blend nothing"
     page.get_by_role("button", name="Start 2 jobs").click()
     page.wait_for_url(re.compile("#/compare/job_[0-9a-f]+/job_[0-9a-f]+$"))
