@@ -20,7 +20,7 @@ def test_default_name_is_scene_and_painting(visit: Visit, service: Service, file
     fields = page.locator("form.panel input:not([type=radio])")
     assert fields.first.get_attribute("id") == page.get_by_label("Name", exact=True).first.get_attribute("id")
     choose(watched, files)
-    assert page.get_by_label("Name", exact=True).first.get_attribute("placeholder") == "scene · style"
+    page.get_by_placeholder("scene · style", exact=True).wait_for()
     set_options(watched, **LONG)
     page.get_by_role("button", name="Start").click()
     page.get_by_role("heading", name="scene · style").wait_for()
