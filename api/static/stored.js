@@ -29,7 +29,7 @@ export class StoredFile {
  */
 export function storedInputs(job) {
   /** @type {Record<string, StoredFile[]>} */
-  const found = { scene: [], style: [], cameras: [], photos: [] };
+  const found = { scene: [], style: [], cameras: [], photos: [], mask: [] };
   for (const input of job.inputs) {
     const those = found[input.role];
     those?.push(new StoredFile(`/v1/jobs/${job.id}/inputs/${input.role}:${those.length}`, input));

@@ -91,6 +91,8 @@ export class SubmitView {
     this.weights = [];
     this.regions = new RegionList();
     this.created = false;
+    /** Masks of regions, from an earlier job. @type {Chosen[]} */
+    this.masks = [];
     /** Idempotency keys of requests for jobs, by their bodies. @type {Map<string, string>} */
     this.keys = new Map();
     this.build();
@@ -103,6 +105,7 @@ export class SubmitView {
     if (!kept) return;
     this.weights = kept.weights.map((value) => ({ value }));
     for (const [role, slot] of Object.entries(this.slots)) slot.add(kept.files[role]);
+    this.masks = kept.files.mask ?? [];
     this.regions.restore(kept.regions);
     this.regionFold.open = kept.regions.length > 0;
     if (kept.apart && this.apart) this.apart.input.checked = true;
@@ -476,10 +479,12 @@ export class SubmitView {
     this.sending = all.map((file) => /** @type {Upload} */ (this.uploads.get(file)));
     for (const upload of this.sending) upload.over = false;
     const ids = await sendAll(this.sending), idOf = new Map(all.map((file, i) => [/** @type {Chosen} */ (file), ids[i]]));
+    const selections = this.regions.value().map(({ select }) => String(select ?? ""));
     const named = (/** @type {Chosen[]} */ chosen) => chosen.map((file) => (file instanceof StoredFile ? file.path : idOf.get(file)));
     return {
       scene: named(scene.files)[0], style: named(style.files), cameras: this.orbiting ? [] : named(cameras.files),
       photos: this.orbiting ? [] : named(photos.files), parameters: this.parameters(),
+      mask: named(this.masks.filter(({ name }) => selections.some((select) => select === `mask=${name}` || (select.startsWith("masks=") && name.startsWith(select.slice(6)))))),
     };
   }
 
@@ -629,7 +634,7 @@ export class SubmitView {
 
   end() {
     if (!this.created) {
-      const files = Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, slot.files]));
+      const files = { ...Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, slot.files])), mask: this.masks };
       kept = { files, weights: this.weights.map((input) => input.value), regions: this.regions.value(), apart: this.apart?.input.checked };
     }
     this.leaving.abort();
