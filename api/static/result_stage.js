@@ -117,10 +117,10 @@ export class ResultStage {
     await scene.headerRead;
   }
 
-  /** Offer the blend if the viewer has all its color sets. */
+  /** Offer the blend of one or two results if the viewer has all its color sets. */
   offerBlend() {
     const { original, blend, jobs } = this;
-    if (!original || !jobs.every(({ id }) => original.colors.has(id))) return;
+    if (!original || jobs.length > 2 || !jobs.every(({ id }) => original.colors.has(id))) return;
     const side = { scene: original, colors: "own", blend: blend.parts };
     this.choices.set(jobs.length > 1 ? "blend" : jobs[0].id, { name: jobs.length > 1 ? words.blend.title : blend.name, side });
     blend.element.hidden = false;

@@ -102,7 +102,7 @@ export const words = {
     cost: "Estimate time", start: "Start", starting: "Starting…", planning: "Analyzing views…", planned: (/** @type {number} */ step, /** @type {number} */ total) => `${count(step)} of ${several(total, "view")} analyzed`,
     needScene: "Choose a scene.", needStyle: "Choose a painting.", needCameras: "Choose camera files, or orbit the object.",
     resumable: (/** @type {string} */ name, /** @type {string} */ share) => `“${name}” was ${share} uploaded. Choose it again to finish.`, forget: "Discard",
-    blended: "Blend into one job", apart: "One job per painting", paintings: "Several paintings", startAll: (/** @type {number} */ n) => `Start ${n} jobs`, eachTakes: (/** @type {number} */ n) => `Each of the ${n} jobs takes about as long.`,
+    blended: "Blend them", apart: "One job each", paintings: "Several paintings", startAll: (/** @type {number} */ n) => `Start ${n} jobs`, eachTakes: (/** @type {number} */ n) => `Each of the ${n} jobs takes about as long.`,
     createdSome: (/** @type {number} */ n, /** @type {number} */ all) => `${n} of ${all} jobs were created; Start creates the rest.`,
     expired: (/** @type {string[]} */ names) => `No longer on the service: ${names.slice(0, 3).join(", ")}${names.length > 3 ? "…" : ""}. Choose it again.`,
     stop: "Stop", created: (/** @type {string} */ name) => `Job “${name}” was created.`, refused: "Couldn't start the job.", unit: (/** @type {string} */ unit) => unit, unset: (/** @type {string} */ text) => text, on: "on", off: "off", byDefault: (/** @type {string} */ text) => `${text} (default)`,
