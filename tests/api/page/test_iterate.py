@@ -54,7 +54,13 @@ def test_another_painting_and_changes_send_nothing_again(
     visit: Visit, service: Service, files: dict[str, Path], night: Path
 ) -> None:
     regions = [{"name": "top", "select": "half-space=0,1,0,0", "freeze": True}]
-    values: dict[str, Any] = {"preset": "preview", "steps_coarse": 3, "background": "40,40,48", "regions": regions, "name": "mine"}
+    values: dict[str, Any] = {
+        "preset": "preview",
+        "steps_coarse": 3,
+        "background": "40,40,48",
+        "regions": regions,
+        "name": "mine",
+    }
     before = httpx.get(f"{service.url}/v1/jobs/{done(service, submit(service, files, **values))}").json()
     watched = visit(f"/#/jobs/{before['id']}")
     page, sent = watched.page, uploads_of(watched)
