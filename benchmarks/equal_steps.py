@@ -25,6 +25,7 @@ from sgsst_core import Stylizer, make_settings
 from sgsst_core.bench.quality import make_novel_views
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import with_scales
+from sgsst_core.quality.dists import may_judge
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.scene.camera import Camera
@@ -69,7 +70,10 @@ def main() -> None:
 
     def run(row: str, seed: int) -> tuple[torch.Tensor, dict[str, float]]:
         colors, seconds = _run(scene, cameras, style, base | rows[row] | {"seed": seed})
-        return colors, {**_judged(judge, colors, wanted), "seconds": seconds}
+        figures = {**_judged(judge, colors, wanted), "seconds": seconds}
+        if not may_judge("vgg16", (base | rows[row]).get("content_weight", 1.0)):
+            figures.pop("dists", None)
+        return colors, figures
 
     unstylized = scene.sh_dc, _judged(judge, scene.sh_dc, wanted)
     colors = compare_rows(

@@ -21,7 +21,7 @@ from sgsst_core.budget import measuring_memory
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.consistency import Consistency
-from sgsst_core.quality.dists import load_dists_or_none
+from sgsst_core.quality.dists import load_dists_or_none, may_judge
 from sgsst_core.quality.exact import ExactLoss, rasterizer_beside
 from sgsst_core.quality.judge import Judge, Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
@@ -52,7 +52,7 @@ class Outcome:
         sh_dc: Colors [N, 3].
         judgment: Judgment on the novel views.
         short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
-        dists: DISTS against the unstylized scene; None if it is not installed.
+        dists: DISTS against the unstylized scene; None if it is not installed, or if the job optimizes its features.
         loss: Remaining loss, relative to the unstylized scene; None if it was not measured.
         steps: Number of steps.
         seconds: Seconds of optimization.
@@ -161,7 +161,9 @@ def compare_quality(
             "no view between the cameras can be judged: neighboring cameras are too far apart, or views are smaller "
             f"than {lpips.minimum_side} pixels. Give more cameras, or larger views."
         )
-    novel_views.lpips, dists = lpips, load_dists_or_none()
+    novel_views.lpips = lpips
+    independent = may_judge(stylizer.job.network.name, stylizer.job.settings.content_weight)
+    dists = load_dists_or_none() if independent else None
 
     def outcome(name: str, what: str, sh_dc: Tensor) -> Outcome:
         moment: NovelViewMoment = novel_views.measure(sh_dc)

@@ -30,6 +30,8 @@ _CHANNELS = (3, 64, 128, 256, 512, 512)
 _EPS, _POOLING_EPS = 1e-6, 1e-12
 #: Number of channels that are converted to float64 at a time.
 _BLOCK = 16
+#: Largest content weight of jobs with VGG16 that can be judged. Others optimize features of the same network.
+_LARGEST_CONTENT_WEIGHT = 100.0
 
 
 class Dists:
@@ -101,7 +103,7 @@ class Dists:
                 part = slice(block, block + _BLOCK)
                 texture, structure = _similarities(x[part], y[part], weights)
                 similarity += float(means[part] @ texture + covariances[part] @ structure)
-        return 1 - similarity
+        return max(1 - similarity, 0.0)
 
 
 def load_dists_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> Dists | None:
@@ -112,6 +114,11 @@ def load_dists_or_none(device: torch.device | str = "cpu", folder: Path | None =
     """
     installed = any(entry.name == "vgg16" and entry.path for entry in list_network_weights(folder))
     return Dists(device=device, folder=folder) if installed and find_spec(_PACKAGE) else None
+
+
+def may_judge(network: str, content_weight: float) -> bool:
+    """Return whether DISTS is independent of what a job with a feature network and a content weight optimizes."""
+    return network != "vgg16" or content_weight <= _LARGEST_CONTENT_WEIGHT
 
 
 def _learned_weights() -> Path:

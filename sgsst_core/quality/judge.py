@@ -144,8 +144,7 @@ class Judge:
     def dists(self, network: Dists, sh_dc: Tensor) -> float | None:
         """Return the mean DISTS of colors `sh_dc` [N, 3] against the unstylized scene; None if there are no views.
 
-        0 for identical images; covered pixels count. Its network is VGG16, so it flatters jobs with a content term in
-        this network's features; those of a content weight up to 100 change nothing visible.
+        It is 0 for identical images. Only covered pixels count. `dists.may_judge` says which jobs it is fair to.
         """
         sh_dc, distances = sh_dc.detach().to(self._rasterizer.device), []
         for camera in self.cameras:

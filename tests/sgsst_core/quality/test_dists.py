@@ -17,7 +17,7 @@ from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_sources import BLOCKS, KAPPA
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.quality import dists as module
-from sgsst_core.quality.dists import Dists, load_dists_or_none
+from sgsst_core.quality.dists import Dists, load_dists_or_none, may_judge
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -113,3 +113,9 @@ def test_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch, vgg16_weig
     assert load_dists_or_none() is None
     with pytest.raises(WeightsError, match=r"pip install 'sgsst-service\[dists\]'"):
         Dists()
+
+
+def test_jobs_that_optimize_its_features_are_not_judged() -> None:
+    assert may_judge("vgg16", 1.0)
+    assert not may_judge("vgg16", 10_000.0)
+    assert may_judge("vgg19", 10_000.0)
