@@ -34,7 +34,8 @@ def main(wheels: list[Path]) -> None:
     Args:
         wheels: Wheels of PyTorch without CUDA, one per CPU architecture of the images.
     """
-    pinned = _compile(str(ROOT / "pyproject.toml"), "--extra", "service", "--extra", "postgresql", "--extra", "s3")
+    extras = [word for extra in ("service", "postgresql", "s3", "video") for word in ("--extra", extra)]
+    pinned = _compile(str(ROOT / "pyproject.toml"), *extras)
     cuda = {name for name in pinned if name in cuda_packages() or name == "torch"}
     _write("common", {name: text for name, text in pinned.items() if name not in cuda})
     _write("cuda", {name: pinned[name] for name in cuda})

@@ -52,4 +52,5 @@ def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest
         _regions(staged, parameters),
         colors=True,
         style_background=parameters.style_background,
+        video=parameters.video,
     )

@@ -34,6 +34,8 @@ Backbone = Literal["auto", "vgg19", "vgg16"]
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
 #: Number of views of an orbit.
 Views = Annotated[int, Ge(1), Le(2000)] | Literal["auto"]
+#: Default longer side of a video in pixels; cameras of smaller images keep theirs.
+DEFAULT_SIDE = 1280
 #: Settings that no preset changes. API responses always include their values.
 _SHOWN = ("preset", "seed", "precision")
 
@@ -163,6 +165,19 @@ class VideoOptions(BaseModel):
     def frames(self) -> int:
         """Return the number of frames, at least 1."""
         return max(1, round(self.seconds * self.fps))
+
+
+class JobVideo(VideoOptions):
+    """Video of a job's result. Its limits bound the time that a job can take for it."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"path": "cameras", "seconds": 6, "compare": True}]})
+
+    fps: int = Field(30, ge=1, le=60, description="Frames per second.")
+    seconds: float = Field(8.0, gt=0, le=30, allow_inf_nan=False, description="Length of the video in seconds.")
+    resolution: int | None = Field(
+        None, ge=64, le=1920, description="Longer side in pixels. Default: the cameras' own, at most 1280."
+    )
+    compare: bool = Field(False, description="Start with the unstylized scene, and end with the result.")
 
 
 class RunOptions(BaseModel):

@@ -12,7 +12,7 @@ from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
-from worker.options import Backbone, ViewOptions
+from worker.options import Backbone, JobVideo, ViewOptions
 from worker.region_requests import RegionRequest
 from worker.styles import StyleFile
 
@@ -50,6 +50,7 @@ class StylizeRequest:
         regions: Regions with their own style or frozen colors, from `region_requests`.
         colors: Whether to also write a file of the stylized colors alone, if nothing else of the scene changes.
         style_background: sRGB color behind transparent parts of style images, in 0..1.
+        video: Options of a video of the result; None for no video.
     """
 
     source: SceneRequest
@@ -62,6 +63,7 @@ class StylizeRequest:
     regions: tuple[RegionRequest, ...] = ()
     colors: bool = False
     style_background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    video: JobVideo | None = None
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,11 @@ class Outputs:
         return self._beside(".colors.f16")
 
     @property
+    def video(self) -> Path:
+        """Return the path of the video."""
+        return self._beside(".video.mp4")
+
+    @property
     def checkpoint(self) -> Path:
         """Return the path of the newest checkpoint."""
         return self._beside(".checkpoint.safetensors")
@@ -140,7 +147,7 @@ class Outputs:
     def all(self) -> list[Path]:
         """Return the paths of all output files except the older checkpoint, which is only created by renaming."""
         paths = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
-        paths.append(self.colors)
+        paths += [self.colors, self.video]
         return paths if self.packed is None else [*paths, self.packed]
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -12,22 +12,21 @@ from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.files.video import check_video_path, is_encoded
+from sgsst_core.files.video import check_video_path, encoder, is_encoded, video_writer
 from sgsst_core.orbit.cameras import ELEVATION, turntable
 from sgsst_core.orbit.subject import find_subject
 from sgsst_core.orbit.up import find_up
+from sgsst_core.quality.exact import rasterizer_beside
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.video import Layer, write_video
+from sgsst_core.report.video import Layer, write_frames
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.stylizing.stylizer import Stylizer
 from worker.capture import about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view
-from worker.options import VideoOptions
+from worker.options import DEFAULT_SIDE, JobVideo, VideoOptions
 from worker.request import SceneRequest, check_choice, check_folder, check_is_not_scene
-
-#: Default longer side of a video in pixels; cameras of smaller images keep theirs.
-DEFAULT_SIDE = 1280
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,12 @@ class VideoRequest:
     @property
     def along_cameras(self) -> bool:
         """Return whether the path leads through cameras rather than around the scene."""
-        return self.options.path == "cameras" or (self.options.path == "auto" and self.source.cameras is not None)
+        return along_cameras(self.options, self.source)
+
+
+def along_cameras(options: VideoOptions, source: SceneRequest) -> bool:
+    """Return whether the path of a video leads through cameras rather than around the scene."""
+    return options.path == "cameras" or (options.path == "auto" and source.cameras is not None)
 
 
 def check_video_request(request: VideoRequest) -> None:
@@ -84,6 +88,8 @@ def render_video(
     request: VideoRequest,
     progress: Callable[[int, int], None] = lambda done, total: None,
     warn: Callable[[str], None] = lambda line: None,
+    *,
+    in_place: bool = False,
 ) -> list[Camera]:
     """Render a requested video on the CPU, and return its cameras. All inputs are checked first.
 
@@ -91,6 +97,7 @@ def render_video(
         request: Request that `check_video_request` accepts.
         progress: Callback that receives the numbers of completed and of all frames.
         warn: Callback for warnings about scene and cameras.
+        in_place: Whether to write to the file itself, which exists, because no other can be created beside it.
 
     Raises:
         InvalidInputError: If an input cannot be used, or the video cannot be written.
@@ -119,17 +126,40 @@ def render_video(
     if before is not None:
         unstylized = Layer(before, after.rasterizer) if _same_geometry(before, scene) else layer(before)
     request.out.parent.mkdir(parents=True, exist_ok=True)
-    write_video(
-        request.out,
-        after,
-        cameras,
-        fps=request.options.fps,
-        unstylized=unstylized,
-        transition=request.options.transition,
-        alpha=request.transparent,
-        progress=progress,
-    )
+    write_to, first, options = encoder if in_place else video_writer, cameras[0], request.options
+    with write_to(request.out, first.width, first.height, options.fps, alpha=request.transparent) as write:
+        write_frames(
+            write,
+            after,
+            cameras,
+            unstylized=unstylized,
+            transition=options.transition,
+            alpha=request.transparent,
+            progress=progress,
+        )
     return cameras
+
+
+def write_job_video(
+    out: Path,
+    stylizer: Stylizer,
+    source: SceneRequest,
+    options: JobVideo,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Write the video of a finished job's result, on the job's device.
+
+    Raises:
+        InvalidInputError: If the video cannot be written.
+    """
+    job = stylizer.job
+    scene = replace(job.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
+    through = job.views.cameras if along_cameras(options, source) else None
+    cameras = video_cameras(scene, source, through, options, options.resolution, even=True)
+    layer = Layer(scene, rasterizer_beside(stylizer, scene))
+    unstylized = Layer(job.scene, layer.rasterizer) if options.compare else None
+    with video_writer(out, cameras[0].width, cameras[0].height, options.fps) as write:
+        write_frames(write, layer, cameras, unstylized=unstylized, transition=options.transition, progress=progress)
 
 
 def video_cameras(

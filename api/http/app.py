@@ -23,7 +23,7 @@ from api.http.problems import METHODS, Problem, add_handlers
 from api.http.rates import Rates
 from api.http.readiness import Readiness
 from api.http.receipts import Receipts
-from api.http.routes import artifacts, blends, events, inputs, jobs, operations, session, uploads
+from api.http.routes import artifacts, blends, events, inputs, jobs, operations, session, uploads, videos
 from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
 from api.http.static import add_static
@@ -34,6 +34,7 @@ from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
+from service.inspection.video_maker import VideoMaker
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.weights import check_weights
@@ -66,6 +67,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             artifacts=results,
             inspector=Inspector(settings, store, blobs),
             derived=DerivedFiles(settings, store, blobs, results),
+            videos=VideoMaker(settings, store, blobs, results),
             hub=Hub(store),
             sign_ins=SignIns(),
             rates=Rates(),
@@ -94,6 +96,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         await context.hub.close()
         await context.inspector.close()
         await context.derived.close()
+        await context.videos.close()
         context.readiness.close()
         store.close()
 
@@ -105,7 +108,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         docs_url=None,  # FastAPI's own page loads its script from a CDN
         redoc_url=None,
     )
-    for module in (jobs, events, inputs, blends, artifacts, uploads, session, operations):
+    for module in (jobs, events, inputs, blends, artifacts, videos, uploads, session, operations):
         app.include_router(module.router)
     add_static(app)
     add_handlers(app)

@@ -32,6 +32,7 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
+from service.inspection.video_maker import VideoMaker
 from service.settings import ServiceSettings, is_loopback
 from service.store import Store
 from service.store.quotas import NO_QUOTAS, Quotas
@@ -85,6 +86,7 @@ class Context:
     artifacts: Artifacts
     inspector: Inspector
     derived: DerivedFiles
+    videos: VideoMaker
     hub: Hub
     metrics: Metrics
     readiness: Readiness

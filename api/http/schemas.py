@@ -93,9 +93,9 @@ class ProgressView(BaseModel):
 
     stage: str = Field(
         description="`reading`, `planning` (surveying the views), `starting`, `coarse` (coarsest scale), `sos` (all "
-        "scales) or `measuring` (views between the cameras)."
+        "scales), `measuring` (views between the cameras) or `video` (frames of the video)."
     )
-    step: int = Field(description="Completed steps; surveyed views while `planning`.")
+    step: int = Field(description="Completed steps; surveyed views while `planning`; frames while `video`.")
     total: int = Field(description="Maximum number of steps or views; 0 while unknown.")
     fraction: float = Field(description="Completed fraction of the steps or views, 0 to 1.")
     eta_s: float | None = Field(

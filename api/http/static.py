@@ -38,7 +38,7 @@ _KINDS = {
 
 POLICY = (
     "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; connect-src 'self'; "
-    "img-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "img-src 'self' blob:; media-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 #: Content-Security-Policy of `/docs`. Swagger UI's style sheet has inline icons.
 DOCS_POLICY = POLICY.replace("img-src 'self' blob:", "img-src 'self' data:")

@@ -71,9 +71,7 @@ class DerivedFiles:
         self._tasks: dict[tuple[str, str], asyncio.Task[None]] = {}
         self._folder = settings.folder / "packing"
         self._folder.mkdir(parents=True, exist_ok=True)
-        for leftover in self._folder.iterdir():  # left behind by a killed process
-            if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
-                shutil.rmtree(leftover, ignore_errors=True)
+        remove_leftovers(self._folder)
 
     async def compressed(self, job: JobRow, format: SceneFormat) -> ArtifactRow:
         """Return a job's result in a compressed format; the compression error is stored beside it as JSON.
@@ -202,6 +200,13 @@ class DerivedFiles:
     async def close(self) -> None:
         """Stop the process, which also aborts any work in progress."""
         await self._process.close()
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete folders that a killed process has left behind."""
+    for leftover in folder.iterdir():
+        if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
+            shutil.rmtree(leftover, ignore_errors=True)
 
 
 def _staged_name(job: JobRow, result: ArtifactRow) -> str:

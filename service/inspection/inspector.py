@@ -168,7 +168,7 @@ class Inspector:
         self._validating = Lanes([InspectionProcess(), InspectionProcess()])
         self._warming: asyncio.Task[None] | None = None
         self._validating_large = Lanes([InspectionProcess()])
-        self._planning = Lanes([InspectionProcess(_threads_of_a_job(settings))])
+        self._planning = Lanes([InspectionProcess(threads_of_a_job(settings))])
         self._folder = settings.folder / "inspections"
         self._folder.mkdir(parents=True, exist_ok=True)
         for feature in missing():
@@ -298,7 +298,7 @@ def _size(inputs: Sequence[Mapping[str, Any]]) -> int:
     return sum(entry["size"] for entry in inputs)
 
 
-def _threads_of_a_job(settings: ServiceSettings) -> int:
+def threads_of_a_job(settings: ServiceSettings) -> int:
     """Return a job's number of threads on this machine; planning uses as many, so that its timings are valid."""
     threads = os.environ.get("OMP_NUM_THREADS", "")
     return (

@@ -1,4 +1,4 @@
-"""Process that reads users' files, and compresses and blends results: `python -m service.inspection.process`.
+"""Process that reads users' files, and makes files from results: `python -m service.inspection.process`.
 
 The process imports slow modules once. For each request it forks a child with limits on time and memory, which reads the
 files and exits. The child is confined (`service.inspection.sandbox`): a hostile file that takes over the child can
@@ -42,7 +42,7 @@ from service.request import scene_request, stylize_request
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.decision import warnings_of
-from sgsst_core.errors import CameraError, InvalidInputError, MaskError, SgsstError, WeightsError
+from sgsst_core.errors import CameraError, InvalidInputError, MaskError, SettingsError, SgsstError, WeightsError
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.blending import blend_scenes, encode_blend
 from sgsst_core.files.cache_folder import cache_folder
@@ -66,9 +66,14 @@ from sgsst_core.stylizing.job_styles import check_style_size
 from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import Capture, about_rendering, choose_axes, read_capture
 from worker.inputs import check_something_in_view, load_styles, read_regions
+from worker.options import JobVideo
 from worker.processes import die_with_parent
 from worker.region_requests import RegionRequest
 from worker.request import check_choice, check_steps
+from worker.video import VideoRequest, render_video
+
+with contextlib.suppress(ImportError):
+    import av  # noqa: F401  # before the first fork, so that every child has it
 
 #: Time at which all modules were imported.
 _ready_at = time.time()
@@ -112,6 +117,8 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
+    if parameters.video is not None:
+        _check_encoder()
     findings: dict[str, Any] = {}
     source = scene_request(staged, parameters)
     with _errors_of("scene"):
@@ -278,11 +285,35 @@ def blend(staged: Staged, parameters: JobParameters, parts: dict[str, float], na
     return {}
 
 
+def video(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
+    """Render a video of a job's result, staged in place of its scene; `show` receives the progress.
+
+    Returns:
+        Width, height and number of the frames.
+    """
+    _check_encoder()
+    options = JobVideo(**limits["options"])
+    source = scene_request(staged, parameters).model_copy(update={"resolution": options.resolution})
+    unstylized = Path(limits["unstylized"]) if options.compare else None
+    request = VideoRequest(
+        source, Path(limits["name"]), options, parameters.settings().background, unstylized, images=staged.photos
+    )
+    started = time.monotonic()
+
+    def progress(done: int, total: int) -> None:
+        left = (time.monotonic() - started) / done * (total - done)
+        show(PlanningProgress(done, total, left))
+
+    cameras = render_video(request, progress, in_place=True)
+    return {"width": cameras[0].width, "height": cameras[0].height, "frames": len(cameras)}
+
+
 WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], dict[str, Any]]] = {
     "validate": lambda staged, parameters, limits, show: validate(staged, parameters, limits),
     "plan": plan,
     "compress": lambda staged, parameters, limits, show: compress(staged, parameters, limits["name"]),
     "blend": lambda staged, parameters, limits, show: blend(staged, parameters, limits["parts"], limits["name"]),
+    "video": video,
 }
 
 
@@ -302,6 +333,15 @@ def _check_network_weights(backbone: str) -> None:
     wanted = [name for name in ("vgg19", "vgg16") if backbone in ("auto", name)]
     if not any(name in installed for name in wanted):
         raise WeightsError(f"The service has no weights of {' or '.join(wanted)}: its operator has to fetch them.")
+
+
+def _check_encoder() -> None:
+    try:
+        import av  # noqa: F401
+    except ImportError as error:
+        raise SettingsError(
+            "The service cannot encode videos: its operator has to install the extra `video`."
+        ) from error
 
 
 def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
@@ -449,10 +489,10 @@ def _confine(request: dict[str, Any]) -> list[None]:
     links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
     linked = [path.resolve() for path in links if path.is_symlink()]
     result, most_bytes = None, 0
-    if request["work"] in ("compress", "blend"):
+    if request["work"] in ("compress", "blend", "video"):
         result = folder / request["limits"]["name"]
-        result.touch()
         most_bytes = request["limits"]["bytes"]
+        result.touch()
     uncompiled: list[None] = []
     cache_in_memory(lambda: uncompiled.append(None))
     confine([folder, *linked, cache_folder(), *kernel_folders(), *installation()], result, most_bytes)

@@ -288,12 +288,25 @@ class Jobs:
             return session.get(ArtifactRow, (job_id, name))
 
     def add_derived(
-        self, source: ArtifactRow, files: Sequence[Published], owner: str, quotas: Quotas = NO_QUOTAS
+        self,
+        source: ArtifactRow,
+        files: Sequence[Published],
+        owner: str,
+        quotas: Quotas = NO_QUOTAS,
+        *,
+        replace: bool = False,
     ) -> list[str]:
         """Publish files derived from `source`, unless `source` has been removed or replaced.
 
+        Args:
+            source: Row of the file that they were derived from.
+            files: Stored files.
+            owner: Owner of the job.
+            quotas: Quotas of the owner.
+            replace: Whether files replace those of the same names, instead of being left out.
+
         Returns:
-            Locations of files that were not published, because files of these names exist or `source` is gone.
+            Locations of files without a row: replaced ones, and those that were left out or whose `source` is gone.
 
         Raises:
             QuotaError: If the files exceed the owner's quota of stored bytes; none is published.
@@ -304,9 +317,13 @@ class Jobs:
             row = session.get(ArtifactRow, (source.job_id, source.name), with_for_update=True)
             for file in files:
                 existing = session.get(ArtifactRow, (source.job_id, file.name))
-                if row is None or row.location != source.location or existing is not None:
+                if row is None or row.location != source.location or (existing is not None and not replace):
                     unused.append(file.location)
                     continue
+                if existing is not None:
+                    unused.append(existing.location)
+                    session.delete(existing)
+                    session.flush()
                 values = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
                 session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **values))
             session.flush()

@@ -91,7 +91,7 @@ def video_writer(
                 f"{MAX_SIDE}."
             )
         remove_leftovers(out)
-        with atomic_path(out) as temporary, _encoder(temporary, width, height, fps, alpha) as write:
+        with atomic_path(out) as temporary, encoder(temporary, width, height, fps, alpha=alpha) as write:
             yield write
     else:
         folder, name = (out.parent, out.name) if out.suffix else (out, _FRAME_NAME)
@@ -100,7 +100,10 @@ def video_writer(
 
 
 @contextmanager
-def _encoder(path: Path, width: int, height: int, fps: int, alpha: bool) -> Iterator[Callable[[VideoFrame], None]]:
+def encoder(
+    path: Path, width: int, height: int, fps: int, *, alpha: bool = False
+) -> Iterator[Callable[[VideoFrame], None]]:
+    """Yield a function that appends a frame to a video file, like `video_writer`, but written in place."""
     import av
 
     codec, options = _ENCODERS[path.suffix.lower()]

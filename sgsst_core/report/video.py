@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sgsst_core.files.video import VideoFrame, video_writer
+from sgsst_core.files.video import VideoFrame
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -45,37 +44,30 @@ class Layer:
         return torch.cat([torch.minimum(image.clamp_min(0), coverage[:, :, None]), coverage[:, :, None]], dim=2)
 
 
-def write_video(
-    out: Path,
+def write_frames(
+    write: Callable[[VideoFrame], None],
     layer: Layer,
     cameras: Sequence[Camera],
     *,
-    fps: int,
     unstylized: Layer | None = None,
     transition: Transition = "wipe",
     alpha: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Write a video of a scene, one frame per camera. One frame is in memory at a time.
+    """Render the frames of a video, one per camera. One frame is in memory at a time.
 
     Args:
-        out: Path of the video or image sequence; see `sgsst_core.files.video`.
+        write: Function that appends a frame to the video; see `sgsst_core.files.video.video_writer`.
         layer: Scene to show.
-        cameras: Cameras of one size, which has even sides for a video file.
-        fps: Frames per second.
+        cameras: Cameras of one size, one per frame.
         unstylized: Scene at the start of the transition; None for no transition.
         transition: Kind of the transition.
         alpha: Whether to write an alpha channel.
         progress: Callback that receives the numbers of completed and of all frames.
-
-    Raises:
-        OutputError: If the video cannot be written.
     """
-    first = cameras[0]
-    with video_writer(out, first.width, first.height, fps, alpha=alpha) as write:
-        for done, frame in enumerate(_frames(layer, cameras, unstylized, transition, alpha), start=1):
-            write(frame)
-            progress(done, len(cameras))
+    for done, frame in enumerate(_frames(layer, cameras, unstylized, transition, alpha), start=1):
+        write(frame)
+        progress(done, len(cameras))
 
 
 def shown_fraction(time: float) -> float:

@@ -44,7 +44,7 @@ from sgsst_core.files.formats.ply import PLY
 router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
 
 #: Media types that a browser may show inline. The HTML report may run its own script, but is isolated from this site.
-_INLINE = ("image/", "text/html", "application/json", "text/plain")
+_INLINE = ("image/", "video/", "text/html", "application/json", "text/plain")
 _SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
@@ -79,6 +79,7 @@ _CONTENT = {
     "text/plain": "14:02:11 info    stylizing 616 Gaussians, 3 views\n",
     "image/jpeg": "\xff\xd8\xff\xe0",
     "image/png": "\x89PNG\r\n\x1a\n",
+    "video/mp4": "\0\0\0 ftypisom",
 }
 _ANSWERS: Responses = {
     **file_answers(_CONTENT),

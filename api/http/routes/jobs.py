@@ -28,7 +28,7 @@ from api.http.multipart import (
     receive,
 )
 from api.http.numbers import Digits
-from api.http.planning import DRY_RUN, answer_plan
+from api.http.progress import DRY_RUN, answer_work
 from api.http.receipts import Receipt
 from api.http.schemas import (
     MOST_POINTS,
@@ -36,6 +36,7 @@ from api.http.schemas import (
     JobDetail,
     JobPage,
     JobView,
+    PlanView,
     ProgressHistory,
     StatusName,
     job_detail,
@@ -144,14 +145,14 @@ async def create_job(
             return await asyncio.to_thread(_queue_job, context, caller, job_request, idempotency_key, receipt)
         stack.pop_all()  # keep the files, which planning needs after this function returns
 
-    async def plan(show: Show) -> dict[str, Any]:
+    async def plan(show: Show) -> PlanView:
         async with receipt:
-            inspect = context.inspector.inspect
-            return await inspect(
+            found = await context.inspector.inspect(
                 "plan", caller.owner, job_request.inputs, job_request.rows, job_request.parameters, show
             )
+        return PlanView(**found, workers=job_request.parameters.workers)
 
-    return await answer_plan(request, plan, job_request.parameters.workers)
+    return await answer_work(request, plan, "planning", "plan")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,126 @@
+"""Tests of videos of jobs: by a parameter, and of finished jobs by a request that reports its progress."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import av
+import httpx
+import pytest
+from httpx_sse import ServerSentEvent, connect_sse
+
+from tests.api.service import Service, wait_for
+from tests.small_scenes import wall, write_files
+
+PARAMETERS = {"preset": "preview", "backbone": "vgg16", "steps_coarse": 1, "steps_sos": 1, "measure": False}
+VIDEO = {"fps": 5, "seconds": 1.2, "resolution": 64}
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with Service(tmp_path_factory.mktemp("videos") / "data") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def job(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the id of a finished job that has made a video by its parameter."""
+    scene, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    files = [("scene", (scene.name, scene.read_bytes())), ("cameras", (cameras.name, cameras.read_bytes()))]
+    files.append(("style", (style.name, style.read_bytes())))
+    with service.client() as client:
+        data = {"parameters": json.dumps(PARAMETERS | {"video": VIDEO | {"compare": True}})}
+        created = client.post("/v1/jobs", files=files, data=data)
+        assert created.status_code == 202, created.text
+        job_id: str = created.json()["id"]
+        wait_for(lambda: client.get(f"/v1/jobs/{job_id}").json()["status"] in ("succeeded", "failed"), "the job to end")
+        assert client.get(f"/v1/jobs/{job_id}").json()["status"] == "succeeded"
+        return job_id
+
+
+def frames(client: httpx.Client, job_id: str) -> list[Any]:
+    """Return the decoded frames of a job's video."""
+    answer = client.get(f"/v1/jobs/{job_id}/artifacts/video.mp4")
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "video/mp4"
+    assert answer.headers["content-disposition"].startswith("inline")
+    with av.open(io.BytesIO(answer.content), "r") as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def events(client: httpx.Client, job_id: str, **options: Any) -> list[ServerSentEvent]:
+    with connect_sse(client, "POST", f"/v1/jobs/{job_id}/video", json=options) as source:
+        assert source.response.status_code == 200, source.response.read()
+        return [sent for sent in source.iter_sse() if sent.data]
+
+
+def names(client: httpx.Client, job_id: str) -> list[str]:
+    return [entry["name"] for entry in client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]]
+
+
+def test_job_makes_the_video_that_its_parameters_ask_for(service: Service, job: str) -> None:
+    with service.client() as client:
+        made = frames(client, job)
+        assert (len(made), made[0].shape) == (6, (48, 64, 3))
+        assert made[0].std() > 5
+        ranged = client.get(f"/v1/jobs/{job}/artifacts/video.mp4", headers={"Range": "bytes=4-7"})
+        assert (ranged.status_code, ranged.content) == (206, b"ftyp")
+
+
+@pytest.mark.parametrize("path", ["orbit", "cameras"])
+def test_finished_job_makes_another_video_with_progress(service: Service, job: str, path: str) -> None:
+    with service.client() as client:
+        *rendering, last = events(client, job, path=path, fps=4, seconds=2, resolution=100)
+        assert {sent.event for sent in rendering} == {"rendering"}
+        assert [sent.json()["total"] for sent in rendering] == [8] * len(rendering)
+        assert rendering[-1].json()["fraction"] == 1
+        assert last.event == "video", last.data
+        assert last.json()["name"] == "video.mp4"
+        made = frames(client, job)
+        assert len(made) == 8
+        assert max(made[0].shape) == 100
+        assert names(client, job).count("video.mp4") == 1
+        again = client.post(f"/v1/jobs/{job}/video", json={"seconds": 0.1})
+        assert (again.status_code, again.json()["media_type"]) == (200, "video/mp4")
+
+
+def test_video_that_nobody_waits_for_is_completed(service: Service, job: str) -> None:
+    with service.client() as client:
+        before = client.get(f"/v1/jobs/{job}/artifacts").json()
+        options = {"fps": 10, "seconds": 6, "resolution": 200}
+        with connect_sse(client, "POST", f"/v1/jobs/{job}/video", json=options) as source:
+            next(source.iter_sse())
+            other = client.post(f"/v1/jobs/{job}/video", json={"seconds": 1})
+            assert (other.status_code, other.json()["code"]) == (503, "busy")
+        wait_for(lambda: client.get(f"/v1/jobs/{job}/artifacts").json() != before, "the video to be published")
+        assert len(frames(client, job)) == 60
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "message"),
+    [
+        ({"seconds": 31}, 422, "less than or equal to 30"),
+        ({"fps": 61}, 422, "less than or equal to 60"),
+        ({"resolution": 4000}, 422, "less than or equal to 1920"),
+        ({"path": "spiral"}, 422, "path"),
+        ({"codec": "av1"}, 422, "codec"),
+    ],
+)
+def test_options_beyond_the_limits_are_refused(
+    service: Service, job: str, options: dict[str, Any], status: int, message: str
+) -> None:
+    with service.client() as client:
+        answer = client.post(f"/v1/jobs/{job}/video", json=options)
+        assert answer.status_code == status
+        assert message in answer.text
+
+
+def test_jobs_without_a_result_have_no_video(service: Service, job: str) -> None:
+    with service.client() as client:
+        assert client.post(f"/v1/jobs/{'job_' + 31 * '0'}/video", json={}).status_code == 404
+        broken = client.post(f"/v1/jobs/{job}/video", content=b"{", headers={"Content-Type": "application/json"})
+        assert broken.status_code in (400, 422)
