@@ -9,6 +9,7 @@ import { ResultStage } from "./result_stage.js";
 import { resultFormats } from "./scene_formats.js";
 import { startFrom } from "./submit.js";
 import { actionsOf, titles, UNFINISHED } from "./statuses.js";
+import { VideoCard } from "./video_card.js";
 import { size, time, words } from "./words.js";
 
 const say = words.job;
@@ -45,12 +46,13 @@ export class JobView {
     this.show = h("div.show", this.picture);
     this.plan = h("section.card", { hidden: true });
     this.download = h("section.card", { hidden: true });
+    this.film = h("div", { hidden: true });
     this.files = h("section.card");
     this.deletion = h("p.deletion");
     this.facts = h("section.card");
     this.curve = h("section.card", h("h2", say.loss), this.chart.element);
     this.body = h("div.job", h("header.head", h("div", h("div.row", this.heading, this.renaming, this.badge), this.meta), this.actions),
-      this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.download, this.curve, this.plan, this.files, this.facts, this.deletion)));
+      this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.download, this.film, this.curve, this.plan, this.files, this.facts, this.deletion)));
     this.element = h("div", h("p.quiet.pending", words.page.loading));
     this.begin();
   }
@@ -228,7 +230,7 @@ export class JobView {
       return;
     }
     const { stage, step, total, fraction, eta_s } = progress;
-    this.stateText.textContent = [say.stages[stage] ?? stage, total ? (stage === "planning" || stage === "measuring" ? say.view : say.step)(step, total) : ""].filter(Boolean).join(" · ");
+    this.stateText.textContent = [say.stages[stage] ?? stage, total ? (stage === "video" ? say.frame : stage === "planning" || stage === "measuring" ? say.view : say.step)(step, total) : ""].filter(Boolean).join(" · ");
     this.leftText.textContent = eta_s === null || eta_s === undefined ? "" : say.left(eta_s);
     if (total) this.bar.value = fraction;
     else this.bar.removeAttribute("value");
@@ -290,10 +292,19 @@ export class JobView {
     else if (!this.preview && !this.result) put(this.picture, h("p.quiet", UNFINISHED.has(this.job.status) ? say.noPreview : ""));
     this.showFiles(found.filter(({ name }) => !name.startsWith("previews/")), names);
     if (names.has("plan.json") && this.plan.hidden) await this.loadPlan();
-    const result = found.find(({ name }) => name === "stylized.ply");
+    const result = found.find(({ name }) => name === "stylized.ply"), video = found.find(({ name }) => name === "video.mp4");
+    if (this.job.status === "succeeded" && result) this.offerVideo(video);
     if (this.job.status !== "succeeded" || !result || this.result) return;
     this.offerDownload(result.size);
     this.showResult(names);
+  }
+
+  /** @param {any} video artifact; undefined if there is none yet */
+  offerVideo(video) {
+    this.video ??= new VideoCard(this.job, this.leaving.signal);
+    if (!this.film.firstChild) put(this.film, this.video.element);
+    this.film.hidden = false;
+    if (video) this.video.play(video);
   }
 
   /** @param {number} bytes size of the PLY */

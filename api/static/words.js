@@ -150,14 +150,20 @@ export const words = {
   },
   job: {
     stages: /** @type {Record<string, string>} */ ({
-      reading: "Reading the files", planning: "Analyzing views", starting: "Starting workers", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality",
+      reading: "Reading the files", planning: "Analyzing views", starting: "Starting workers", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality", video: "Rendering the video",
     }),
-    unnamed: "Unnamed job", rename: "Rename", newName: "New name", save: "Save", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`,
+    unnamed: "Unnamed job", rename: "Rename", newName: "New name", save: "Save", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`, frame: (/** @type {number} */ n, /** @type {number} */ all) => `frame ${count(n)} of ${count(all)}`,
     left: (/** @type {number} */ s) => (s < 1 ? "almost done" : `about ${seconds(s)} left`), progress: "Progress", remove: "Delete", removeSure: "Delete this job and its results?", keep: "Cancel", deleted: "This job was deleted.",
     actions: /** @type {Record<string, string>} */ ({ finish: "Stop here and keep it" }), lost: "Connection lost. Reconnecting…", back: "Reconnected.", loss: "Loss", noLoss: "The chart appears once painting starts.", preview: "Latest preview", noPreview: "The first preview will appear shortly.",
     made: (/** @type {string} */ at) => `Created ${at}`, took: (/** @type {number} */ s) => `took ${seconds(s)}`, attempt: (/** @type {number} */ n) => `attempt ${n}`, expires: (/** @type {string} */ at) => `kept until ${at}`,
     threeD: "3D", sheet: "Before and after", report: "Report", result: "Result", download: "Download", format: "Format", converting: "Converted on the first download, which takes about 10 seconds for a million Gaussians.", files: "Files", settings: "Settings", inputs: "Inputs", openReport: "Open the report", noFiles: "Nothing yet.", noScene: "This scene can't be shown here.", view3d: "Result", compare: "Compare with another job", compareWith: "Another job of this scene", noOther: "No other finished job of this scene.",
     sheetOf: (/** @type {string} */ name) => `Views of ${name} before and after`, failed: "The job failed", anotherPainting: "Try another painting", changed: "Same with changes", preparing: "Preparing…",
+  },
+  video: {
+    title: "Video", path: "Camera path", paths: /** @type {Record<string, string>} */ ({ orbit: "Once around", cameras: "Through the cameras" }), length: "Length", seconds: (/** @type {number} */ n) => `${n} seconds`,
+    compare: "Start with the original", make: "Make a video", again: "Make another video", starting: "Starting the video…", made: "The video is ready.", progress: "Video progress", player: "Video of the result", download: "Download video",
+    rendering: (/** @type {number} */ n, /** @type {number} */ all, /** @type {number | null} */ left) => `Frame ${count(n)} of ${count(all)}${left ? `, about ${seconds(left)} left` : ""}. You can leave this page.`,
+    unplayable: "This browser can't play H.264 video. Download it instead.",
   },
   chart: {
     seconds: "seconds", loss: "loss", all: "mean of all views", single: "single views", coarse: "coarse", scale: (/** @type {number} */ n) => (n ? `1/${2 ** n}` : "full size"),

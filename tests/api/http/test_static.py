@@ -51,6 +51,7 @@ def test_pages_reference_existing_files(client: httpx.Client, path: str, policy:
 def test_policies_forbid_inline_scripts() -> None:
     for policy in (POLICY, DOCS_POLICY):
         assert "unsafe" not in policy
+        assert "media-src 'self';" in policy
         assert "http" not in policy
         assert policy.startswith("default-src 'none'; script-src 'self';")
 

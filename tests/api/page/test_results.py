@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import av
 import httpx
 import pytest
 
@@ -133,3 +134,34 @@ def test_result_without_webgl_is_the_sheet(browser: Any, service: Service, finis
     assert httpx.get(f"{service.url}/v1/jobs/{finished}").json()["preview"] == "previews/thumbnail.jpg"
     watched.check("WebGL")
     bare.close()
+
+
+def test_video_is_made_and_played(visit: Visit, service: Service, finished: str) -> None:
+    from axe_playwright_python.sync_playwright import Axe
+
+    watched = visit(f"/#/jobs/{finished}", width=360, height=800)
+    page = watched.page
+    page.get_by_label("Camera path").select_option("cameras")
+    page.get_by_label("Length").select_option("4")
+    page.get_by_label("Start with the original").check()
+    with page.expect_response(lambda answer: "/artifacts/video.mp4" in answer.url) as received:
+        page.get_by_role("button", name="Make a video").click()
+        page.get_by_text("You can leave this page.").wait_for()
+    assert received.value.status in (200, 206)
+    player = page.get_by_label("Video of the result")
+    player.wait_for()
+    if player.evaluate("(video) => video.canPlayType('video/mp4; codecs=\"avc1.640028\"')"):
+        page.wait_for_function("document.querySelector('video').readyState > 0")
+        assert player.evaluate("(video) => [video.duration, video.videoWidth]") == [pytest.approx(4, abs=0.1), 96]
+    else:  # Chromium without patented codecs
+        page.get_by_text("can't play H.264").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download video").click()
+    with av.open(str(download.value.path()), "r") as container:
+        assert len(list(container.decode(video=0))) == 120
+    assert Axe().run(page).violations_count == 0
+    page.reload()
+    page.get_by_label("Video of the result").wait_for()
+    page.get_by_role("button", name="Make another video").wait_for()
+    watched.check()
