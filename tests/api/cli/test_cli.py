@@ -169,7 +169,8 @@ def test_invalid_regions_are_rejected(
     assert not files.out.exists()
 
 
-@pytest.mark.parametrize("form", [pytest.param("compressed.ply", marks=pytest.mark.slow), "spz"])
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["compressed.ply", "spz"])
 def test_stylize_reads_and_writes_compressed_scenes(
     files: Files, capsys: pytest.CaptureFixture[str], form: str
 ) -> None:
@@ -519,7 +520,8 @@ def test_resume_after_ctrl_c_is_bit_identical(files: Files, capfd: pytest.Captur
     assert files.out.read_bytes() == resumed
 
 
-@pytest.mark.parametrize("command", ["plan", pytest.param("stylize", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["plan", "stylize"])
 def test_ctrl_c_during_survey_leaves_no_files(files: Files, command: str) -> None:
     """The progress bar shows when the survey runs; there are enough views for the signal to arrive meanwhile."""
     views, out = 2000, files.out if command == "stylize" else files.out.with_name("plan.json")

@@ -44,13 +44,14 @@ def test_ctrl_c_while_reading_is_announced(
     assert capsys.readouterr().err.splitlines()[-1] == "Aborted. Output files are complete or were not written."
 
 
-@pytest.mark.parametrize("command", ["convert", "render", "study"])
+@pytest.mark.parametrize("command", ["convert", "render", "study", "plan"])
 def test_ctrl_c_while_writing_leaves_no_file(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, views, style = map(str, write_files(tmp_path, wall()))
     out = tmp_path / "out"
     arguments = {
         "convert": ["convert", scene, str(out / "scene.spz")],
         "render": ["render", scene, "--cameras", views, "--out", str(out)],
+        "plan": ["plan", scene, "--cameras", views, "--style", style, "--out", str(out / "plan.json")],
         "study": ["study", "make", f"a={scene}", f"b={scene}", "--style", style, "--cameras", views],
     }[command]
     if command == "study":

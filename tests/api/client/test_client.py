@@ -233,7 +233,9 @@ def test_plan_queues_nothing_and_rejects_bad_files(
         assert [job.id for job in client.jobs()] == before
 
 
-@both
+@pytest.mark.parametrize(
+    "connect", [Client, pytest.param(Awaited, marks=pytest.mark.slow)], ids=["Client", "AsyncClient"]
+)
 def test_plan_reports_progress(connect: Any, service: Service, files: dict[str, Path]) -> None:
     options = {"preset": "preview", "backbone": "vgg16", "resolution": 64, "cameras": files["cameras"]}
     reported: list[tuple[int, int]] = []

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import json
 import math
@@ -109,21 +110,27 @@ def parsed(report: dict[str, Any], sheet: bytes | None = None) -> Page:
     return page
 
 
+@functools.cache
+def sample_page() -> Page:
+    """Return the parsed page of the unchanged sample report, for tests that only read it."""
+    return parsed(sample_report(), sample_sheet())
+
+
 def parsed_without_figures(report: dict[str, Any]) -> Page:
     """Return the parsed page of a report without charts, which would take most of the time."""
     return parsed({**report, "history": []})
 
 
-def losses_alone(coarse: int = 6, sos: int = 12) -> dict[str, Any]:
-    """Return a report whose only data for charts are losses."""
-    report = sample_report(coarse, sos)
+def losses_alone(coarse: int = 6, sos: int = 12, scales: int = 2, *, also: str = "") -> dict[str, Any]:
+    """Return a report whose only data for charts are losses and, if requested, those of one other field."""
+    report = sample_report(coarse, sos, scales)
     for record in report["history"]:
         del record["memory_bytes"]
-    return {**report, "novel_views": None, "approximations": None}
+    return {**report, **{name: None for name in ("novel_views", "approximations") if name != also}}
 
 
 def test_page_is_complete_and_self_contained() -> None:
-    page = parsed(sample_report(), sample_sheet())
+    page = sample_page()
     assert page.html.startswith("<!DOCTYPE html>")
     assert "http:" not in page.html
     assert "https:" not in page.html
@@ -142,7 +149,7 @@ def test_sheet_is_embedded_unchanged() -> None:
 
 
 def test_sections_are_in_order() -> None:
-    text = parsed(sample_report(), sample_sheet()).text
+    text = sample_page().text
     headings = [
         "garden.ply in the style of wave.jpg",
         "Loss over time",
@@ -184,7 +191,7 @@ def test_heading_states_why_the_job_stopped(stopped: str, words: str) -> None:
 
 
 def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
-    page = parsed(sample_report())
+    page = sample_page()
     figures = [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
     assert figures == ["loss", "split", "consistency", "approximations", "memory"]
     for against in ("seconds", "steps"):
@@ -210,13 +217,14 @@ def test_lines_are_named_and_phases_marked() -> None:
 
 
 def test_split_has_a_panel_for_each_scale() -> None:
-    words = Page(draw_figures(sample_report(scales=3))[1].svg["seconds"]).text
+    report = losses_alone(scales=3)
+    words = Page(draw_figures(report)[1].svg["seconds"]).text
     assert [words.count(f"scale {scale} (") for scale in range(4)] == [1, 1, 1, 0]
     assert all(name in words for name in TERMS.values())
 
 
 def test_unused_loss_terms_are_not_drawn() -> None:
-    report = sample_report(scales=2)
+    report = losses_alone()
     for record in report["history"]:
         for terms in record["scales"].values():
             terms["nearest"] = 0.0
@@ -229,7 +237,7 @@ def test_unused_loss_terms_are_not_drawn() -> None:
 
 def test_both_axes_of_the_loss_are_logarithmic() -> None:
     """Points with twice the step and half the value of the previous one are evenly spaced."""
-    report = sample_report(0, 64)
+    report = losses_alone(0, 64, also="novel_views")
     for moment, step in zip(report["novel_views"]["moments"], (0, 4, 8), strict=True):
         moment.update(step=step, gram_relative=1 / step if step else 1.0)
     report["novel_views"]["moments"].append(
@@ -303,7 +311,7 @@ def test_prediction_is_shown_next_to_the_measurement() -> None:
 
 def test_gpu_memory_is_shown_separately() -> None:
     report = losses_alone()
-    cells, captions = parsed(report).cells, []
+    cells, captions = parsed_without_figures(report).cells, []
     assert "peak memory of the GPU" not in cells
     report["plan"]["prediction"]["device_bytes"] = 40_000_000_000
     report["plan"]["measured"]["device_bytes"] = 20_000_000_000
@@ -417,7 +425,7 @@ def test_novel_views_without_values_are_shown() -> None:
 @pytest.mark.parametrize("missing", ["short", "long"])
 def test_missing_range_leaves_panel_sizes_unchanged(missing: str) -> None:
     """Four cameras give too few novel views for the long range, which then appears in no panel and no legend."""
-    report = sample_report()
+    report = losses_alone(also="novel_views")
     for moment in report["novel_views"]["moments"]:
         moment["consistency"]["long"] = {**moment["consistency"]["short"], "gap": 7}
         moment["consistency"][missing] = None
@@ -442,7 +450,7 @@ def panel_borders(svg: str) -> list[tuple[float, float]]:
 
 def test_probes_before_the_first_step_are_not_drawn() -> None:
     """A logarithmic axis cannot show a probe before the first step."""
-    report = sample_report()
+    report = losses_alone(also="approximations")
     report["approximations"]["moments"] = [{**report["approximations"]["moments"][0], "step": 0}]
     figure = {figure.name: figure for figure in draw_figures(report)}["approximations"]
     assert panel_borders(figure.svg["steps"])[0][0] > 20, "there is no room left for the axis's name"
@@ -506,8 +514,7 @@ def test_extreme_losses_are_shown(size: float) -> None:
 
 
 def test_long_history_stays_small() -> None:
-    report = sample_report(10_000, 10_000, scales=4)
-    page = parsed(report)
+    page = parsed(sample_report(5 * BINS, 5 * BINS, scales=4))
     assert len(page.html.encode()) < 1_500_000  # leaves as much again for the sheet
     points = [attributes.get("d") or "" for tag, attributes in page.elements if tag == "path"]
     assert max(path.count("L") for path in points) < 2 * BINS + 10
