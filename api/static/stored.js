@@ -7,12 +7,13 @@ import { ask } from "./api.js";
 export class StoredFile {
   /**
    * @param {string} path path of the input in the API, by which a new job refers to it
-   * @param {{name: string, size: number}} input
+   * @param {{name: string, size: number, sha256: string}} input
    */
-  constructor(path, { name, size }) {
+  constructor(path, { name, size, sha256 }) {
     this.path = path;
     this.name = name;
     this.size = size;
+    this.sha256 = sha256;
   }
 
   /** Absolute address of the content. */

@@ -3,6 +3,7 @@
 import { ask, eventsOf, get, Problem, randomKey } from "./api.js";
 import { readCameras, ringCameras } from "./cameras.js";
 import { announce, h, icon, newId, put } from "./dom.js";
+import { Gallery } from "./gallery.js";
 import { defaultName } from "./names.js";
 import { GROUPS, optionControl, plainly } from "./options.js";
 import { costCard } from "./plan.js";
@@ -11,8 +12,9 @@ import { accepted } from "./scene_formats.js";
 import { droppedFiles, oneModel, Slot, sorted } from "./slots.js";
 import { Stage } from "./stage.js";
 import { contentOf, StoredFile, storedInputs } from "./stored.js";
+import { addPictures } from "./strength.js";
 import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
-import { percent, words } from "./words.js";
+import { percent, seconds, words } from "./words.js";
 
 /** @typedef {import("./options.js").Control} Control */
 /** @typedef {import("./stored.js").Chosen} Chosen */
@@ -95,6 +97,8 @@ export class SubmitView {
     this.masks = [];
     /** Idempotency keys of requests for jobs, by their bodies. @type {Map<string, string>} */
     this.keys = new Map();
+    /** Elements with the estimated time of each preset. @type {Map<string, HTMLElement>} */
+    this.times = new Map();
     this.build();
     this.restoreFiles();
     this.loadOptions();
@@ -124,6 +128,7 @@ export class SubmitView {
     this.fromFiles = this.choice("views", say.fromFiles, true);
     this.viewsBody = h("div.views-body");
     this.found = h("p.quiet");
+    this.gallery = new Gallery((painting) => this.slots.style.add([painting]), this.leaving.signal);
     this.blended = this.choice("paintings", say.blended, true, () => this.styleChanged());
     this.apart = this.choice("paintings", say.apart, false, () => this.styleChanged());
     this.together = h("fieldset.segments.wide", { hidden: true }, h("legend.away", say.paintings), this.blended.element, this.apart.element);
@@ -144,7 +149,7 @@ export class SubmitView {
     this.unused = h("p.wrong.block", { hidden: true, role: "alert" });
     this.form = h("form.panel", { noValidate: true, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.act(false)) },
       h("header", h("h1", say.heading), h("p.lead", say.lead)), this.notice, this.name.element,
-      h("section", h("h2", say.files), this.unused, this.slots.scene.element, this.slots.style.element, this.together, this.shares),
+      h("section", h("h2", say.files), this.unused, this.slots.scene.element, this.slots.style.element, this.gallery.element, this.together, this.shares),
       h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.viewsBody, this.found),
       h("section", h("h2", say.essentials), this.presets, this.main),
       h("section", h("h2", say.more), this.search, this.none, h("div", this.lookFold, this.regionFold, this.expertFold)),
@@ -203,8 +208,13 @@ export class SubmitView {
     put(this.lookOptions, ...elements(GROUPS.look));
     put(this.expertOptions, ...elements([...this.controls.keys()].filter((name) => !PLACED.has(name) && !GROUPS.look.includes(name))));
     this.ring.addEventListener("input", () => this.camerasChanged());
+    const followStrength = addPictures(/** @type {Control} */ (this.controls.get("content_weight")));
     this.restoreDraft();
-    this.form.addEventListener("input", () => this.saveDraft());
+    followStrength();
+    this.form.addEventListener("input", (/** @type {Event} */ event) => {
+      this.saveDraft();
+      if (!this.presets.contains(event.target)) this.forgetTimes();
+    });
   }
 
   /** @param {any} schema */
@@ -213,7 +223,42 @@ export class SubmitView {
     this.choosePreset(schema.default);
     put(this.presets, h("legend", "Preset"), schema.enum.map((/** @type {string} */ value) => h("label",
       h("input", { type: "radio", name, value, checked: value === schema.default, onchange: () => this.choosePreset(value) }),
-      h("span", h("strong", value), h("small", say.presets[value] ?? "")))));
+      h("span", h("strong", value), h("small", say.presets[value] ?? ""), this.times.get(value) ?? this.newTime(value)))));
+  }
+
+  /** Create the element for the estimated time of a preset. @param {string} preset */
+  newTime(preset) {
+    const element = h("small.time");
+    this.times.set(preset, element);
+    return element;
+  }
+
+  /** Discard the estimated times of the presets, which were made for other files or options. */
+  forgetTimes() {
+    this.timing?.abort();
+    for (const element of this.times.values()) element.textContent = "";
+  }
+
+  /**
+   * Show the estimated time at each preset. The other presets are estimated one after another; the service remembers
+   * what it has planned.
+   *
+   * @param {any} body job whose plan is known
+   * @param {any} view its plan
+   */
+  async showTimes(body, view) {
+    this.forgetTimes();
+    const { signal } = (this.timing = new AbortController());
+    const tell = (/** @type {string} */ preset, /** @type {any} */ { total_seconds: total }) => void (/** @type {any} */ (this.times.get(preset)).textContent = total === null ? "" : say.about(seconds(total)));
+    tell(body.parameters.preset, view);
+    for (const preset of this.times.keys()) {
+      if (preset === body.parameters.preset || signal.aborted) continue;
+      try {
+        tell(preset, await (await ask("POST", "/v1/jobs?dry_run=true", { json: { ...body, parameters: { ...body.parameters, preset } }, signal })).json());
+      } catch {
+        // this preset is shown without a time
+      }
+    }
   }
 
   /** @param {string} preset */
@@ -379,6 +424,7 @@ export class SubmitView {
   /** Discard the displayed plan, which was made for other files or parameters. */
   refresh() {
     if (this.result && !this.busy) put(this.result);
+    this.forgetTimes();
     const scene = this.slots.scene.files[0]?.name;
     this.name.suggest(defaultName(scene, this.slots.style.files.map(({ name }) => name)));
     this.stage.title = this.name.value() ?? defaultName(scene, []);
@@ -530,20 +576,21 @@ export class SubmitView {
   async plan(body) {
     this.tellPlanning(say.planning);
     const answer = await ask("POST", "/v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: AbortSignal.any([this.leaving.signal, /** @type {AbortController} */ (this.stopping).signal]) });
-    if (!answer.headers.get("content-type")?.includes("event-stream")) return void this.showPlan(await answer.json());
+    if (!answer.headers.get("content-type")?.includes("event-stream")) return void this.showPlan(body, await answer.json());
     for await (const { event, data } of eventsOf(answer)) {
       if (event === "planning") this.tellPlanning(say.planned(data.step, data.total), data.fraction);
       else if (event === "problem") throw new Problem(data.status, data);
       else if (event === "plan") {
-        this.showPlan(data);
+        this.showPlan(body, data);
         this.result.scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
       }
     }
     this.planningText = "";
   }
 
-  /** @param {any} view */
-  showPlan(view) {
+  /** @param {any} body @param {any} view */
+  showPlan(body, view) {
+    this.showTimes(body, view);
     put(this.result, costCard(view), this.jobs > 1 ? h("p.help", say.eachTakes(this.jobs)) : null);
   }
 
@@ -638,6 +685,7 @@ export class SubmitView {
       kept = { files, weights: this.weights.map((input) => input.value), regions: this.regions.value(), apart: this.apart?.input.checked };
     }
     this.leaving.abort();
+    this.timing?.abort();
     for (const upload of this.uploads.values()) upload.stop();
     for (const slot of Object.values(this.slots)) slot.end();
     this.stage.end();

@@ -99,7 +99,7 @@ export const words = {
     nFiles: (/** @type {number} */ n) => several(n, "file"), more: "More options", find: "Find an option", regions: "Regions", addRegion: "Add a region", noOptions: "No matching option.", optionsAway: "Couldn't load the options; the preset's defaults apply.",
     regionsHint: "Give parts of the scene their own painting, or freeze them.", region: (/** @type {number} */ n) => `Region ${n}`, ownStyle: "Same as the job",
     presets: /** @type {Record<string, string>} */ ({ preview: "Quick look, minutes", standard: "Recommended", paper: "Published settings, hours" }),
-    cost: "Estimate time", start: "Start", starting: "Starting…", planning: "Analyzing views…", planned: (/** @type {number} */ step, /** @type {number} */ total) => `${count(step)} of ${several(total, "view")} analyzed`,
+    about: (/** @type {string} */ time) => `about ${time}`, cost: "Estimate time", start: "Start", starting: "Starting…", planning: "Analyzing views…", planned: (/** @type {number} */ step, /** @type {number} */ total) => `${count(step)} of ${several(total, "view")} analyzed`,
     needScene: "Choose a scene.", needStyle: "Choose a painting.", needCameras: "Choose camera files, or orbit the object.",
     resumable: (/** @type {string} */ name, /** @type {string} */ share) => `“${name}” was ${share} uploaded. Choose it again to finish.`, forget: "Discard",
     blended: "Blend them", apart: "One job each", paintings: "Several paintings", startAll: (/** @type {number} */ n) => `Start ${n} jobs`, eachTakes: (/** @type {number} */ n) => `Each of the ${n} jobs takes about as long.`,
@@ -173,5 +173,13 @@ export const words = {
     title: "Jobs", filter: "Filter", name: "Name", status: "Status", any: "Any status", empty: "No jobs yet", emptyLead: "Your jobs will appear here.", noMatch: "No matching jobs.", more: "Show more", choose: "Compare", select: (/** @type {string} */ name) => `Compare ${name}`, compare: "Compare", chooseTwo: "Select two or more finished jobs of the same scene.", remove: (/** @type {string} */ name) => `Delete ${name}`, removed: "Deleted.", otherScenes: "Those use different scenes.",
   },
   compare: { title: "Compare", heading: (/** @type {string} */ a, /** @type {string} */ b) => `${a} and ${b}`, several: (/** @type {number} */ n) => `${n} paintings of one scene`, notThere: "One of these jobs is missing or unfinished.", sheet: "Jobs side by side" },
+  gallery: {
+    title: "Gallery", used: "Used last", bundled: "Paintings in the public domain", use: (/** @type {string} */ title) => `Add ${title}`,
+    paintings: /** @type {Record<string, string>} */ ({
+      starry_night: "The Starry Night, Vincent van Gogh", wheat_field_with_cypresses: "Wheat Field with Cypresses, Vincent van Gogh", great_wave: "The Great Wave off Kanagawa, Hokusai",
+      shipwreck: "The Wreck of a Transport Ship, Turner", rembrandt_old_man: "Old man, Rembrandt", vallotton_woodcut: "Woodcut, Félix Vallotton",
+    }),
+  },
+  strengths: { legend: "How strongly to paint", titles: /** @type {Record<string, string>} */ ({ light: "Light", balanced: "Balanced", strong: "Strong" }) },
   signIn: { title: "Sign in", heading: "Sign in", lead: "This service requires an API key.", expired: "Your session has expired, or you signed out in another tab. Sign in to continue where you were.", where: "Enter your API key. Ask your administrator for one.", key: "API key", go: "Sign in", wrong: "That key isn't valid.", out: "You signed out." },
 };

@@ -10,6 +10,7 @@ import httpx
 import pytest
 from PIL import Image
 
+from sgsst_core.option_parsers import STRENGTHS
 from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, set_options, submit
 from tests.api.page.browser import Watched
 from tests.api.service import Service
@@ -145,4 +146,47 @@ def test_job_is_finished_early_on_the_page(visit: Visit, service: Service, files
     page.locator(".badge", has_text="Done").wait_for()
     page.get_by_role("link", name="Download", exact=True).wait_for()
     assert httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["result"]["stopped"] == "on-request"
+    watched.check()
+
+
+def test_paintings_are_chosen_from_the_gallery(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """Paintings of earlier jobs are not sent again."""
+    earlier = submit(service, files, **LONG, name="earlier")
+    httpx.post(f"{service.url}/v1/jobs/{earlier}/cancel").raise_for_status()
+    watched = visit(width=900, height=700)
+    page, sent = watched.page, uploads_of(watched)
+    choose(watched, {role: files[role] for role in ("scene", "cameras")})
+    page.locator("summary", has_text="Gallery").click()
+    page.get_by_role("button", name="Add style.png").click()
+    page.get_by_role("button", name="Remove style.png").wait_for()
+    page.get_by_role("button", name="Add The Great Wave off Kanagawa, Hokusai").click()
+    page.get_by_role("button", name="Remove great_wave.jpg").wait_for()
+    broken = "(images) => images.filter((image) => image.complete && !image.naturalWidth).length"
+    assert page.locator(".painting img").count() == 7
+    assert page.locator(".painting img").evaluate_all(broken) == 0
+    set_options(watched, **STEPS)
+    page.get_by_role("radio", name="Balanced").check(force=True)
+    assert page.locator("[data-name=content_weight] input[list]").input_value() == "balanced"
+    page.locator("[data-name=content_weight] input[list]").fill("2.5")
+    assert page.locator(".strengths input:checked").count() == 0
+    page.get_by_role("radio", name="Light").check(force=True)
+    job = started(watched, service)
+    assert len(sent) == 3, "the scene, its cameras and the painting of the page"
+    assert job["parameters"]["content_weight"] == STRENGTHS["light"]
+    assert job["name"] == "scene · style + great_wave"
+    httpx.post(f"{service.url}/v1/jobs/{job['id']}/cancel").raise_for_status()
+    watched.check()
+
+
+def test_each_preset_shows_its_estimated_time(visit: Visit, files: dict[str, Path]) -> None:
+    watched = visit(width=900, height=700)
+    page = watched.page
+    choose(watched, files)
+    set_options(watched, measure=0)
+    page.get_by_role("button", name="Estimate time").click()
+    times = page.locator(".presets .time")
+    for index in range(3):
+        times.nth(index).filter(has_text="about").wait_for()
+    set_options(watched, resolution=48)
+    assert times.all_inner_texts() == ["", "", ""], "they were made for another resolution"
     watched.check()
