@@ -4,12 +4,19 @@ import { h, icon, newId, put } from "./dom.js";
 import { showWrong } from "./options.js";
 import { words } from "./words.js";
 
-const say = words.submit;
+const say = words.submit, hand = words.select;
+
+/** @typedef {import("./select_panel.js").Mask} Mask */
+/** @typedef {{element: HTMLElement, value: () => any, mask: () => Mask | null, setMask: (mask: Mask | null) => void, set: (region: any) => void, setStyles: (names: string[]) => void, wrong: (text: string, field?: string) => void}} Row */
 
 export class RegionList {
-  constructor() {
-    /** @type {{element: HTMLElement, value: () => any, set: (region: any) => void, setStyles: (names: string[]) => void, wrong: (text: string, field?: string) => void}[]} */
+  /** @param {(row: Row) => void} [select] called to select the Gaussians of a region in the 3D view */
+  constructor(select) {
+    this.select = select;
+    /** @type {Row[]} */
     this.rows = [];
+    /** Files of masks, which stay the same while name and mask do. @type {Map<Uint8Array, File>} */
+    this.files = new Map();
     /** @type {string[]} */
     this.styles = [];
     this.list = h("div.regions");
@@ -23,6 +30,7 @@ export class RegionList {
     };
     const name = h("input", { type: "text", placeholder: "face", pattern: "[A-Za-z][A-Za-z0-9_\\-]{0,31}", autocomplete: "off" });
     const select = h("input", { type: "text", placeholder: "sphere=0,1.4,0,0.3", autocomplete: "off" });
+    const weight = h("input", { type: "number", min: 0, step: "any", value: "1" });
     const style = h("select"), freeze = h("input", { type: "checkbox" });
     const setStyles = (/** @type {string[]} */ names) => {
       const before = style.value;
@@ -30,10 +38,25 @@ export class RegionList {
       style.value = names.includes(before) ? before : "";
     };
     setStyles(this.styles);
-    const value = () => ({ name: name.value.trim(), ...(select.value.trim() ? { select: select.value.trim() } : {}), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(freeze.checked ? { freeze: true } : {}) });
-    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field("Name", name), field("Select", select), field(say.style, style), h("label.check", freeze, h("span", "Freeze")));
+    /** @type {Mask | null} */
+    let mask = null;
+    const text = () => (mask ? `mask=${name.value.trim()}.bin` : select.value.trim());
+    const value = () => ({ name: name.value.trim(), ...(text() ? { select: text() } : {}), ...(freeze.checked || weight.value === "1" ? {} : { weight: Number(weight.value) }), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(freeze.checked ? { freeze: true } : {}) });
+    const selectField = field("Select", select), picked = h("span");
+    const pick = h("button.quiet.small", { type: "button", hidden: !this.select, onclick: () => this.select?.(row) });
+    const drop = h("button.quiet.small", { type: "button", onclick: () => setMask(null) }, hand.forget);
+    const handmade = h("div.handmade", picked, pick, drop);
+    const setMask = (/** @type {Mask | null} */ made) => {
+      mask = made;
+      selectField.hidden = !!mask;
+      drop.hidden = !mask;
+      pick.textContent = mask ? hand.change : hand.byHand;
+      picked.textContent = mask ? hand.made(mask.total) : "";
+    };
+    setMask(null);
+    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field("Name", name), selectField, handmade, field(say.style, style), field(hand.weight, weight), h("label.check", freeze, h("span", "Freeze")));
     const error = h("p.wrong", { id: newId(), hidden: true });
-    const inputs = /** @type {Record<string, any>} */ ({ name, select, style, freeze });
+    const inputs = /** @type {Record<string, any>} */ ({ name, select, style, weight, freeze });
     for (const input of Object.values(inputs)) input.setAttribute("aria-describedby", error.id);
     const wrong = (/** @type {string} */ text, field = "select") => {
       for (const input of Object.values(inputs)) showWrong(input, error, "");
@@ -42,8 +65,11 @@ export class RegionList {
     const set = (/** @type {any} */ region) => {
       [name.value, select.value, style.value] = [region.name, region.select ?? "", region.style ?? ""];
       freeze.checked = !!region.freeze;
+      weight.value = String(region.weight ?? 1);
+      setMask(region.mask ?? null);
+      if (mask) select.value = "";
     };
-    const row = { element, value, set, setStyles, wrong };
+    const row = { element, value, mask: () => mask, setMask, set, setStyles, wrong };
     const remove = h("button.tool", { type: "button", "aria-label": say.remove(say.region(this.rows.length + 1)), onclick: () => ((this.rows = this.rows.filter((each) => each !== row)), element.remove()) }, icon("close"));
     element.append(error, remove);
     element.addEventListener("input", () => wrong(""));
@@ -55,6 +81,27 @@ export class RegionList {
   /** Rows that are sent; the others are empty. */
   get sent() {
     return this.rows.filter((row) => row.value().name || row.value().select);
+  }
+
+  /** Return the files of the masks of all sent regions. */
+  masks() {
+    return this.sent.flatMap((row) => {
+      const mask = row.mask(), { name } = row.value();
+      if (!mask) return [];
+      const known = this.files.get(mask.bits), file = known?.name === `${name}.bin` ? known : new File([/** @type {BlobPart} */ (mask.bits)], `${name}.bin`);
+      this.files.set(mask.bits, file);
+      return [file];
+    });
+  }
+
+  /** Remove masks, which belong to another scene. */
+  dropMasks() {
+    for (const row of this.rows) row.setMask(null);
+  }
+
+  /** Return the regions for `restore`. */
+  kept() {
+    return this.rows.map((row) => ({ ...row.value(), mask: row.mask() }));
   }
 
   /** @param {any[]} regions */

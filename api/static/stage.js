@@ -38,6 +38,8 @@ export class Stage {
     this.covered = null;
     /** @type {Viewer | null} */
     this.viewer = null;
+    /** Lines of the selection's box or sphere, as pairs of points. */
+    this.outline = new Float32Array(0);
     this.hasFrames = false;
     this.framesShown = true;
     this.up = [0, -1, 0];
@@ -175,7 +177,7 @@ export class Stage {
     if (!viewer) return;
     const middle = viewer.sides?.left.scene.middle ?? null, length = frameSize(this.cameras, middle);
     const shown = this.hasFrames && this.framesShown ? this.cameras.filter((_, i) => i !== this.stood) : [];
-    viewer.lines = cameraLines(shown, length);
+    viewer.lines = Float32Array.of(...cameraLines(shown, length), ...this.outline);
     viewer.draw();
   }
 

@@ -9,6 +9,7 @@ import { GROUPS, optionControl, plainly } from "./options.js";
 import { costCard } from "./plan.js";
 import { RegionList } from "./regions.js";
 import { accepted } from "./scene_formats.js";
+import { SelectPanel } from "./select_panel.js";
 import { droppedFiles, oneModel, Slot, sorted } from "./slots.js";
 import { Stage } from "./stage.js";
 import { contentOf, StoredFile, storedInputs } from "./stored.js";
@@ -91,7 +92,10 @@ export class SubmitView {
     this.uploads = new Map();
     /** @type {any[]} */
     this.weights = [];
-    this.regions = new RegionList();
+    /** Scene that the masks of the regions belong to. @type {Chosen | undefined} */
+    this.shown = undefined;
+    this.selecting = new SelectPanel(this.stage);
+    this.regions = new RegionList(this.stage.viewer ? (row) => this.selectRegion(row) : undefined);
     this.created = false;
     /** Masks of regions, from an earlier job. @type {Chosen[]} */
     this.masks = [];
@@ -116,6 +120,17 @@ export class SubmitView {
     for (const [role, files] of Object.entries(kept.expired ?? {})) if (files.length) this.slots[/** @type {keyof typeof this.slots} */ (role)].askAgain(files.map(({ name }) => name));
     kept = null;
     this.styleChanged();
+  }
+
+  /** Let the user select the Gaussians of a region. @param {import("./regions.js").Row} row */
+  async selectRegion(row) {
+    const { name, select } = row.value(), stored = this.masks.find((file) => select === `mask=${file.name}` && /\.bin$/i.test(file.name));
+    const before = row.mask() ?? (stored ? { bits: new Uint8Array(await (await contentOf(stored)).arrayBuffer()), total: 0 } : null);
+    const opened = this.selecting.open(name, before, (mask) => {
+      if (mask) row.setMask(mask);
+      /** @type {HTMLElement} */ (row.element.querySelector(".handmade button")).focus();
+    });
+    row.wrong(opened ? "" : words.select.notLoaded);
   }
 
   build() {
@@ -344,6 +359,9 @@ export class SubmitView {
   async sceneChanged() {
     const [file] = this.slots.scene.files;
     this.refresh();
+    this.selecting.close(null);
+    if (file !== this.shown) this.regions.dropMasks();
+    this.shown = file;
     this.opened?.end();
     this.opened = null;
     if (this.invite) this.invite.hidden = !!file;
@@ -516,21 +534,26 @@ export class SubmitView {
     if (busy) put(this.result);
   }
 
+  /** Return the masks of the regions: those selected by hand, and those from an earlier job that a region still names. */
+  maskFiles() {
+    const made = this.regions.masks(), names = made.map(({ name }) => name), selections = this.regions.value().map(({ select }) => String(select ?? ""));
+    const used = (/** @type {string} */ name) => selections.some((select) => select === `mask=${name}` || (select.startsWith("masks=") && name.startsWith(select.slice(6))));
+    return [...made, ...this.masks.filter(({ name }) => used(name) && !names.includes(name))];
+  }
+
   /** Upload the files that the service lacks, and return the body of `POST /v1/jobs`. */
   async send() {
-    const { scene, style, cameras, photos } = this.slots, files = this.orbiting ? [] : [cameras.files, photos.files];
-    const all = /** @type {File[]} */ ([scene.files, style.files, ...files].flat().filter((file) => !(file instanceof StoredFile)));
+    const { scene, style, cameras, photos } = this.slots, files = this.orbiting ? [] : [cameras.files, photos.files], masks = this.maskFiles();
+    const all = /** @type {File[]} */ ([scene.files, style.files, ...files, masks].flat().filter((file) => !(file instanceof StoredFile)));
     for (const file of all) if (!this.uploads.has(file)) this.uploads.set(file, new Upload(file, () => this.showSending(all)));
     this.showSending(all);
     this.sending = all.map((file) => /** @type {Upload} */ (this.uploads.get(file)));
     for (const upload of this.sending) upload.over = false;
     const ids = await sendAll(this.sending), idOf = new Map(all.map((file, i) => [/** @type {Chosen} */ (file), ids[i]]));
-    const selections = this.regions.value().map(({ select }) => String(select ?? ""));
     const named = (/** @type {Chosen[]} */ chosen) => chosen.map((file) => (file instanceof StoredFile ? file.path : idOf.get(file)));
     return {
       scene: named(scene.files)[0], style: named(style.files), cameras: this.orbiting ? [] : named(cameras.files),
-      photos: this.orbiting ? [] : named(photos.files), parameters: this.parameters(),
-      mask: named(this.masks.filter(({ name }) => selections.some((select) => select === `mask=${name}` || (select.startsWith("masks=") && name.startsWith(select.slice(6)))))),
+      photos: this.orbiting ? [] : named(photos.files), mask: named(masks), parameters: this.parameters(),
     };
   }
 
@@ -682,10 +705,11 @@ export class SubmitView {
   end() {
     if (!this.created) {
       const files = { ...Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, slot.files])), mask: this.masks };
-      kept = { files, weights: this.weights.map((input) => input.value), regions: this.regions.value(), apart: this.apart?.input.checked };
+      kept = { files, weights: this.weights.map((input) => input.value), regions: this.regions.kept(), apart: this.apart?.input.checked };
     }
     this.leaving.abort();
     this.timing?.abort();
+    this.selecting.end();
     for (const upload of this.uploads.values()) upload.stop();
     for (const slot of Object.values(this.slots)) slot.end();
     this.stage.end();

@@ -107,6 +107,16 @@ export const words = {
     expired: (/** @type {string[]} */ names) => `No longer on the service: ${names.slice(0, 3).join(", ")}${names.length > 3 ? "…" : ""}. Choose it again.`,
     stop: "Stop", created: (/** @type {string} */ name) => `Job “${name}” was created.`, refused: "Couldn't start the job.", unit: (/** @type {string} */ unit) => unit, unset: (/** @type {string} */ text) => text, on: "on", off: "off", byDefault: (/** @type {string} */ text) => `${text} (default)`,
   },
+  select: {
+    name: "Selection", of: (/** @type {string} */ name) => (name ? `Select “${name}”` : "Select a region"), byHand: "Select in the 3D view", change: "Change the selection", forget: "Remove the selection",
+    selected: (/** @type {number} */ n, /** @type {number} */ all) => `${count(n)} of ${several(all, "Gaussian")} selected`, made: (/** @type {number} */ n) => `${several(n, "Gaussian")} selected by hand`,
+    notLoaded: "Choose a scene first, and wait until it is shown.", weight: "Weight",
+    tool: "Tool", tools: { move: "Move", brush: "Brush", lasso: "Lasso", box: "Box", sphere: "Sphere", similar: "Similar" }, mode: "Mode", modes: { add: "Add", subtract: "Subtract" },
+    toolHelp: { move: "Drag to move the camera.", brush: "Paint over the scene. Hold Alt to do the opposite; drag with the right button to move the camera.", lasso: "Draw around a part of the scene.", box: "Drag the handles or enter numbers, then apply.", sphere: "Drag the handles or enter numbers, then apply.", similar: "Click a color; then change the tolerance." },
+    radius: "Brush size", tolerance: "Tolerance", through: "Select through", connected: "Connected only", atMiddle: "Pick at the middle", apply: "Apply",
+    moveShape: "Move", resize: (/** @type {string} */ axis, /** @type {number} */ sign) => `Resize ${sign > 0 ? "+" : "−"}${axis}`, center: ["X", "Y", "Z"], sizes: ["Half width", "Half height", "Half depth"], sphereRadius: "Radius",
+    undo: "Undo", redo: "Redo", invert: "Invert", grow: "Grow", clear: "Clear", cancel: "Cancel", done: "Use selection",
+  },
   refusals: {
     notNumber: "Must be a number.", notWhole: "Must be a whole number.",
     noLess: (/** @type {number} */ n) => `Must be at least ${count(n)}.`, noMore: (/** @type {number} */ n) => `Must be at most ${count(n)}.`,

@@ -4,17 +4,23 @@ import { ByteReader, SceneError } from "./byte_reader.js";
 import { depthOrder } from "./depth_order.js";
 import { pack } from "./packing.js";
 import { openScene } from "./scene_file.js";
+import { rgbOf, Selector } from "./selector.js";
 import { words } from "../words.js";
 
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
 const port = /** @type {any} */ (self);
-let centers = new Float32Array(0), reach = new Float32Array(0), count = 0, degree = 0;
+let centers = new Float32Array(0), reach = new Float32Array(0), colors = new Uint8ClampedArray(0), count = 0, degree = 0;
+/** @type {Selector | undefined} */
+let selector;
 
 port.onmessage = async (/** @type {MessageEvent} */ { data }) => {
   if (data.kind === "sort") {
     const order = depthOrder(centers, reach, count, data.pose);
     port.postMessage({ kind: "order", order, number: data.number, of: count }, [order.buffer]);
+  } else if (data.kind === "select") {
+    selector ??= new Selector(centers, reach, colors, middle().radius);
+    port.postMessage({ kind: "selected", ...selector.answer(data) });
   } else if (data.kind === "load") {
     try {
       await load(data.source, data.room);
@@ -35,6 +41,7 @@ async function load(source, room) {
   degree = keptDegree(file, room);
   centers = new Float32Array(file.count * 3);
   reach = new Float32Array(file.count);
+  colors = new Uint8ClampedArray(file.count * 3);
   port.postMessage({ kind: "header", header: { count: file.count, degree: file.degree, size, rendering: file.rendering }, degree });
   for await (const rows of file.batches()) give(rows, file);
   reader.end();
@@ -77,12 +84,13 @@ function give(rows, file) {
   const packed = pack(rows, file.width, file.at, file.degree, degree);
   centers.set(packed.centers, count * 3);
   reach.set(packed.reach, count);
+  colors.set(rgbOf(rows, file.width, file.at), count * 3);
   const begin = count;
   count += packed.reach.length;
-  const { geometry, colors, harmonics } = packed;
+  const { geometry, harmonics } = packed;
   const first = begin === 0 ? middle() : undefined;
-  port.postMessage({ kind: "batch", begin, count: count - begin, geometry, colors, harmonics, middle: first },
-    [geometry.buffer, colors.buffer, harmonics.buffer]);
+  port.postMessage({ kind: "batch", begin, count: count - begin, geometry, colors: packed.colors, harmonics, middle: first },
+    [geometry.buffer, packed.colors.buffer, harmonics.buffer]);
 }
 
 /**

@@ -52,9 +52,12 @@ uniform vec3 eye;
 uniform vec2 focal, size, fade;
 uniform float near, eps2d;
 uniform bool antialiased;
+uniform usampler2D marks;   // 1 for Gaussians to highlight
+uniform float highlight;    // 0 to highlight none
 out vec3 leftColor, rightColor;
 out vec2 at;
-flat out float opacity;
+flat out float opacity, marked;
+flat out uint who;
 ivec2 place(int texel) { return ivec2(texel & ${(1 << bits) - 1}, texel >> ${bits}); }
 vec2 fractions(uint both) { return max(vec2(ivec2(int(both << 16) >> 16, int(both) >> 16)) / 32767., -1.); }
 ${directional(degree)}
@@ -68,6 +71,8 @@ vec3 blended(sampler2D first, sampler2D second, sampler2D third, vec3 weights, i
 void main() {
   gl_Position = vec4(2, 2, 2, 1);
   int i = int(index);
+  who = index;
+  marked = highlight > 0. ? highlight * float(texelFetch(marks, place(i), 0).r) : 0.;
   uvec4 g = texelFetch(geometry, place(2 * i), 0), h = texelFetch(geometry, place(2 * i + 1), 0);
   vec3 away = uintBitsToFloat(g.xyz) - eye, center = away * axes;
   opacity = float(g.w & 0xffffu) / 65535.;
@@ -104,13 +109,13 @@ export const splatFragment = `#version 300 es
 precision highp float;
 in vec3 leftColor, rightColor;
 in vec2 at;
-flat in float opacity;
+flat in float opacity, marked;
 uniform float cut;          // pixels; what is left of it has the left colors
 out vec4 color;
 void main() {
   float alpha = min(opacity * exp(-0.5 * dot(at, at)), 0.99);
   if (alpha < 1. / 255.) discard;
-  color = vec4((gl_FragCoord.x < cut ? leftColor : rightColor) * alpha, alpha);
+  color = vec4(mix(gl_FragCoord.x < cut ? leftColor : rightColor, vec3(0.1, 0.9, 1), marked) * alpha, alpha);
 }`;
 
 /** Triangle that covers the whole canvas. */

@@ -33,6 +33,10 @@ export class SplatScene {
     this.drawn = 0;
     /** @type {Map<string, WebGLTexture>} */
     this.colors = new Map();
+    /** Flags of Gaussians to highlight; null for none. @type {WebGLTexture | null} */
+    this.marks = null;
+    /** Called with the worker's answers to changes of the selection. @type {((changed: import("./selection.js").Changed) => void) | undefined} */
+    this.onSelected = undefined;
     this.order = gl.createBuffer();
     this.room = 0;
     this.busy = false;
@@ -56,6 +60,7 @@ export class SplatScene {
     if (told.kind === "header") this.allocate(told.header, told.degree);
     else if (told.kind === "batch") this.take(told);
     else if (told.kind === "order") this.takeOrder(told);
+    else if (told.kind === "selected") this.onSelected?.(told);
     else if (told.kind === "done") {
       this.whole = true;
       this.middle = told.middle;
@@ -113,7 +118,7 @@ export class SplatScene {
    *
    * @param {WebGLTexture | null | undefined} texture
    * @param {number} begin first texel, at the start of a row
-   * @param {Uint32Array | Uint16Array} data
+   * @param {Uint32Array | Uint16Array | Uint8Array} data
    * @param {number} form
    * @param {number} type
    * @param {number} parts values of a texel
@@ -186,14 +191,14 @@ export class SplatScene {
   /** Bytes of the scene's textures and its order. */
   get bytes() {
     const count = this.header?.count ?? 0;
-    return count * (32 + 16 * (this.texels ?? 0) + 6 * this.colors.size) + this.room * 4;
+    return count * (32 + 16 * (this.texels ?? 0) + 6 * this.colors.size + Number(!!this.marks)) + this.room * 4;
   }
 
   /** Free all resources. */
   end() {
     this.worker.terminate();
     const { gl } = this;
-    for (const texture of new Set([this.geometry, this.harmonics, ...this.colors.values()])) gl.deleteTexture(texture ?? null);
+    for (const texture of new Set([this.geometry, this.harmonics, this.marks, ...this.colors.values()])) gl.deleteTexture(texture ?? null);
     gl.deleteBuffer(this.order);
   }
 }

@@ -14,6 +14,8 @@ import { words } from "../words.js";
 const SLOW = 70, VERY_SLOW = 350;
 /** Milliseconds without movement after which the full resolution is drawn. */
 const STILL = 160;
+/** Fraction of the highlight's color in highlighted Gaussians, and texture unit of the marks. */
+const HIGHLIGHT = 0.6, MARKS_UNIT = 10;
 /** Color of lines, and their opacity. */
 const INK = [0.98, 0.6, 0.28, 0.55];
 
@@ -310,6 +312,7 @@ export class Viewer {
     this.splatPrograms.set(key, { program, at });
     gl.useProgram(program);
     this.setView(at, width, height);
+    this.setMarks(at, scene);
     gl.uniform2f(at("fade"), 1 - (left.fade ?? 0), 1 - (right.fade ?? 0));
     gl.uniform1f(at("cut"), cut);
     const { antialiased, eps2d } = scene.header?.rendering ?? CLASSIC;
@@ -327,6 +330,26 @@ export class Viewer {
       gl.uniform1i(at(name), unit);
     });
     gl.activeTexture(gl.TEXTURE0 + textures.length);
+    this.drawInstances(scene);
+  }
+
+  /**
+   * Set the Gaussians to highlight.
+   *
+   * @param {(name: string) => WebGLUniformLocation | null} at
+   * @param {SplatScene} scene
+   */
+  setMarks(at, scene) {
+    const { gl } = this;
+    gl.uniform1f(at("highlight"), scene.marks ? HIGHLIGHT : 0);
+    gl.activeTexture(gl.TEXTURE0 + MARKS_UNIT);
+    gl.bindTexture(gl.TEXTURE_2D, scene.marks ?? scene.geometry ?? null);
+    gl.uniform1i(at("marks"), MARKS_UNIT);
+  }
+
+  /** Draw each Gaussian of a scene's order as two triangles, with the current program. @param {SplatScene} scene */
+  drawInstances(scene) {
+    const { gl } = this;
     gl.bindBuffer(gl.ARRAY_BUFFER, this.corners ?? null);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);

@@ -1,0 +1,339 @@
+// @ts-check
+/** Tools to select Gaussians in the 3D view: brush, lasso, box, sphere and similar colors. */
+import { h, newId, put } from "./dom.js";
+import { outline, ShapeHandles } from "./shapes.js";
+import { Selection } from "./viewer/selection.js";
+import { words } from "./words.js";
+
+/** @typedef {import("./stage.js").Stage} Stage */
+/** @typedef {import("./viewer/selection.js").Changed} Changed */
+/** @typedef {{bits: Uint8Array, total: number}} Mask `bits`: one for each Gaussian, the lowest bit first; `total`: number of selected ones */
+/** @typedef {"move" | "brush" | "lasso" | "box" | "sphere" | "similar"} Tool */
+
+const say = words.select;
+
+export class SelectPanel {
+  /** @param {Stage} stage */
+  constructor(stage) {
+    this.stage = stage;
+    /** @type {Tool} */
+    this.tool = "move";
+    /** @type {"add" | "subtract"} */
+    this.mode = "add";
+    /** @type {Selection | null} */
+    this.selection = null;
+    /** Points of the current stroke or lasso, in CSS pixels of the canvas. @type {number[]} */
+    this.drawn = [];
+    this.change = 0;
+    this.erasing = false;
+    /** Points of a stroke to send at the next frame, and its request. @type {number[]} */
+    this.waiting = [];
+    this.requested = 0;
+    /** Pixel of the color that was picked, until something else changes the selection. @type {number[] | undefined} */
+    this.seed = undefined;
+    /** Whether a request for similar colors is running, whether another one follows, and whether the last one changed something. */
+    this.asking = this.again = this.changes = false;
+    /** @type {import("./shapes.js").Shape | null} */
+    this.shape = null;
+    /** @type {HTMLInputElement[]} */
+    this.inputs = [];
+    /** @type {((mask: Mask | null) => void) | null} */
+    this.finish = null;
+    /** Controls of the panel. @type {any} */
+    this.parts = {};
+    this.surface = h("canvas.surface", { hidden: true, "aria-hidden": "true" });
+    this.handleLayer = h("div.handles");
+    this.counted = h("output");
+    this.build();
+    if (stage.viewer) this.handles = new ShapeHandles(stage.viewer, this.handleLayer, () => this.shapeChanged());
+    stage.frame.append(this.surface, this.handleLayer);
+    stage.element.append(this.element);
+    this.listen();
+  }
+
+  build() {
+    const button = (/** @type {string} */ name, /** @type {() => void} */ onclick, kind = "quiet") => h(`button.${kind}.small`, { type: "button", onclick }, name);
+    const radios = (/** @type {string} */ legend, /** @type {Record<string, string>} */ names, /** @type {(value: any) => void} */ changed) => {
+      const group = newId();
+      return h("fieldset.segments", h("legend.away", legend), Object.entries(names).map(([value, name], i) => h("label", h("input", { type: "radio", name: group, value, checked: i === 0, onchange: () => changed(value) }), h("span", name))));
+    };
+    const range = (/** @type {string} */ name, /** @type {any} */ properties) => {
+      const input = h("input", { type: "range", id: newId(), ...properties });
+      return { input, element: h("div.range", h("label", { htmlFor: input.id }, name), input) };
+    };
+    const check = (/** @type {string} */ name, checked = false) => {
+      const input = h("input", { type: "checkbox", checked });
+      return { input, element: h("label.check", input, h("span", name)) };
+    };
+    this.parts.title = h("h2");
+    this.parts.radius = range(say.radius, { min: 2, max: 150, value: 24 });
+    this.parts.tolerance = range(say.tolerance, { min: 0, max: 100, value: 12, oninput: () => this.similarAgain() });
+    this.parts.through = check(say.through);
+    this.parts.connected = check(say.connected, true);
+    this.parts.connected.input.addEventListener("change", () => this.similarAgain());
+    this.parts.numbers = h("div.numbers");
+    this.parts.toolHelp = h("p.help");
+    this.parts.middle = button(say.atMiddle, () => this.similarAtMiddle());
+    this.parts.apply = button(say.apply, () => this.applyShape());
+    this.parts.undo = button(say.undo, () => this.ask("undo"));
+    this.parts.redo = button(say.redo, () => this.ask("redo"));
+    this.parts.toolRadios = radios(say.tool, say.tools, (tool) => this.choose(tool));
+    put(this.element = h("section.selecting", { hidden: true }), h("div.row", this.parts.title, this.counted),
+      h("div.row", this.parts.toolRadios, radios(say.mode, say.modes, (mode) => (this.mode = mode))), this.parts.toolHelp,
+      h("div.row", this.parts.radius.element, this.parts.through.element, this.parts.tolerance.element, this.parts.connected.element, this.parts.middle, this.parts.numbers, this.parts.apply),
+      h("div.row", this.parts.undo, this.parts.redo, button(say.invert, () => this.ask("invert")), button(say.grow, () => this.ask("grow")), button(say.clear, () => this.ask("clear")),
+        h("span.spring"), button(say.cancel, () => this.close(null)), button(say.done, () => this.done(), "primary")));
+    this.element.setAttribute("aria-label", say.name);
+    this.choose("move");
+  }
+
+  listen() {
+    const { surface, stage } = this;
+    surface.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => this.down(event));
+    surface.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => this.move(event));
+    surface.addEventListener("pointerup", () => this.up());
+    surface.addEventListener("pointercancel", () => this.up());
+    surface.addEventListener("pointerleave", () => !this.drawn.length && this.paint());
+    surface.addEventListener("contextmenu", (/** @type {Event} */ event) => event.preventDefault());
+    surface.addEventListener("wheel", (/** @type {WheelEvent} */ event) => (event.preventDefault(), stage.controls?.wheel(event)), { passive: false });
+    stage.element.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => this.key(event));
+  }
+
+  /**
+   * Let the user change a selection.
+   *
+   * @param {string} name name of the region
+   * @param {Mask | null} mask selection to start from
+   * @param {(mask: Mask | null) => void} finish receives the selection, or null if it was canceled
+   */
+  open(name, mask, finish) {
+    const { viewer } = this.stage, scene = viewer?.sides?.left.scene;
+    if (!viewer || !scene?.whole) return false;
+    this.close(null);
+    this.finish = finish;
+    this.scene = scene;
+    this.selection = new Selection(viewer, scene, (changed) => this.changed(changed));
+    this.selection.ask("load", { bits: mask?.bits ?? new Uint8Array(Math.ceil((scene.header?.count ?? 0) / 8)) });
+    put(this.parts.title, say.of(name));
+    this.element.hidden = false;
+    this.choose("brush");
+    this.element.scrollIntoView({ block: "nearest" });
+    /** @type {HTMLInputElement} */ (this.parts.toolRadios.querySelector("input:checked")).focus();
+    this.follow();
+    return true;
+  }
+
+  async done() {
+    const { selection } = this;
+    if (!selection) return;
+    const { bits, total } = await selection.ask("bits");
+    if (selection === this.selection && bits) this.close({ bits, total });
+  }
+
+  /** @param {Mask | null} mask */
+  close(mask) {
+    if (!this.selection) return;
+    const { finish } = this;
+    this.choose("move");
+    this.selection.end();
+    this.selection = null;
+    this.finish = null;
+    this.element.hidden = true;
+    finish?.(mask);
+  }
+
+  /** @param {Tool} tool */
+  choose(tool) {
+    this.tool = tool;
+    const input = this.parts.toolRadios.querySelector(`[value=${tool}]`);
+    if (input) input.checked = true;
+    const shaped = tool === "box" || tool === "sphere", drawing = tool === "brush" || tool === "lasso";
+    this.parts.toolHelp.textContent = say.toolHelp[tool];
+    this.surface.hidden = !(drawing || tool === "similar");
+    this.parts.radius.element.hidden = tool !== "brush";
+    this.parts.through.element.hidden = !drawing;
+    for (const part of [this.parts.tolerance.element, this.parts.connected.element, this.parts.middle]) part.hidden = tool !== "similar";
+    for (const part of [this.parts.numbers, this.parts.apply]) part.hidden = !shaped;
+    this.seed = undefined;
+    this.showShape(shaped ? /** @type {"box" | "sphere"} */ (tool) : null);
+    this.paint();
+  }
+
+  /** @param {Changed} changed */
+  changed({ total, past, future }) {
+    if (!this.selection) return;
+    this.counted.textContent = say.selected(total, this.selection.count);
+    this.parts.undo.disabled = !past;
+    this.parts.redo.disabled = !future;
+    this.stage.viewer?.draw();
+  }
+
+  /** @param {string} op @param {Record<string, any>} [values] */
+  ask(op, values) {
+    this.seed = op === "similar" ? this.seed : undefined;
+    return this.selection?.ask(op, values);
+  }
+
+  /** @param {PointerEvent} event */
+  down(event) {
+    const { stage, surface } = this;
+    if (!this.selection) return;
+    if (event.button !== 0 || !event.isPrimary) return void stage.controls?.down(event);
+    surface.setPointerCapture(event.pointerId);
+    this.selection.look();
+    this.change++;
+    this.erasing = event.altKey;
+    this.drawn = this.pointOf(event);
+    if (this.tool === "similar") this.pick(this.drawn);
+    else this.draw(this.drawn);
+  }
+
+  /** @param {PointerEvent} event */
+  move(event) {
+    const point = this.pointOf(event);
+    if (this.drawn.length && this.tool !== "similar") {
+      const last = this.drawn.slice(-2);
+      this.drawn.push(...point);
+      this.draw([...last, ...point]);
+    }
+    this.paint(point);
+  }
+
+  up() {
+    if (this.tool === "lasso" && this.drawn.length >= 6) this.ask("lasso", { points: this.inView(this.drawn), ...this.how });
+    this.drawn = [];
+    this.paint();
+  }
+
+  /** Apply the brush to a part of a stroke; parts that arrive before the next frame are sent together. @param {number[]} points */
+  draw(points) {
+    if (this.tool !== "brush") return;
+    this.waiting.push(...points);
+    this.requested ||= requestAnimationFrame(() => {
+      if (!this.selection) return;
+      const radius = (Number(this.parts.radius.input.value) * this.selection.size[0]) / this.stage.canvas.clientWidth;
+      this.ask("stroke", { points: this.inView(this.waiting), radius, change: this.change, ...this.how });
+      [this.waiting, this.requested] = [[], 0];
+    });
+  }
+
+  /** @param {PointerEvent} event */
+  pointOf(event) {
+    const { left, top } = this.surface.getBoundingClientRect();
+    return [event.clientX - left, event.clientY - top];
+  }
+
+  /** @param {number[]} points */
+  inView(points) {
+    const found = [];
+    for (let k = 0; k < points.length; k += 2) found.push(.../** @type {Selection} */ (this.selection).point(points[k], points[k + 1]));
+    return found;
+  }
+
+  get how() {
+    const subtracts = (this.mode === "subtract") !== !!this.erasing;
+    return { mode: subtracts ? "subtract" : "add", through: this.parts.through.input.checked };
+  }
+
+  /** @param {number[]} at */
+  pick(at) {
+    this.seed = this.inView(at);
+    this.similar(false);
+  }
+
+  similarAtMiddle() {
+    const { clientWidth, clientHeight } = this.stage.canvas;
+    this.selection?.look();
+    this.erasing = false;
+    this.pick([clientWidth / 2, clientHeight / 2]);
+  }
+
+  similarAgain() {
+    if (this.seed) this.similar(true);
+  }
+
+  /** @param {boolean} replaces whether to replace the last change, which had another tolerance */
+  async similar(replaces) {
+    if (this.asking) return void (this.again = replaces);
+    this.asking = true;
+    const changed = await this.ask("similar", { point: this.seed, tolerance: Number(this.parts.tolerance.input.value) / 100, connected: this.parts.connected.input.checked, replaces: replaces && this.changes, ...this.how });
+    this.asking = false;
+    this.changes = !!changed?.flags.length || (replaces && this.changes);
+    if (this.again && this.seed) {
+      this.again = false;
+      this.similar(true);
+    }
+  }
+
+  /** @param {"box" | "sphere" | null} kind */
+  showShape(kind) {
+    const middle = this.scene?.middle;
+    this.shape = kind && middle ? { kind, center: [...middle.center], sizes: kind === "box" ? middle.high.map((high, axis) => Math.max((high - middle.low[axis]) / 4, 1e-6)) : Array(3).fill(middle.radius / 2) } : null;
+    this.handles?.show(this.shape);
+    const names = this.shape ? [...say.center, ...(kind === "box" ? say.sizes : [say.sphereRadius])] : [];
+    this.inputs = names.map((name) => h("input", { type: "number", step: "any", "aria-label": name, title: name, oninput: () => this.numbersChanged() }));
+    put(this.parts.numbers, this.inputs.map((input, i) => h("label", h("span", names[i]), input)));
+    this.shapeChanged();
+  }
+
+  shapeChanged() {
+    const { shape, stage } = this;
+    if (shape) [...shape.center, ...shape.sizes].slice(0, this.inputs.length).forEach((value, i) => (this.inputs[i].value = String(Number(value.toPrecision(5)))));
+    stage.outline = shape ? outline(shape) : new Float32Array(0);
+    stage.drawFrames();
+  }
+
+  numbersChanged() {
+    const values = this.inputs.map((input) => Number(input.value)), { shape } = this;
+    if (!shape || values.some((value) => !Number.isFinite(value)) || values.slice(3).some((value) => value <= 0)) return;
+    Object.assign(shape, { center: values.slice(0, 3), sizes: shape.kind === "box" ? values.slice(3) : Array(3).fill(values[3]) });
+    this.handles?.place();
+    this.stage.outline = outline(shape);
+    this.stage.drawFrames();
+  }
+
+  applyShape() {
+    const { shape, mode } = this;
+    if (!shape) return;
+    const { center, sizes } = shape;
+    if (shape.kind === "sphere") this.ask("sphere", { center, radius: sizes[0], mode });
+    else this.ask("box", { low: center.map((value, axis) => value - sizes[axis]), high: center.map((value, axis) => value + sizes[axis]), mode });
+  }
+
+  /** Draw the brush at a point, or the lasso. @param {number[]} [point] */
+  paint(point) {
+    const { surface, drawn } = this, ratio = window.devicePixelRatio || 1, context = surface.getContext("2d");
+    [surface.width, surface.height] = [surface.clientWidth * ratio, surface.clientHeight * ratio];
+    if (!context) return;
+    context.scale(ratio, ratio);
+    context.lineWidth = 1.5;
+    for (const [style, wide] of [["rgb(0 0 0 / 60%)", 3.5], ["#fff", 1.5]]) {
+      [context.strokeStyle, context.lineWidth] = [style, Number(wide)];
+      context.beginPath();
+      if (this.tool === "brush" && point) context.arc(point[0], point[1], Number(this.parts.radius.input.value), 0, 2 * Math.PI);
+      if (this.tool === "lasso") for (let k = 0; k < drawn.length; k += 2) context.lineTo(drawn[k], drawn[k + 1]);
+      if (this.tool === "lasso") context.closePath();
+      context.stroke();
+    }
+  }
+
+  /** @param {KeyboardEvent} event */
+  key(event) {
+    if (!this.selection || !(event.ctrlKey || event.metaKey)) return;
+    const key = event.key.toLowerCase(), redo = key === "y" || (key === "z" && event.shiftKey);
+    if (!redo && key !== "z") return;
+    event.preventDefault();
+    this.ask(redo ? "redo" : "undo");
+  }
+
+  /** Keep the handles where the camera shows the shape. */
+  follow() {
+    if (!this.selection || this.stage.viewer?.ended) return;
+    if (this.shape) this.handles?.place();
+    requestAnimationFrame(() => this.follow());
+  }
+
+  end() {
+    this.selection = null;
+  }
+}

@@ -1,0 +1,107 @@
+// @ts-check
+/**
+ * Image of the Gaussians that a view shows: each pixel holds one of them, drawn with its blend weight as probability.
+ *
+ * A fragment is kept with the probability of its alpha, and nearer ones are drawn over farther ones. The one that stays
+ * is therefore Gaussian i with probability alpha_i times the product of (1 - alpha) of all nearer ones, its weight.
+ */
+import { CLASSIC } from "./render_tag.js";
+import { splatVertex } from "./shaders.js";
+
+/** @typedef {import("./viewer.js").Viewer} Viewer */
+/** @typedef {import("./viewer.js").Program} Program */
+
+/** Longer side of the image in pixels. */
+const LONGER = 768;
+
+const pickFragment = `#version 300 es
+precision highp float; precision highp int;
+in vec2 at;
+flat in float opacity;
+flat in uint who;
+out uint found;
+float random(uvec3 v) { // three rounds of a permuted congruential generator
+  v = v * 1664525u + 1013904223u;
+  v.x += v.y * v.z; v.y += v.z * v.x; v.z += v.x * v.y;
+  v ^= v >> 16u;
+  v.x += v.y * v.z; v.y += v.z * v.x; v.z += v.x * v.y;
+  return float(v.x >> 8u) / 16777216.;
+}
+void main() {
+  float alpha = min(opacity * exp(-0.5 * dot(at, at)), 0.99);
+  if (alpha < 1. / 255. || alpha <= random(uvec3(gl_FragCoord.xy, who))) discard;
+  found = who + 1u;
+}`;
+
+export class PickPass {
+  /** @param {Viewer} viewer */
+  constructor(viewer) {
+    this.viewer = viewer;
+    /** @type {Map<number, Program>} */
+    this.programs = new Map();
+  }
+
+  /**
+   * Draw the scene on the left side as the viewer's camera sees it.
+   *
+   * @returns {import("./selector.js").PickedView | null} null if there is none
+   */
+  draw() {
+    const { viewer } = this, { gl, camera } = viewer, scene = viewer.sides?.left.scene;
+    if (!scene?.drawn || !scene.geometry) return null;
+    const [w, h] = viewer.size(), scale = Math.min(1, LONGER / Math.max(w, h));
+    const width = Math.max(1, Math.round(w * scale)), height = Math.max(1, Math.round(h * scale));
+    const target = gl.createTexture(), frame = gl.createFramebuffer();
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, target);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
+    gl.viewport(0, 0, width, height);
+    gl.disable(gl.BLEND);
+    gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
+    this.drawScene(scene, width, height);
+    const pixels = new Uint32Array(width * height * 4), ids = new Uint32Array(width * height);
+    gl.readPixels(0, 0, width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, pixels);
+    for (let i = 0; i < ids.length; i++) ids[i] = pixels[4 * i];
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.deleteFramebuffer(frame);
+    gl.deleteTexture(target);
+    const { axes, eye, near } = camera;
+    return { axes, eye, near, focal: camera.pixels(width, height), ids, width, height };
+  }
+
+  /**
+   * @param {import("./splat_scene.js").SplatScene} scene
+   * @param {number} width
+   * @param {number} height
+   */
+  drawScene(scene, width, height) {
+    const { viewer } = this, { gl } = viewer;
+    const { program, at } = this.programs.get(scene.bits) ?? viewer.program(splatVertex(0, scene.bits), pickFragment);
+    this.programs.set(scene.bits, { program, at });
+    gl.useProgram(program);
+    viewer.setView(at, width, height);
+    const { antialiased, eps2d } = scene.header?.rendering ?? CLASSIC;
+    gl.uniform1f(at("eps2d"), eps2d);
+    gl.uniform1i(at("antialiased"), Number(antialiased));
+    gl.bindTexture(gl.TEXTURE_2D, scene.geometry ?? null);
+    gl.uniform1i(at("geometry"), 0);
+    this.separateSamplers(program, at);
+    viewer.drawInstances(scene);
+  }
+
+  /**
+   * Bind samplers of colors to another unit than those of integers, in case the driver retains unused ones.
+   *
+   * @param {WebGLProgram} program
+   * @param {(name: string) => WebGLUniformLocation | null} at
+   */
+  separateSamplers(program, at) {
+    const { gl } = this.viewer;
+    for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); i++) {
+      const { name, type } = gl.getActiveUniform(program, i) ?? {};
+      if (name && type === gl.SAMPLER_2D) gl.uniform1i(at(name), 1);
+    }
+  }
+}

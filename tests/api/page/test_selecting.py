@@ -1,0 +1,365 @@
+"""Tests of selecting Gaussians in the 3D view: the selections, what the tools take, and a whole job with the mask."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.scene.gaussians import Scene
+from tests.api.page.actions import STEPS, choose, set_options
+from tests.api.page.browser import Watched
+from tests.api.page.test_viewer import base_of
+from tests.api.service import Service
+from tests.small_scenes import cameras, wall, write_files
+
+pytestmark = pytest.mark.slow
+Visit = Callable[..., Watched]
+
+#: Script that makes changes to a selection of the given Gaussians, and returns the flags after each.
+_SELECTOR = """async ([base, centers, colors, view, changes]) => {
+  const { Selector } = await import(`${base}/viewer/selector.js`);
+  const count = colors.length / 3, reach = new Float32Array(count).fill(0.01);
+  const selector = new Selector(Float32Array.from(centers), reach, Uint8ClampedArray.from(colors), 1);
+  selector.answer({ op: "view", ...view, ids: new Uint32Array(view.width * view.height) });
+  return changes.map((change) => {
+    const { total } = selector.answer(change);
+    return [total, [...selector.flags], [...selector.bits()]];
+  });
+}"""
+WIDTH, HEIGHT, FOCAL = 80, 60, 70.0
+
+
+def front(count: int, *, seed: int = 4) -> NDArray[np.float32]:
+    """Return random centers [n, 3] before a camera at the origin that looks along z."""
+    generator = np.random.default_rng(seed)
+    return generator.uniform([-1, -1, 1.5], [1, 1, 3.5], (count, 3)).astype(np.float32)
+
+
+def flags(watched: Watched, centers: NDArray[np.float32], *changes: dict[str, Any]) -> list[NDArray[np.bool_]]:
+    """Return the flags after each change; totals and bits must be those of the flags."""
+    colors = (centers[:, :1] * 100 + 100).clip(0, 255).astype(np.uint8).repeat(3, axis=1)
+    view = {"axes": np.eye(3).tolist(), "eye": [0, 0, 0], "focal": [FOCAL, FOCAL], "near": 0.2}
+    given = [
+        base_of(watched),
+        centers.ravel().tolist(),
+        colors.ravel().tolist(),
+        {**view, "width": WIDTH, "height": HEIGHT},
+    ]
+    found = []
+    for total, values, bits in watched.page.evaluate(_SELECTOR, [*given, list(changes)]):
+        found.append(np.array(values, bool))
+        assert total == sum(values)
+        assert bits == np.packbits(found[-1], bitorder="little").tolist()
+    return found
+
+
+def projected(centers: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the positions of centers in the view [n, 2] in float64."""
+    return centers[:, :2].astype(float) * FOCAL / centers[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+
+
+@pytest.fixture(scope="module")
+def watched(browser: Any, service: Service) -> Any:
+    page = Watched(browser, service.url)
+    page.page.goto(f"{service.url}/#/jobs")
+    yield page
+    page.check()
+    page.context.close()
+
+
+def test_shapes_select_as_the_command_line_does(watched: Watched) -> None:
+    centers = front(3000)
+    low, high = [-0.5, -0.6, 1.8], [0.4, 0.7, 2.9]
+    box = {"op": "box", "low": low, "high": high}
+    ball = {"op": "sphere", "center": [0.1, 0.2, 2.4], "radius": 0.6}
+    added, removed = flags(watched, centers, {**box, "mode": "add"}, {**ball, "mode": "subtract"})
+    inside = ((centers >= np.array(low, np.float32)) & (centers <= np.array(high, np.float32))).all(axis=1)
+    near = ((centers.astype(float) - ball["center"]) ** 2).sum(axis=1) <= 0.36
+    assert 100 < inside.sum() < 2000
+    assert added.tolist() == inside.tolist()
+    assert removed.tolist() == (inside & ~near).tolist()
+
+
+def test_strokes_and_lassos_take_centers_inside(watched: Watched) -> None:
+    centers = front(3000)
+    points, radius = [20.0, 20.0, 50.0, 25.0, 50.0, 45.0], 6.0
+    corners = [10.0, 10.0, 70.0, 12.0, 40.0, 55.0]
+    stroke = {"op": "stroke", "points": points, "radius": radius, "mode": "add", "through": True, "change": 1}
+    brushed, both = flags(watched, centers, stroke, {"op": "lasso", "points": corners, "mode": "add", "through": True})
+    at = projected(centers)
+    away = np.full(len(at), np.inf)
+    for start, end in zip(np.reshape(points, (-1, 2))[:-1], np.reshape(points, (-1, 2))[1:], strict=True):
+        along = (((at - start) @ (end - start)) / ((end - start) @ (end - start))).clip(0, 1)
+        away = np.minimum(away, np.linalg.norm(at - start - along[:, None] * (end - start), axis=1))
+    clear = abs(away - radius) > 1e-4
+    assert brushed[clear].tolist() == (away <= radius)[clear].tolist()
+    pixel = np.floor(at) + 0.5
+    sides = []
+    for start, end in zip(np.reshape(corners, (-1, 2)), np.roll(np.reshape(corners, (-1, 2)), -1, axis=0), strict=True):
+        sides.append((end[0] - start[0]) * (pixel[:, 1] - start[1]) - (end[1] - start[1]) * (pixel[:, 0] - start[0]))
+    inside = np.array(sides).min(axis=0) > 0
+    seen = (abs(np.array(sides)).min(axis=0) > 1e-3) & ((pixel > 0) & (pixel < [WIDTH, HEIGHT])).all(axis=1) & ~brushed
+    assert inside[seen].sum() > 100
+    assert both[seen].tolist() == inside[seen].tolist()
+
+
+def test_changes_are_undone_and_redone(watched: Watched) -> None:
+    centers = front(2000)
+    box = {"op": "box", "low": [-0.5, -0.6, 1.8], "high": [0.4, 0.7, 2.9], "mode": "add"}
+    parts = [
+        {"op": "stroke", "points": [x, 30.0], "radius": 5.0, "mode": "add", "through": True, "change": 7}
+        for x in (20.0, 50.0)
+    ]
+    bits = np.packbits(np.arange(2000) % 3 == 0, bitorder="little").tolist()
+    found = flags(
+        watched,
+        centers,
+        {"op": "load", "bits": bits},
+        box,
+        *parts,
+        {"op": "invert"},
+        {"op": "undo"},
+        {"op": "undo"},
+        {"op": "redo"},
+        {"op": "undo"},
+        {"op": "undo"},
+        {"op": "undo"},
+        {"op": "clear"},
+    )
+    loaded, boxed, first, both, inverted, *after, cleared = (each.tolist() for each in found)
+    assert loaded == (np.arange(2000) % 3 == 0).tolist()
+    assert boxed != first != both
+    assert inverted == [not value for value in both]
+    assert after == [both, boxed, both, boxed, loaded, loaded]
+    assert not any(cleared)
+
+
+def test_growth_adds_near_neighbors(watched: Watched) -> None:
+    """A line of Gaussians grows by those that are at most the distance away that is derived from the density."""
+    centers = np.zeros((400, 3), np.float32)
+    centers[:, 0] = np.linspace(-1, 1, 400)
+    seed = {"op": "sphere", "center": [0, 0, 0], "radius": 0.1, "mode": "add"}
+    before, once, twice = flags(watched, centers, seed, {"op": "grow"}, {"op": "grow"})
+    widths = [each.sum() * 2 / 399 for each in (before, once, twice)]
+    assert widths[0] == pytest.approx(0.2, abs=0.01)
+    assert widths[1] - widths[0] == pytest.approx(widths[2] - widths[1], abs=0.012)
+    assert widths[1] > widths[0] + 0.01
+    for each in (before, once, twice):
+        (places,) = np.nonzero(each)
+        assert len(places) == places[-1] - places[0] + 1
+
+
+def test_connected_colors_stop_at_gaps(watched: Watched) -> None:
+    """Two equal clusters of one color: connectedness takes only that of the seed, and tolerance limits the colors."""
+    script = """async ([base]) => {
+      const { Selector } = await import(`${base}/viewer/selector.js`);
+      const count = 4000, centers = new Float32Array(count * 3);
+      const colors = new Uint8ClampedArray(count * 3).fill(100);
+      let state = 1;
+      const random = () => (state = (state * 16807) % 2147483647) / 2147483647;
+      for (let i = 0; i < count; i++) {
+        centers.set([random() + (i % 2 ? 3 : 0), random(), 4], 3 * i);
+        if (centers[3 * i + 1] > 0.5) colors.fill(140, 3 * i, 3 * i + 3);
+      }
+      const selector = new Selector(centers, new Float32Array(count).fill(0.01), colors, 2);
+      const ids = new Uint32Array(100).fill(1), axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+      selector.answer({ op: "view", axes, eye: [0, 0, 0], focal: [10, 10], near: 0.2, ids, width: 10, height: 10 });
+      colors.fill(100, 0, 3);
+      centers[1] = 0.2;
+      const ask = (tolerance, connected) => {
+        selector.answer({ op: "clear" });
+        selector.answer({ op: "similar", point: [5, 5], tolerance, connected, mode: "add" });
+        return [...selector.flags];
+      };
+      return [[...centers], [ask(0.1, true), ask(0.1, false), ask(0.2, true), ask(1, false)]];
+    }"""
+    places, (narrow, all_narrow, wide, everything) = watched.page.evaluate(script, [base_of(watched)])
+    centers = np.reshape(places, (-1, 3))
+    left, low = centers[:, 0] < 2, centers[:, 1] <= 0.5
+    assert np.array(narrow, bool).tolist() == (left & low).tolist()
+    assert np.array(all_narrow, bool).tolist() == low.tolist()
+    assert np.array(wide, bool).tolist() == left.tolist()
+    assert all(everything)
+
+
+def two_walls() -> Scene:
+    """Return a wall in the left and right half, and another one behind it."""
+    near = wall()
+    far = replace(near, means=near.means * torch.tensor([2.0, 2.0, 2.0]), scales=near.scales + torch.tensor(2.0).log())
+    return Scene(
+        *(
+            torch.cat([getattr(near, name), getattr(far, name)])
+            for name in ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
+        )
+    )
+
+
+def opened(visit: Visit, files: dict[str, Path], **size: int) -> Watched:
+    """Open the form with the files, and start to select a region `near`."""
+    watched = visit(**size)
+    page = watched.page
+    choose(watched, files)
+    watched.settled()
+    page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
+    page.get_by_role("button", name="Add a region").click()
+    region = page.get_by_role("group", name="Region 1")
+    region.get_by_label("Name").fill("near")
+    region.get_by_role("button", name="Select in the 3D view").click()
+    page.get_by_role("heading", name="Select “near”").wait_for()
+    return watched
+
+
+def selected(watched: Watched, text: str = "") -> int:
+    """Return the number of selected Gaussians once the page shows this text."""
+    output = watched.page.locator(".selecting output", has_text=re.compile(f"^{text}"))
+    output.wait_for()
+    return int(output.inner_text().split()[0].replace(",", ""))
+
+
+def some_selected(watched: Watched) -> None:
+    """Wait until the page shows that a Gaussian is selected."""
+    watched.page.locator(".selecting output", has_text=re.compile("^[1-9]")).wait_for()
+
+
+def drag(watched: Watched, *points: tuple[float, float]) -> None:
+    """Drag over the 3D view; points are fractions of its width and height."""
+    view = watched.page.locator("canvas.view")
+    view.scroll_into_view_if_needed()
+    box = view.bounding_box()
+    mouse = watched.page.mouse
+    places = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in points]
+    mouse.move(*places[0])
+    mouse.down()
+    for place in places[1:]:
+        mouse.move(*place, steps=8)
+    mouse.up()
+
+
+def test_drawn_selections_take_what_is_visible(visit: Visit, tmp_path: Path) -> None:
+    """A lasso around the middle takes Gaussians of the near wall only, unless it selects through."""
+    ply, file, style = write_files(tmp_path, two_walls(), cameras(3, 96, 72))
+    watched = opened(visit, {"scene": ply, "cameras": file, "style": style})
+    page = watched.page
+    page.get_by_label("Lasso").check()
+    loop = [(0.3, 0.3), (0.7, 0.3), (0.7, 0.7), (0.3, 0.7), (0.3, 0.3)]
+    assert selected(watched, "0 of 1,232 Gaussians") == 0
+    drag(watched, *loop)
+    some_selected(watched)
+    near = selected(watched)
+    page.get_by_role("button", name="Undo").click()
+    assert selected(watched, "0 of 1,232") == 0
+    page.get_by_label("Select through").check()
+    drag(watched, *loop)
+    some_selected(watched)
+    assert selected(watched) > 1.15 * near
+    assert near > 50
+    page.get_by_role("button", name="Use selection").click()
+    region = page.get_by_role("group", name="Region 1")
+    region.get_by_text("Gaussians selected by hand").wait_for()
+    assert region.get_by_role("button", name="Change the selection").evaluate("(it) => it === document.activeElement")
+    watched.check()
+
+
+def test_selected_region_stays_frozen(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
+    """The whole path in the browser: select with the brush, freeze, submit, and compare the result's colors."""
+    watched = opened(visit, files)
+    page = watched.page
+    before_image = watched.pixels()
+    drag(watched, (0.25, 0.5), (0.45, 0.4), (0.45, 0.6))
+    some_selected(watched)
+    drag(watched, (0.3, 0.6), (0.4, 0.65))
+    watched.settled()
+    assert np.abs(watched.pixels() - before_image).max() > 40, "the selection is not highlighted"
+    count = selected(watched)
+    for _ in range(2):
+        page.get_by_role("button", name="Undo").click()
+    selected(watched, "0 of")
+    assert np.array_equal(watched.pixels(), before_image)
+    for _ in range(2):
+        page.get_by_role("button", name="Redo").click()
+    assert selected(watched, f"{count} of") == count
+    page.get_by_role("button", name="Use selection").click()
+    region = page.get_by_role("group", name="Region 1")
+    region.get_by_label("Freeze").check()
+    set_options(watched, **STEPS, name="by hand")
+    page.get_by_role("button", name="Start").click()
+    page.locator(".badge", has_text="Done").wait_for()
+    job_id = page.url.rsplit("/", 1)[1]
+    job = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()
+    (kept,) = job["parameters"]["regions"]
+    assert (kept["name"], kept["select"], kept["freeze"]) == ("near", "mask=near.bin", True)
+    mask = httpx.get(f"{service.url}/v1/jobs/{job_id}/inputs/mask").content
+    frozen = np.unpackbits(np.frombuffer(mask, np.uint8), bitorder="little").astype(bool)[:616]
+    assert 10 < frozen.sum() == count < 600
+    result = tmp_path / "stylized.ply"
+    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    before, after = read_scene(files["scene"]).scene, read_scene(result).scene
+    same = (before.sh_dc.numpy().view(np.uint32) == after.sh_dc.numpy().view(np.uint32)).all(axis=1)
+    assert same[frozen].all()
+    assert same[~frozen].mean() < 0.5
+    x = before.means[:, 0].numpy()
+    assert x[frozen].max() < 1.0, "the brush moved over the left half"
+    watched.check()
+
+
+def test_panel_works_by_keyboard_on_small_screens(visit: Visit, files: dict[str, Path]) -> None:
+    from axe_playwright_python.sync_playwright import Axe
+
+    watched = opened(visit, files, width=360, height=760)
+    page = watched.page
+    for tool in ("Brush", "Lasso", "Similar", "Box", "Sphere"):
+        page.get_by_label(tool, exact=True).check()
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= 360, tool
+        found = Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]})
+        assert not found.response["violations"], found.generate_report()
+    page.get_by_label("Radius", exact=True).fill("0.8")
+    page.get_by_role("button", name="Apply").press("Enter")
+    some_selected(watched)
+    scene = read_scene(files["scene"]).scene
+    center = [float(page.get_by_label(name, exact=True).input_value()) for name in ("X", "Y", "Z")]
+    inside = ((scene.means.double() - torch.tensor(center, dtype=torch.float64)).norm(dim=1) <= 0.8).sum()
+    assert abs(selected(watched) - int(inside)) <= 2  # the page shows five digits
+    handle = page.get_by_role("button", name="Move", exact=True)
+    handle.press("ArrowRight")
+    assert float(page.get_by_label("X", exact=True).input_value()) != center[0]
+    count = selected(watched)
+    page.get_by_role("button", name="Invert").press("Enter")
+    assert selected(watched, f"{616 - count} of") == 616 - count
+    page.keyboard.press("Control+z")
+    assert selected(watched, f"{count} of") == count
+    page.get_by_label("Similar", exact=True).check()
+    page.get_by_role("button", name="Clear").press("Enter")
+    page.get_by_role("button", name="Pick at the middle").press("Enter")
+    some_selected(watched)
+    page.get_by_role("button", name="Cancel").press("Enter")
+    assert "selected by hand" not in page.get_by_role("group", name="Region 1").inner_text()
+    watched.check()
+
+
+def test_masks_survive_other_views_but_not_another_scene(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
+    watched = opened(visit, files)
+    page = watched.page
+    page.get_by_role("button", name="Invert").click()
+    selected(watched, "616 of")
+    page.get_by_role("button", name="Use selection").click()
+    page.get_by_text("616 Gaussians selected by hand").wait_for()
+    page.get_by_role("link", name="Jobs").click()
+    page.get_by_role("link", name="New").click()
+    region = page.get_by_role("group", name="Region 1")
+    assert "616 Gaussians selected by hand" in region.inner_text()
+    other = tmp_path / "other.ply"
+    write_scene(other, wall(10, 10))
+    choose(watched, {"scene": other})
+    watched.settled()
+    assert "selected by hand" not in region.inner_text()
+    watched.check()
