@@ -1,26 +1,30 @@
-"""Forecast of the time of a step on one H200, from counted operations, bytes and kernel launches.
+"""Forecast of the time of a step on one GPU, from counted operations, bytes and kernel launches.
 
-python -m benchmarks.forecast [--launches 509]
+python -m benchmarks.forecast
 
-Nothing here is measured on a GPU: peak rates come from the data sheet, and `SHARES` below contains assumed fractions of
+Nothing here is measured on a GPU: peak rates come from data sheets, and `SHARES` below contains assumed fractions of
 them. The work of feature network, image pyramid, colors and content loss is counted by running the project's own code
 on meta tensors, which have no values. The work of Triton kernels is counted from their source, that of the rasterizer
-from the number of pairs of a Gaussian and a raster tile.
+from the number of pairs of a Gaussian and a raster tile, and from the instructions of its compiled kernels.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from typing import Any
+from unittest import mock
 
 import torch
+from torch import Tensor
 
 from benchmarks.machine import write_result
 from benchmarks.work import Counted, Work, meta
-from sgsst_core.budget import GPU_SHARE, measuring_memory, memory_for
+from sgsst_core.budget import GPU_SHARE, content_fraction, measuring_memory, memory_for
 from sgsst_core.constants import RASTER_TILE
+from sgsst_core.features import vgg
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
@@ -34,20 +38,14 @@ from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings
 
-#: Peak rates of the H200 SXM from the data sheet, without sparsity: operations per second by precision; memory
-#: bandwidth in bytes per second; sizes of memory and L2 cache in bytes.
-PEAKS = {"bfloat16": 989e12, "tf32": 495e12, "float32": 67e12}
-BANDWIDTH, MEMORY, L2 = 4.8e12, 141e9, 50e6
-#: Thread instructions per second: the data sheet counts a fused multiply-add as two float32 operations.
-LANES = PEAKS["float32"] / 2
 PRECISIONS = ("float32", "tf32", "bfloat16")
-#: Kernel launches of a step on a fully cached view in bfloat16, as counted by `device_counts`.
-LAUNCHES = 509
+#: Kernel launches of a step with a fully cached view in bfloat16, and those of its loss, as counted by `device_counts`.
+LAUNCHES, LOSS_LAUNCHES = 485, 456
 #: Launches to compute a view's tile intersections: two multi-pass sorts, a multi-pass sum, kernels and copies.
 LIST_LAUNCHES = 40
-#: Instructions per pixel for a pair of Gaussian and raster tile, from the source of `blend_weights` and its callers:
-#: about 30 for the weight, including two functions at a quarter of the rate or less, and 15 for three color channels.
-PIXEL_INSTRUCTIONS = 45
+#: Instructions per pixel for a pair of Gaussian and raster tile in render and gradient (compute capability 9.0), as
+#: counted by `triton_targets`, and float64 instructions for each pair.
+PIXEL_INSTRUCTIONS, PAIR_INSTRUCTIONS = (20.5, 22.2), 20
 #: Fraction of the scene's Gaussians that are visible in a view. `Job.pairs_each` in `JOBS` was counted on the biker
 #: scene (152,605 Gaussians) at widths of 980 and 5187 pixels. Most of its Gaussians are a few pixels wide, as in large
 #: scenes. The Gaussians of the plush toy are larger and have 12.8 and 236 pairs each.
@@ -57,16 +55,52 @@ LIST_BYTES = (80, 8)
 
 
 @dataclass(frozen=True)
-class Shares:
-    """Assumed fractions of the peak rates.
+class Device:
+    """Data sheet of a GPU.
 
     Attributes:
-        convolution: Fraction of `PEAKS` for convolutions, by precision.
-        matrix: Fraction of `PEAKS` for Triton's feature products, in TF32 or float32 ("ieee").
+        peaks: Operations per second by precision, without sparsity.
+        bandwidth: Memory bandwidth in bytes per second.
+        memory: Memory size in bytes.
+        cache: Size of the L2 cache in bytes.
+    """
+
+    peaks: Mapping[str, float]
+    bandwidth: float
+    memory: float
+    cache: float
+
+    @property
+    def memory_limit(self) -> int:
+        """Memory limit in bytes that a job has by default (`budget.default_memory_limit`)."""
+        return int(GPU_SHARE * self.memory)
+
+
+def _device(bfloat16: float, tf32: float, float32: float, float64: float, *rest: float) -> Device:
+    return Device({"bfloat16": bfloat16, "tf32": tf32, "float32": float32, "float64": float64}, *rest)
+
+
+DEVICES = {
+    "H200": _device(989e12, 495e12, 67e12, 34e12, 4.8e12, 141e9, 50e6),
+    "H100": _device(989e12, 495e12, 67e12, 34e12, 3.35e12, 80e9, 50e6),
+    "A100": _device(312e12, 156e12, 19.5e12, 9.7e12, 2.04e12, 80e9, 40e6),
+    "RTX 4090": _device(165e12, 82.6e12, 82.6e12, 1.29e12, 1.01e12, 24e9, 72e6),
+}
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Assumed fractions of the peak rates, and overheads of launches.
+
+    Attributes:
+        convolution: Fraction of `Device.peaks` for convolutions, by precision.
+        matrix: Fraction of `Device.peaks` for Triton's feature products, in TF32 or float32 ("ieee").
         bandwidth: Fraction of the memory bandwidth.
-        lanes: Fraction of `LANES` for the rasterizer.
+        lanes: Fraction of the thread instructions per second for the rasterizer, whose loop has no memory accesses. A
+            data sheet counts a fused multiply-add as two float32 operations.
         blended: Fraction of the pairs of Gaussian and tile that are blended before the tile is opaque.
         launch: CPU seconds per kernel launch.
+        gap: GPU seconds between two kernels.
     """
 
     convolution: Mapping[str, float]
@@ -75,15 +109,17 @@ class Shares:
     lanes: float
     blended: float
     launch: float
+    gap: float
 
-    def rates(self, precision: str) -> dict[str, float]:
+    def rates(self, device: Device, precision: str) -> dict[str, float]:
         """Return the operations and bytes per second that `Work.seconds` expects."""
         product = matrix_precision(torch.bfloat16 if precision == "bfloat16" else torch.float32)
         return {
-            "convolution": PEAKS[precision] * self.convolution[precision],
-            "matrix": PEAKS["tf32" if product == "tf32" else "float32"] * self.matrix[product],
-            "lanes": LANES * self.lanes / self.blended,
-            "bytes": BANDWIDTH * self.bandwidth,
+            "convolution": device.peaks[precision] * self.convolution[precision],
+            "matrix": device.peaks["tf32" if product == "tf32" else "float32"] * self.matrix[product],
+            "lanes": device.peaks["float32"] / 2 * self.lanes / self.blended,
+            "float64": device.peaks["float64"] / 2 * self.lanes / self.blended,
+            "bytes": device.bandwidth * self.bandwidth,
         }
 
 
@@ -92,10 +128,11 @@ def _shares(float32: float, tf32: float, bfloat16: float, ieee: float, product: 
     return Shares(convolution, {"ieee": ieee, "tf32": product}, *rest)
 
 
+#: cuDNN comes close to the optimistic fractions with 256 channels or more only.
 SHARES = {
-    "optimistic": _shares(0.85, 0.75, 0.75, 0.6, 0.5, 0.85, 0.5, 0.5, 3e-6),
-    "likely": _shares(0.7, 0.6, 0.6, 0.4, 0.3, 0.7, 0.35, 0.7, 4e-6),
-    "pessimistic": _shares(0.5, 0.4, 0.4, 0.25, 0.15, 0.55, 0.25, 1.0, 6e-6),
+    "optimistic": _shares(0.85, 0.65, 0.65, 0.6, 0.5, 0.85, 0.7, 0.5, 15e-6, 1e-6),
+    "likely": _shares(0.7, 0.5, 0.5, 0.4, 0.3, 0.7, 0.5, 0.7, 25e-6, 1.5e-6),
+    "pessimistic": _shares(0.5, 0.35, 0.35, 0.25, 0.15, 0.55, 0.35, 1.0, 40e-6, 2.5e-6),
 }
 
 
@@ -154,23 +191,18 @@ def shapes_of(name: str) -> BackboneWeights:
     return BackboneWeights(name, "shapes", "0" * 64, layers, meta(3), meta(3))
 
 
-def make_loss(precision: str) -> SosLoss:
+def make_loss(device: Device, precision: str) -> SosLoss:
     """Return the loss of VGG19 with the memory budget of a job on the device."""
     dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
     network = FeatureNetwork(shapes_of("vgg19"), dtype=dtype, device="meta", tf32=precision == "tf32")
-    return SosLoss(network, memory=memory_for("activations", int(memory_limit())))
-
-
-def memory_limit() -> float:
-    """Return the memory limit in bytes that a job has by default (`budget.default_memory_limit`)."""
-    return GPU_SHARE * MEMORY
+    return SosLoss(network, memory=memory_for("activations", device.memory_limit))
 
 
 class Passes:
-    """Work of the parts of a view's loss at the given scales."""
+    """Work of the parts of a view's loss at the given scales; `cache` is the size of the GPU's L2 cache in bytes."""
 
-    def __init__(self, loss: SosLoss, size: Size, scales: Sequence[int]) -> None:
-        self.loss, self.size = loss, size
+    def __init__(self, loss: SosLoss, size: Size, scales: Sequence[int], cache: float) -> None:
+        self.loss, self.size, self.cache = loss, size, cache
         self.sizes = {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
         tiles = {scale: loss.divider.tiles(scaled) for scale, scaled in self.sizes.items()}
         self.tiles = [(tile, self.sizes[scale]) for scale, own in tiles.items() for tile in own]
@@ -183,7 +215,7 @@ class Passes:
             outer = tile.outer
             with Counted() as there:
                 activations = self.loss.network.forward(meta(outer.bottom - outer.top, outer.right - outer.left, 3))
-            with Counted() as back:
+            with Counted() as back, _fused_pooling(back):
                 self.loss.network.backward(activations, lambda *_: None)
             forward += there.works
             backward += back.works if is_cached else there.works + back.works
@@ -197,7 +229,10 @@ class Passes:
             for tile, scaled in self.tiles
             for layer in STYLE_LAYERS
         ]
-        return [statistics(*piece, size) for piece in pieces], [style_gradient(*piece, size) for piece in pieces]
+        return (
+            [statistics(*piece, size, self.cache) for piece in pieces],
+            [style_gradient(*piece, size, self.cache) for piece in pieces],
+        )
 
     def content(self) -> list[Work]:
         """Return the work of the content loss and gradient, given the features."""
@@ -228,35 +263,46 @@ class Passes:
         return counted.works
 
 
+def _fused_pooling(counted: Counted) -> AbstractContextManager[Any]:
+    """Count the backward pass of pooling and ReLU as the Triton kernel that a GPU runs; it needs values."""
+
+    def launch(gradient: Tensor, source: Tensor) -> Tensor:
+        counted.works.append(Work(0, gradient.nbytes + 2 * source.nbytes))
+        return torch.empty_like(source)
+
+    return mock.patch.object(vgg, "max_pool_backward", launch)
+
+
 def _cells(layer: str, tile: PartitionTile, size: Size) -> int:
     return tile.owned_cells(layer, size)[1].pixels
 
 
-def statistics(channels: int, positions: int, size: int) -> Work:
+def statistics(channels: int, positions: int, size: int, cache: float) -> Work:
     """Return the work of `statistics_kernels.shifted_moments` and its subsequent kernels.
 
     Args:
         channels: Number of channels of the layer.
         positions: Number of feature cells.
         size: Bytes per feature value.
+        cache: Size of the L2 cache in bytes.
     """
     tiles = -(-channels // TILE)
     pairs = tiles * (tiles + 1) // 2
     # Each pair of channel tiles reads both tiles, or one on the diagonal. Spans are the outer loop, so a layer larger
     # than the L2 cache is read from memory each time.
-    reads = tiles if channels * positions * size > L2 else 1
+    reads = tiles if channels * positions * size > cache else 1
     spans = -(-positions // span_positions(channels))
     moved = reads * channels * positions * size + 2 * spans * channels**2 * 4
     return Work(2.0 * min(TILE, channels) ** 2 * pairs * positions, moved, "matrix")
 
 
-def style_gradient(channels: int, positions: int, size: int) -> Work:
+def style_gradient(channels: int, positions: int, size: int, cache: float) -> Work:
     """Return the work of `statistics_terms_kernels.add_style_gradient`.
 
     Each channel tile reads all features, and reads and writes its own part of the gradient.
     """
     tiles = -(-channels // TILE)
-    reads = tiles if channels * positions * size > L2 else 1
+    reads = tiles if channels * positions * size > cache else 1
     return Work(2.0 * channels**2 * positions, (reads + 2.0) * channels * positions * size, "matrix")
 
 
@@ -266,20 +312,24 @@ def render(job: Job) -> list[Work]:
     Each pair reads its depth-order index, eight float64 values and a color. Each pixel writes color and transmittance.
     """
     pixels = job.size[0] * job.size[1]
-    return [Work(_blending(job), job.pairs * (4 + 64 + 8 + 12) + 16 * pixels, "lanes")]
+    return _blending(job, PIXEL_INSTRUCTIONS[0], job.pairs * (4 + 64 + 8 + 12) + 16 * pixels)
 
 
 def raster_gradient(job: Job) -> list[Work]:
     """Return the work of clearing, writing and summing the gradient slots of pairs, and of the gradient [N, 3]."""
     pixels = job.size[0] * job.size[1]
     return [
-        Work(_blending(job), job.pairs * (8 + 64 + 24) + 12 * pixels, "lanes"),
+        *_blending(job, PIXEL_INSTRUCTIONS[1], job.pairs * (8 + 64 + 24) + 12 * pixels),
         Work(0, 12 * (job.pairs + job.gaussians + job.visible)),
     ]
 
 
-def _blending(job: Job) -> float:
-    return job.pairs * RASTER_TILE**2 * PIXEL_INSTRUCTIONS
+def _blending(job: Job, instructions: float, moved: float) -> list[Work]:
+    """Return the work of a compositing kernel: that of all pixels, and that of preparing the pairs."""
+    return [
+        Work(job.pairs * RASTER_TILE**2 * instructions, moved, "lanes"),
+        Work(job.pairs * PAIR_INSTRUCTIONS, unit="float64"),
+    ]
 
 
 def lists(job: Job) -> list[Work]:
@@ -307,22 +357,27 @@ def colors(job: Job) -> list[Work]:
     return [*counted.works, Work(0, (3 + 7) * 12 * job.gaussians)]
 
 
-def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_cached: bool = False) -> dict[str, Part]:
+def step_parts(
+    job: Job, device: Device, precision: str, *, coarse: bool = False, everything_cached: bool = False
+) -> dict[str, Part]:
     """Return the parts of a step.
 
     Args:
         job: Scene and views.
+        device: GPU.
         precision: Precision of the feature network.
         coarse: Whether the step belongs to phase 1, which uses the coarsest scale alone.
         everything_cached: Whether content features, intersections and frozen colors of all views are cached.
     """
-    loss = make_loss(precision)
+    loss = make_loss(device, precision)
     count = loss.tiling.scale_count(job.size)
-    passes = Passes(loss, job.size, [count - 1] if coarse else range(count))
+    passes = Passes(loss, job.size, [count - 1] if coarse else range(count), device.cache)
     forward, backward = passes.network()
     moments, style = passes.style()
     cached = (
-        dict.fromkeys(("content", "lists", "colors"), 1.0) if everything_cached else cached_fractions(job, loss, coarse)
+        dict.fromkeys(("content", "lists", "colors"), 1.0)
+        if everything_cached
+        else cached_fractions(job, device, loss, coarse)
     )
     missing = {name: 1 - share for name, share in cached.items()}
     uncached = [*forward, *render(job), *passes.scaled()]
@@ -344,16 +399,19 @@ def step_parts(job: Job, precision: str, *, coarse: bool = False, everything_cac
     }
 
 
-def cached_fractions(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
+def cached_fractions(job: Job, device: Device, loss: SosLoss, coarse: bool) -> dict[str, float]:
     """Return the fractions of views whose content features, tile intersections and frozen colors fit the caches."""
-    views = view_budget(job, loss)
+    views = view_budget(job, device, loss)
     cell = loss.network.channels(CONTENT_LAYER) * loss.network.dtype.itemsize
     count = loss.tiling.scale_count(job.size)
     size = (job.size[0] >> count - 1, job.size[1] >> count - 1) if coarse else job.size
     of_a_view = {
-        "content": (views / 2, content_bytes([size], loss.tiling, cell)),
+        "content": (
+            views * content_fraction("cuda", weighted=False, has_maps=False),
+            content_bytes([size], loss.tiling, cell),
+        ),
         "lists": (
-            memory_for("rasterizer", int(memory_limit())),
+            memory_for("rasterizer", device.memory_limit),
             LIST_BYTES[0] * job.visible + LIST_BYTES[1] * job.pairs,
         ),
         "colors": (views / 4, 12.0 * job.gaussians),
@@ -361,9 +419,9 @@ def cached_fractions(job: Job, loss: SosLoss, coarse: bool) -> dict[str, float]:
     return {name: min(1.0, budget // each / job.views) for name, (budget, each) in of_a_view.items()}
 
 
-def view_budget(job: Job, loss: SosLoss) -> int:
+def view_budget(job: Job, device: Device, loss: SosLoss) -> int:
     """Return the memory in bytes for data of views, in a job with CUDA graphs that is measured (`cost.view_memory`)."""
-    memory, network = int(memory_limit()), loss.network
+    memory, network = device.memory_limit, loss.network
     budget = memory_for("activations", memory)
     each = network.held_bytes_per_pixel() + network.working_bytes_per_pixel()
     once = min(int(job.size[0] * job.size[1] * each), budget)
@@ -373,15 +431,31 @@ def view_budget(job: Job, loss: SosLoss) -> int:
     return memory_for("views", memory) - reference * measuring_memory(memory) + spare
 
 
-def step_seconds(parts: Mapping[str, Part], shares: Shares, precision: str, launches: int) -> dict[str, float]:
-    """Return GPU seconds by part, CPU seconds, and the total: the maximum of both sums."""
-    rates = shares.rates(precision)
+def step_seconds(
+    parts: Mapping[str, Part],
+    shares: Shares,
+    device: Device,
+    precision: str,
+    launches: tuple[int, int] = (LAUNCHES, LOSS_LAUNCHES),
+) -> dict[str, float]:
+    """Return GPU seconds by part, CPU seconds, and the total: the maximum of both sums.
+
+    Args:
+        parts: Parts of the step.
+        shares: Assumed fractions of the peak rates.
+        device: GPU.
+        precision: Precision of the feature network.
+        launches: Kernels of a step, and those of them in the CUDA graph of its loss, which one launch starts.
+    """
+    rates, (kernels, in_graph) = shares.rates(device, precision), launches
     seconds = {name: part.visits * sum(w.seconds(rates) for w in part.works) for name, part in parts.items()}
-    host = shares.launch * (launches + sum(part.visits * part.more_launches for part in parts.values()))
+    more = sum(part.visits * part.more_launches for part in parts.values())
+    seconds["gaps between kernels"] = shares.gap * (kernels + more)
+    host = shares.launch * (kernels - in_graph + 1 + more)
     return {**seconds, "host": host, "total": max(sum(seconds.values()), host)}
 
 
-def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
+def forecast(job: Job, device: Device, precision: str) -> dict[str, Any]:
     """Return seconds per step in each phase, with and without complete caches, and the hours of the paper's job."""
     kinds: dict[str, dict[str, bool]] = {
         "sos": {},
@@ -389,9 +463,9 @@ def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
         "sos, all cached": {"everything_cached": True},
         "coarse, all cached": {"coarse": True, "everything_cached": True},
     }
-    parts = {kind: step_parts(job, precision, **options) for kind, options in kinds.items()}
+    parts = {kind: step_parts(job, device, precision, **options) for kind, options in kinds.items()}
     forecasts: dict[str, Any] = {
-        kind: {name: step_seconds(own, shares, precision, launches) for name, shares in SHARES.items()}
+        kind: {name: step_seconds(own, shares, device, precision) for name, shares in SHARES.items()}
         for kind, own in parts.items()
     }
     paper = make_settings("paper")
@@ -404,7 +478,7 @@ def forecast(job: Job, precision: str, launches: int) -> dict[str, Any]:
             / 3600
             for name in SHARES
         }
-    forecasts["cached"] = cached_fractions(job, make_loss(precision), coarse=False)
+    forecasts["cached"] = cached_fractions(job, device, make_loss(device, precision), coarse=False)
     forecasts["teraflops"] = sum(w.operations for w in parts["sos"]["convolutions forward"].works) / 1e12
     return forecasts
 
@@ -433,23 +507,21 @@ def table(results: Mapping[str, Mapping[str, Any]]) -> str:
 
 def main() -> None:
     """Compute the forecast, then print and store it."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--launches", type=int, default=LAUNCHES, help="of a step")
-    arguments = parser.parse_args()
-    results = {
-        name: {precision: forecast(job, precision, arguments.launches) for precision in PRECISIONS}
-        for name, job in JOBS.items()
-    }
-    for name, result in results.items():
-        print(f"\n{name}\n\n{table(result)}")
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    results: dict[str, dict[str, Any]] = {}
+    for name, job in JOBS.items():
+        results[name] = {}
+        for title, device in DEVICES.items():
+            results[name][title] = {precision: forecast(job, device, precision) for precision in PRECISIONS}
+            print(f"\n{name}, {title}\n\n{table(results[name][title])}", flush=True)
     assumptions = {
-        "peaks": PEAKS,
-        "bandwidth": BANDWIDTH,
-        "memory": MEMORY,
+        "devices": {name: asdict(device) for name, device in DEVICES.items()},
         "shares": {name: asdict(shares) for name, shares in SHARES.items()},
         "jobs": {name: {**asdict(job), "pairs": job.pairs} for name, job in JOBS.items()},
-        "launches": arguments.launches,
+        "launches": LAUNCHES,
+        "loss_launches": LOSS_LAUNCHES,
         "pixel_instructions": PIXEL_INSTRUCTIONS,
+        "pair_instructions": PAIR_INSTRUCTIONS,
     }
     write_result("forecast", {"assumptions": assumptions, "forecast": results})
 

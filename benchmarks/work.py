@@ -19,8 +19,8 @@ class Work:
     Attributes:
         operations: Number of operations on `unit`.
         bytes: Memory traffic in bytes, if every argument is read once and every result written once.
-        unit: Hardware unit: "convolution", "matrix" (matrix products in the project's kernels, TF32 or float32) or
-            "lanes" (thread instructions).
+        unit: Hardware unit: "convolution", "matrix" (matrix products in the project's kernels, TF32 or float32),
+            "lanes" (thread instructions) or "float64" (those in float64).
     """
 
     operations: float = 0.0

@@ -7,9 +7,11 @@ import torch
 import torch.nn.functional as F
 
 from benchmarks import forecast
-from benchmarks.forecast import JOBS, LAUNCHES, SHARES, Job, Part, Passes, make_loss, statistics, step_seconds
+from benchmarks.forecast import DEVICES, JOBS, SHARES, Job, Part, Passes, make_loss, statistics, step_seconds
 from benchmarks.work import Counted, Work, meta
 
+#: GPU of these tests.
+H200 = DEVICES["H200"]
 #: Job whose scene and views fit into memory.
 SMALL = Job((96, 128), 1000, 4.0, 3)
 #: Floating-point operations of VGG19 up to relu5_1 per pixel, by block: 9 multiply-adds for each pair of channels.
@@ -23,15 +25,15 @@ FLOP = 2 * 9 * (
 
 
 def test_vgg19_takes_0_72_million_operations_per_pixel_and_pass() -> None:
-    forward, backward = Passes(make_loss("float32"), SMALL.size, [0]).network()
+    forward, backward = Passes(make_loss(H200, "float32"), SMALL.size, [0], H200.cache).network()
     assert FLOP == 722_304
     for works in (forward, backward):
         assert sum(work.operations for work in works) / (96 * 128) == FLOP
 
 
 def test_activations_beyond_memory_are_recomputed(monkeypatch: pytest.MonkeyPatch) -> None:
-    loss = make_loss("float32")
-    passes = Passes(loss, SMALL.size, [0])
+    loss = make_loss(H200, "float32")
+    passes = Passes(loss, SMALL.size, [0], H200.cache)
     passes.cached = [False]
     forward, backward = passes.network()
     assert sum(work.operations for work in backward) == 2 * sum(work.operations for work in forward)
@@ -58,41 +60,52 @@ def test_slower_of_compute_and_memory_determines_time() -> None:
 
 
 def test_statistics_use_upper_triangle_of_channel_pairs() -> None:
-    assert statistics(64, 1000, 4).operations == 2 * 64**2 * 1000
-    assert statistics(512, 1000, 4).operations == 2 * 512**2 * 1000 * 36 / 64
-    large = statistics(512, 10**6, 2)
+    assert statistics(64, 1000, 4, H200.cache).operations == 2 * 64**2 * 1000
+    assert statistics(512, 1000, 4, H200.cache).operations == 2 * 512**2 * 1000 * 36 / 64
+    large = statistics(512, 10**6, 2, H200.cache)
     assert large.bytes > 8 * 512 * 10**6 * 2  # eight passes, since it does not fit into the cache
 
 
 def test_feature_precision_determines_matrix_product_rate() -> None:
-    rates = {name: SHARES["likely"].rates(name)["matrix"] for name in forecast.PRECISIONS}
-    assert rates["tf32"] == rates["float32"] == forecast.PEAKS["float32"] * SHARES["likely"].matrix["ieee"]
-    assert rates["bfloat16"] == forecast.PEAKS["tf32"] * SHARES["likely"].matrix["tf32"]
+    rates = {name: SHARES["likely"].rates(H200, name)["matrix"] for name in forecast.PRECISIONS}
+    assert rates["tf32"] == rates["float32"] == H200.peaks["float32"] * SHARES["likely"].matrix["ieee"]
+    assert rates["bfloat16"] == H200.peaks["tf32"] * SHARES["likely"].matrix["tf32"]
 
 
 def test_device_and_host_times_overlap() -> None:
-    shares = SHARES["likely"]
+    shares, launches = SHARES["likely"], (500, 450)
     parts = {
         "a": Part([Work(0, 4.8e12 * shares.bandwidth)] * 3),
         "b": Part([Work(0, 4.8e12 * shares.bandwidth)], 0.5, 100),
     }
-    seconds = step_seconds(parts, shares, "float32", LAUNCHES)
-    assert (seconds["a"], seconds["b"], seconds["total"]) == pytest.approx((3.0, 0.5, 3.5))
-    assert seconds["host"] == pytest.approx(shares.launch * (LAUNCHES + 50))
-    assert step_seconds(parts, shares, "float32", 10**9)["total"] == pytest.approx(1e9 * shares.launch, rel=1e-6)
+    seconds = step_seconds(parts, shares, H200, "float32", launches)
+    gaps = shares.gap * (500 + 50)
+    assert (seconds["a"], seconds["b"], seconds["total"]) == pytest.approx((3.0, 0.5, 3.5 + gaps))
+    assert seconds["host"] == pytest.approx(shares.launch * (51 + 50))
+    eager = step_seconds(parts, shares, H200, "float32", (10**9, 0))
+    assert eager["total"] == pytest.approx(1e9 * shares.launch, rel=1e-6)
+
+
+def test_backward_pass_of_pooling_reads_and_writes_each_value_once() -> None:
+    """Its gradient is a quarter as large as its input, which is that of the convolution before it."""
+    _, backward = Passes(make_loss(H200, "bfloat16"), SMALL.size, [0], H200.cache).network()
+    pooled = 96 * 128 * (64 + 128 / 4 + 256 / 16 + 512 / 64) * 2
+    moved = [work.bytes for work in backward if not work.operations]
+    assert sum(moved[index] for index in range(len(moved)) if moved[index] == 96 * 128 * 64 * 2 * 9 / 4) > 0
+    assert sum(moved) >= pooled * 9 / 4
 
 
 def test_cached_values_are_not_recomputed() -> None:
-    everything = forecast.cached_fractions(SMALL, make_loss("float32"), coarse=False)
+    everything = forecast.cached_fractions(SMALL, H200, make_loss(H200, "float32"), coarse=False)
     assert everything == {"content": 1.0, "lists": 1.0, "colors": 1.0}
-    garden = forecast.cached_fractions(JOBS["5187x3361"], make_loss("float32"), coarse=False)
+    garden = forecast.cached_fractions(JOBS["5187x3361"], H200, make_loss(H200, "float32"), coarse=False)
     assert all(0 < share < 1 for share in garden.values())
-    parts = forecast.step_parts(SMALL, "bfloat16")
+    parts = forecast.step_parts(SMALL, H200, "bfloat16")
     assert [parts[name].visits for name in parts if name.endswith("recomputed")] == [0.0] * 3
 
 
 def test_forecast_range_contains_likely_value() -> None:
-    result = forecast.forecast(SMALL, "tf32", LAUNCHES)
+    result = forecast.forecast(SMALL, H200, "tf32")
     for kind in ("sos", "coarse"):
         low, mid, high = (result[kind][name]["total"] for name in ("optimistic", "likely", "pessimistic"))
         assert 0 < low < mid < high

@@ -21,9 +21,9 @@ def size_of(scene: int = GB, name: str = "scene.ply", photos: int = 0, **paramet
 @pytest.mark.parametrize("name", forecast.JOBS)
 @pytest.mark.parametrize("precision", forecast.PRECISIONS)
 def test_estimated_seconds_agree_with_the_forecast(name: str, precision: str) -> None:
-    job = forecast.JOBS[name]
-    parts = forecast.step_parts(job, precision)
-    step = forecast.step_seconds(parts, forecast.SHARES["likely"], precision, forecast.LAUNCHES)["total"]
+    job, device = forecast.JOBS[name], forecast.DEVICES["H200"]
+    parts = forecast.step_parts(job, device, precision)
+    step = forecast.step_seconds(parts, forecast.SHARES["likely"], device, precision)["total"]
     estimated = JobSize(job.gaussians, job.size[0] * job.size[1], 0, 1, precision).seconds()
     assert step / 1.6 < estimated < step * 1.6
 
