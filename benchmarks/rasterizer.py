@@ -64,7 +64,7 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
         cache.render(colors, camera)
     keep = timed(lambda: CachedRasterizer(scene).render(colors, camera)) - prepare
     reference = ReferenceRasterizer(scene, dtype=torch.float32)
-    reference.render(colors, camera, (0, 1))  # projection and sorting
+    reference.render(colors, camera)  # projection and sorting
     rasterizers: dict[str, Rasterizer] = {
         "reference": reference,
         "cpu": cpu,

@@ -15,6 +15,7 @@ from typing import Any
 from benchmarks.machine import write_result
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO
+from sgsst_core.loss.tiling import RENDERING
 from sgsst_core.parallel.division import Piece, divide, loads
 from sgsst_core.planning.cost import IterationWork
 from sgsst_core.planning.facts import Link
@@ -58,6 +59,7 @@ def main() -> None:
             fixed=FIXED_SECONDS,
             gaussians=gaussians,
             shown=arguments.shown * gaussians,
+            rendering=RENDERING["cuda"],
         )
         results[name] = forecast(work)
         sent = ", ".join(f"{kind} {size / 1e6:.1f} MB" for kind, size in work.sent(2).items())

@@ -27,7 +27,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from benchmarks.machine import write_result
-from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, TRANSMITTANCE_MIN
+from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, TRANSMITTANCE_MIN
 from sgsst_core.features import pooling_triton_kernels as pooling_kernels
 from sgsst_core.features import statistics_kernels
 from sgsst_core.features.statistics import (
@@ -145,7 +145,7 @@ _ADDED = {"BLOCK": kernels.ADDED.value, "SLOTS": kernels.SLOTS.value}
 KERNELS: dict[str, Target] = {
     "project": Target(
         kernels.project,
-        {"EPS2D": EPS2D, "ANTIALIASED": True, "MARGIN": FRUSTUM_MARGIN, "SUPPORT": 8.0, "POWER": 0.85, "BLOCK": _BLOCK},
+        {"EPS2D": EPS2D, "ANTIALIASED": True, "SUPPORT": 8.0, "POWER": 0.85, "BLOCK": _BLOCK},
         4,
     ),
     "list_tiles": Target(kernels.list_tiles, {"SUPPORT": 8.0, "BLOCK": _BLOCK}, 4),

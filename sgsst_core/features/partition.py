@@ -31,9 +31,34 @@ class Rectangle:
         return (self.bottom - self.top) * (self.right - self.left)
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of the rectangle."""
+        return self.bottom - self.top, self.right - self.left
+
+    @property
     def slices(self) -> tuple[slice, slice]:
         """Index of the rectangle in an [H, W, ...] tensor."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    def intersection(self, other: Rectangle) -> Rectangle:
+        """Return the pixels that two rectangles share; a rectangle without pixels if there are none."""
+        top, left = max(self.top, other.top), max(self.left, other.left)
+        bottom, right = min(self.bottom, other.bottom), min(self.right, other.right)
+        if bottom <= top or right <= left:
+            bottom, right = top, left
+        return Rectangle(top, left, bottom, right)
+
+    def within(self, area: Rectangle) -> Rectangle:
+        """Return the rectangle relative to an area that contains it."""
+        return Rectangle(self.top - area.top, self.left - area.left, self.bottom - area.top, self.right - area.left)
+
+    def at_scale(self, scale: int) -> Rectangle:
+        """Return the complete cells of 2^scale x 2^scale pixels; edges are between cells or at the view's border."""
+        return Rectangle(self.top >> scale, self.left >> scale, self.bottom >> scale, self.right >> scale)
+
+    def at_full_size(self, scale: int) -> Rectangle:
+        """Return the pixels of a rectangle of cells of 2^scale x 2^scale pixels; inverse of `at_scale`."""
+        return Rectangle(self.top << scale, self.left << scale, self.bottom << scale, self.right << scale)
 
 
 @dataclass(frozen=True)

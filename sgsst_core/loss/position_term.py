@@ -24,20 +24,29 @@ PositionWeights = Sequence[Tensor] | None
 
 @dataclass(frozen=True)
 class ScaledView:
-    """One scale of a view.
+    """One scale of a view, or the pixels of it that a rank needs.
 
     Attributes:
-        image: [h, w, 3], on the network's device.
+        image: [h, w, 3], pixels of `area` on the network's device.
         scale: Scale; 0 is full size.
+        size: (height, width) of the whole scaled view.
+        area: Rectangle of the scaled view; empty if the rank needs no pixels.
     """
 
     image: Tensor
     scale: int
+    size: Size
+    area: Rectangle
 
-    @property
-    def size(self) -> Size:
-        """(height, width) in pixels."""
-        return self.image.shape[0], self.image.shape[1]
+    @staticmethod
+    def of(image: Tensor, scale: int) -> ScaledView:
+        """Return the whole of a scaled view [h, w, 3]."""
+        size = (image.shape[0], image.shape[1])
+        return ScaledView(image, scale, size, Rectangle(0, 0, *size))
+
+    def pixels(self, rectangle: Rectangle) -> Tensor:
+        """Return the pixels of a rectangle of the scaled view."""
+        return self.image[rectangle.within(self.area).slices]
 
     def weights(self, layer: str, cells: Rectangle, pyramid: PositionWeights) -> Tensor | None:
         """Return the weights [h, w] of a block of cells of a layer, as box averages; None for equal weights."""

@@ -23,10 +23,10 @@ from sgsst_core.loss.statistics_terms import StatisticsTerms, compared_layers
 from sgsst_core.loss.target_builder import TargetBuilder
 from sgsst_core.loss.targets import ContentFeatures, StyleTarget, StyleTargets, ViewTarget
 from sgsst_core.loss.terms import POSITION_TERMS, TERMS, LossTerms
-from sgsst_core.loss.tiling import Divider, Division, Tiling
+from sgsst_core.loss.tiling import RENDERING, Divider, Division, Tiling
+from sgsst_core.loss.view_images import ViewImages
 from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
 from sgsst_core.parallel.division import Size, rounds
-from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.settings import Settings, StyleLossName
 from sgsst_core.timing import Timer
 
@@ -41,8 +41,8 @@ class SosResult:
     Attributes:
         scales: Evaluated scales.
         values: [scales, terms] float64, the loss of each scale split into `TERMS`, still on the device.
-        image_gradient: This rank's summand of dE/dimage, [H, W, 3]; the sum over all ranks is the gradient. None if
-            only the loss was requested.
+        image_gradient: This rank's summand of dE/dimage, [h, w, 3], with respect to the pixels that it was given; the
+            sum over all ranks is the gradient. None if only the loss was requested.
         weights: Weights of the scales in the loss.
     """
 
@@ -116,7 +116,15 @@ class SosLoss:
         held = network.held_bytes_per_pixel()
         working = network.working_bytes_per_pixel() / held
         self.tiling = Tiling(
-            network.halo, memory / held, working, coarsest, tile_size, cache_activations, scales, network.largest_tile
+            network.halo,
+            memory / held,
+            working,
+            coarsest,
+            tile_size,
+            cache_activations,
+            scales,
+            network.largest_tile,
+            RENDERING[network.device.type],
         )
         self.divider = Divider(self.tiling, collectives, leave_out=leave_out)
         self.targets = TargetBuilder(
@@ -145,40 +153,38 @@ class SosLoss:
         *,
         gradient: bool = True,
     ) -> SosResult:
-        """Compute the loss of an image [H, W, 3] (0..1, not clamped) and dE/dimage.
+        """Compute the loss of an image [h, w, 3] (0..1, not clamped) and dE/dimage.
 
         Args:
-            image: Image of the view at full size.
+            image: Image of the view at full size, or of the rectangle that this rank renders (`Division.shares`).
             style: Style targets, from `targets.of_style`.
             view: View targets, from `targets.of_view`.
             scales: Scales to evaluate, each with a positive weight; phase 1 passes only the coarsest. None for the full
                 SOS loss.
             gradient: Whether to compute the gradient.
         """
-        height, width = image.shape[0], image.shape[1]
+        shares = view.division.shares if view.division else None
+        height, width = shares.size if shares else (image.shape[0], image.shape[1])
         scales = self.tiling.scales((height, width)) if scales is None else scales
         sizes = {scale: (height >> scale, width >> scale) for scale in scales}
         division, weights = self._division(view, sizes), self.weights.fractions(sizes)
-        dtype = torch.promote_types(self.network.dtype, torch.float32)
-        total = torch.zeros(image.shape, dtype=dtype, device=self.network.device)
+        images = ViewImages(image.to(self.network.device), division, view.background, self.collectives, self.timer)
         values: dict[int, Tensor] = {}
         for some in rounds(list(sizes), self.collectives.size):
-            passes = []
-            for scale in some:
-                scaled = ScaledView(downscale(image.to(self.network.device), scale), scale)
-                passes.append(self._pass(scaled, division.tiles[scale], style[scale], view))
+            passes = [self._pass(images.scaled(scale), division.tiles[scale], style[scale], view) for scale in some]
             cached = self._collect(passes, cache=gradient)
             values |= {pass_.view.scale: pass_.values for pass_ in passes}
             gradients = self._backward(passes, cached) if gradient else []
             for pass_, pixel_gradient in zip(passes, gradients, strict=gradient):
-                scale = pass_.view.scale
-                add_upscaled_(total, pixel_gradient, scale, weights[scale])
+                images.add_gradient(pass_.view.scale, pixel_gradient, weights[pass_.view.scale])
         stacked = torch.stack(list(values.values()))
-        return SosResult(tuple(values), stacked, total if gradient else None, self.weights)
+        return SosResult(tuple(values), stacked, images.gradient() if gradient else None, self.weights)
 
     def _division(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Division:
         if view.division is not None and view.division.tiles.keys() == sizes.keys():
             return view.division
+        if view.division is not None and view.division.shares is not None:
+            raise ValueError(f"the view was prepared for the scales {[*view.division.tiles]}, not {[*sizes]}")
         return self.divider.divide(sizes, view.coverage)
 
     def _pass(
@@ -204,7 +210,7 @@ class SosLoss:
             return view.content[scale]
         if view.content_image is None:
             raise ValueError("the view was prepared without content, but content_weight is not 0")
-        return self.targets.content_features(view.content_image, scale, tiles)
+        return self.targets.content_features(self.targets.scaled(view.content_image, scale), tiles)
 
     def _collect(self, passes: Sequence[_ScalePass], *, cache: bool) -> list[dict[PartitionTile, Activations]]:
         """Run the first pass of some scales, and set the values of their terms.
@@ -244,7 +250,7 @@ class SosLoss:
     def _backward(
         self, passes: Sequence[_ScalePass], cached: Sequence[dict[PartitionTile, Activations]]
     ) -> list[Tensor]:
-        """Return the pixel gradient [h, w, 3] of each scale.
+        """Return the gradient of each scale with respect to the pixels [h, w, 3] of its view.
 
         Tiles with cached activations are processed first, which frees memory for tiles that have to be recomputed.
         """
@@ -271,11 +277,11 @@ class SosLoss:
                     term.add_gradient(tile, layer, features, gradient)
 
         with self.timer("vgg_backward"):
-            result[tile.outer.slices] += self.network.backward(activations, add)
+            result[tile.outer.within(pass_.view.area).slices] += self.network.backward(activations, add)
 
     def _forward(self, pass_: _ScalePass, tile: PartitionTile, *, cache: bool = True) -> Activations:
         with self.timer("vgg_forward"):
-            return self.network.forward(pass_.view.image[tile.outer.slices], cache=cache)
+            return self.network.forward(pass_.view.pixels(tile.outer), cache=cache)
 
 
 @dataclass

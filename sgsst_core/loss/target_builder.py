@@ -12,6 +12,7 @@ from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork, layer_stride
 from sgsst_core.loss.nearest import MOST_VECTORS, chosen_positions, nearest_layers, positions_in, positions_per_image
+from sgsst_core.loss.position_term import ScaledView
 from sgsst_core.loss.statistics_terms import compared_layers
 from sgsst_core.loss.targets import ContentFeatures, LayerTarget, StyleTarget, StyleTargets, StyleVectors, ViewTarget
 from sgsst_core.loss.tiling import Divider
@@ -127,7 +128,7 @@ class TargetBuilder:
         size, device = _size(image), image.device
         total: list[LayerStatistics] = []
         for tile in tiles:
-            features = self._forward(image, tile).features
+            features = self._forward(image[tile.outer.slices]).features
             with self._timer("statistics"):
                 own = [layer_statistics(features[c][tile.owned_cells(c, size)[1].slices]) for c in self._compared]
                 total = [merge(*pair) for pair in zip(total, own, strict=True)] if total else own
@@ -170,7 +171,7 @@ class TargetBuilder:
             for layer in self._matched
         }
         for tile in self._divider.tiles(size):
-            features = self._forward(image, tile).features
+            features = self._forward(image[tile.outer.slices]).features
             in_image, in_tile = tile.owned_cells(self._matched[0], size)
             inside, row, column = positions_in(positions, width, in_image)
             for layer, values in vectors.items():
@@ -192,7 +193,8 @@ class TargetBuilder:
         target = ViewTarget(content_image=content, coverage=weights, division=division)
         if self._has_content and cache_content:
             target.content = {
-                scale: self.content_features(content, scale, tiles) for scale, tiles in division.tiles.items()
+                scale: self.content_features(self.scaled(content, scale), tiles)
+                for scale, tiles in division.tiles.items()
             }
             target.content_image = None
         return target
@@ -204,14 +206,17 @@ class TargetBuilder:
         dtype = torch.promote_types(self._network.dtype, torch.float32)
         return coverage_pyramid(coverage.to(self._network.device, dtype), levels)
 
-    def content_features(self, content: Tensor, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
-        """Compute the content features of a content image [H, W, 3] at a scale, on the cells owned by some tiles."""
-        image = downscale(content.to(self._network.device), scale)
+    def scaled(self, content: Tensor, scale: int) -> ScaledView:
+        """Return a scale of a content image [H, W, 3]."""
+        return ScaledView.of(downscale(content.to(self._network.device), scale), scale)
+
+    def content_features(self, content: ScaledView, tiles: Sequence[PartitionTile]) -> ContentFeatures:
+        """Compute the content features of a scale of a content image, on the cells owned by some tiles."""
         result = {}
         for tile in tiles:
-            cells = tile.owned_cells(CONTENT_LAYER, _size(image))[1]
-            # Copy: a slice would keep the features of the halo alive too.
-            result[tile] = self._forward(image, tile).features[CONTENT_LAYER][cells.slices].clone()
+            cells = tile.owned_cells(CONTENT_LAYER, content.size)[1]
+            features = self._forward(content.pixels(tile.outer)).features[CONTENT_LAYER]
+            result[tile] = features[cells.slices].clone()  # a slice would keep the features of the halo alive too
         return result
 
     def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
@@ -223,9 +228,9 @@ class TargetBuilder:
         value = torch.finfo(self._network.dtype).bits // 8 * self._network.channels(CONTENT_LAYER)
         return max(sum(piece.cells(CONTENT_LAYER) for piece in own) for own in pieces) * value
 
-    def _forward(self, image: Tensor, tile: PartitionTile) -> Activations:
+    def _forward(self, pixels: Tensor) -> Activations:
         with self._timer("vgg_forward"):
-            return self._network.forward(image[tile.outer.slices], cache=False)
+            return self._network.forward(pixels, cache=False)
 
 
 def _size(image: Tensor) -> Size:

@@ -129,6 +129,7 @@ class ViewTarget:
         division: Division of work for which the content was prepared; None to divide the work in every evaluation.
         regions: Position weights of each region (its fraction of the blend weights), in the format of `coverage` and
             the order of the style targets. None if the scene has no regions.
+        background: Color of the pixels that no rank renders, because no Gaussian covers them.
     """
 
     content_image: Tensor | None = None
@@ -136,3 +137,4 @@ class ViewTarget:
     coverage: list[Tensor] | None = None
     division: Division | None = None
     regions: list[list[Tensor]] | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -12,8 +12,8 @@ from typing import Any, Literal, Protocol, TypeVar, get_args
 
 from torch import Tensor
 
+from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics
-from sgsst_core.rasterizer.base import Rows
 
 T = TypeVar("T")
 
@@ -49,15 +49,21 @@ class Collectives(Protocol):
         """
         ...
 
-    def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
-        """Return the image [H, ...] composed of every rank's band of rows [h, ...].
+    def gather_parts(
+        self, part: Tensor, parts: Sequence[Rectangle], window: Tensor, windows: Sequence[Rectangle]
+    ) -> None:
+        """Fill each rank's window of an image from every rank's part of it.
 
-        `bands` lists the rows of each rank, in order.
+        Args:
+            part: [h, w, ...], part of this rank.
+            parts: Rectangle of each rank's part in the image; they are disjoint.
+            window: [h, w, ...], window of this rank. Pixels in no part are left unchanged.
+            windows: Rectangle of each rank's window in the image; may be empty.
         """
         ...
 
-    def reduce_scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
-        """Return this rank's band [h, ...] of the sum of all ranks' images [H, ...]; adjoint of `all_gather_rows`."""
+    def reduce_parts(self, window: Tensor, parts: Sequence[Rectangle], windows: Sequence[Rectangle]) -> Tensor:
+        """Return this rank's part [h, w, ...] of the sum of all ranks' windows; adjoint of `gather_parts`."""
         ...
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
@@ -115,11 +121,17 @@ class _Alone:
     rank, size, local_size, gpu_sharing = 0, 1, 1, 1
     sent: Mapping[Traffic, int] = MappingProxyType(dict.fromkeys(TRAFFIC, 0))
 
-    def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
-        return band
+    def gather_parts(
+        self, part: Tensor, parts: Sequence[Rectangle], window: Tensor, windows: Sequence[Rectangle]
+    ) -> None:
+        shared = parts[0].intersection(windows[0])
+        window[shared.within(windows[0]).slices] = part[shared.within(parts[0]).slices]
 
-    def reduce_scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
-        return image
+    def reduce_parts(self, window: Tensor, parts: Sequence[Rectangle], windows: Sequence[Rectangle]) -> Tensor:
+        total = window.new_zeros((*parts[0].shape, *window.shape[2:]))
+        shared = parts[0].intersection(windows[0])
+        total[shared.within(parts[0]).slices] = window[shared.within(windows[0]).slices]
+        return total
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         return tensor

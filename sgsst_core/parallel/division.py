@@ -1,4 +1,4 @@
-"""Division of work among ranks: rows of a view, and pixels of its scales, by estimated cost.
+"""Division of work among ranks: the pixels of a view at all of its scales, by estimated cost.
 
 Every rank computes the whole division from the same numbers, so no messages are needed. The division affects only the
 rounding of results, because partition tiles give exact gradients for any division.
@@ -7,14 +7,11 @@ rounding of results, because partition tiles give exact gradients for any divisi
 from __future__ import annotations
 
 import functools
-import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from sgsst_core.constants import RASTER_TILE
 from sgsst_core.features.partition import PartitionTile, Rectangle, partition
 from sgsst_core.features.vgg import ALIGNMENT
-from sgsst_core.rasterizer.base import Rows
 
 Size = tuple[int, int]  # height, width in pixels
 
@@ -46,8 +43,76 @@ class Piece:
         return partition(*self.size, None, halo, self.region)[0]
 
 
-@functools.lru_cache(maxsize=1024)
-def divide(pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...]) -> tuple[tuple[Piece, ...], ...]:
+@dataclass(frozen=True)
+class Shares:
+    """Rectangles of a view, at full size, that the ranks render. Those of a rank without pixels are empty.
+
+    Attributes:
+        size: (height, width) of the view.
+        scale: Finest computed scale; no rank needs pixels of its pieces of it from another rank.
+        parts: Each rank's piece of the finest scale. They are disjoint and contain every covered pixel.
+        windows: Each rank's part and its halo, which the rank renders.
+    """
+
+    size: Size
+    scale: int
+    parts: tuple[Rectangle, ...]
+    windows: tuple[Rectangle, ...]
+
+    @staticmethod
+    def of(size: Size, by_rank: Sequence[Sequence[Piece]], halo: int) -> Shares:
+        """Return the rectangles that follow from a division of all computed scales of a view (`divide`)."""
+        scale = min(piece.scale for pieces in by_rank for piece in pieces)
+        own = [next((p for p in pieces if p.scale == scale and p.region.pixels), None) for pieces in by_rank]
+        return Shares(
+            size,
+            scale,
+            tuple(piece.region.at_full_size(scale) if piece else _NOTHING for piece in own),
+            tuple(piece.tile(halo).outer.at_full_size(scale) if piece else _NOTHING for piece in own),
+        )
+
+    def exchanged_scale(self, scales: Iterable[int]) -> int | None:
+        """Return the scale of the image that ranks exchange to compute some scales; None if they need none.
+
+        Coarser scales are computed from it. The edges of parts are between its pixels.
+        """
+        coarser = [scale for scale in scales if scale != self.scale]
+        return min(*coarser, self.scale + ALIGNMENT.bit_length() - 1) if coarser else None
+
+    def coarse_windows(self, by_rank: Sequence[Sequence[Piece]], halo: int, scale: int) -> list[Rectangle]:
+        """Return the rectangle of the exchanged image that each rank needs for its pieces of coarser scales.
+
+        Args:
+            by_rank: Pieces of each rank.
+            halo: Width in pixels of the halo around a tile.
+            scale: Scale of the exchanged image.
+        """
+        return [
+            self._coarse_window([p for p in pieces if p.scale != self.scale and p.region.pixels], halo, scale)
+            for pieces in by_rank
+        ]
+
+    def _coarse_window(self, pieces: Sequence[Piece], halo: int, scale: int) -> Rectangle:
+        if not pieces:
+            return _NOTHING
+        outer = [piece.tile(halo).outer.at_full_size(piece.scale - scale) for piece in pieces]
+        # Edges between the pixels of the coarsest of these scales, or at the border of the view.
+        step = 1 << max(piece.scale for piece in pieces) - scale
+        height, width = self.size[0] >> scale, self.size[1] >> scale
+        return Rectangle(
+            min(area.top for area in outer) // step * step,
+            min(area.left for area in outer) // step * step,
+            min(-(-max(area.bottom for area in outer) // step) * step, height),
+            min(-(-max(area.right for area in outer) // step) * step, width),
+        )
+
+
+_NOTHING = Rectangle(0, 0, 0, 0)
+
+
+def divide(
+    pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...], rendering: float = 0.0
+) -> tuple[tuple[Piece, ...], ...]:
     """Divide pieces among ranks in proportion to their speeds.
 
     The ranks are recursively split into two halves, and the pieces are divided between the halves: larger pieces go to
@@ -58,24 +123,48 @@ def divide(pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...]) -> t
         pieces: One piece per scale.
         halo: Width in pixels of the halo around a tile.
         speeds: Relative speeds of the ranks.
+        rendering: Cost of a rendered pixel, relative to that of a pixel in the network. A rank renders its piece of the
+            finest scale; 0 if what it renders does not depend on this division.
 
     Returns:
         Pieces of each rank, scale 0 first. A rank may get none if there are fewer than 16 x 16 pixels per rank.
     """
+    finest = min((piece.scale for piece in pieces), default=0)
+    return _divide(pieces, speeds, _Costs(halo, finest, rendering))
+
+
+@dataclass(frozen=True)
+class _Costs:
+    """Costs of pieces; see `divide`."""
+
+    halo: int
+    finest: int
+    rendering: float
+
+    def of(self, piece: Piece) -> float:
+        """Return the cost of a piece in pixels through the network."""
+        rendered = self.rendering * 4**self.finest if piece.scale == self.finest else 0.0
+        return piece.cost(self.halo) * (1 + rendered)
+
+
+@functools.lru_cache(maxsize=1024)
+def _divide(pieces: tuple[Piece, ...], speeds: tuple[float, ...], costs: _Costs) -> tuple[tuple[Piece, ...], ...]:
     if len(speeds) == 1:
         return (tuple(sorted(pieces, key=lambda piece: piece.scale)),)
     half = len(speeds) // 2
     fraction = sum(speeds[:half]) / sum(speeds)
-    first, second = _halves(pieces, fraction, halo)
-    return divide(first, halo, speeds[:half]) + divide(second, halo, speeds[half:])
+    first, second = _halves(pieces, fraction, costs.of)
+    return _divide(first, speeds[:half], costs) + _divide(second, speeds[half:], costs)
 
 
-def _halves(pieces: tuple[Piece, ...], fraction: float, halo: int) -> tuple[tuple[Piece, ...], tuple[Piece, ...]]:
+def _halves(
+    pieces: tuple[Piece, ...], fraction: float, cost: Callable[[Piece], float]
+) -> tuple[tuple[Piece, ...], tuple[Piece, ...]]:
     """Divide pieces into two sets; the first set has a given fraction of the cost."""
-    ordered = sorted(pieces, key=lambda piece: -piece.cost(halo))
-    costs = [piece.cost(halo) for piece in ordered]
+    ordered = sorted(pieces, key=lambda piece: -cost(piece))
+    costs = [cost(piece) for piece in ordered]
     total = sum(costs)
-    before = 0
+    before = 0.0
     index = 0  # index of the piece to split
     while index < len(ordered) - 1 and before + costs[index] < fraction * total:
         before += costs[index]
@@ -85,7 +174,7 @@ def _halves(pieces: tuple[Piece, ...], fraction: float, halo: int) -> tuple[tupl
     after = total - before - costs[index]
 
     def load(parts: tuple[Piece | None, Piece | None]) -> float:
-        own, other = (part.cost(halo) if part else 0 for part in parts)
+        own, other = (cost(part) if part else 0 for part in parts)
         return max((before + own) / fraction, (after + other) / (1 - fraction))
 
     left, right = min(_splits(ordered[index]), key=load)
@@ -108,20 +197,6 @@ def _splits(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
         left = part(Rectangle(area.top, area.left, area.bottom, column))
         splits.append((left, part(Rectangle(area.top, column, area.bottom, area.right))))
     return splits
-
-
-def divide_rows(height: int, count: int, covered: Rows | None = None) -> list[Rows]:
-    """Divide the rows of an image into one band per rank, in order. Bands may be empty.
-
-    Bands start at raster tile boundaries, because two ranks would have to process the Gaussians of a divided tile. The
-    covered rows are divided equally. Empty rows above and below them cost nothing, and belong to the first and last
-    band.
-    """
-    top, bottom = covered or (0, height)
-    first, last = top // RASTER_TILE, -(-bottom // RASTER_TILE)
-    edges = [min((first + (last - first) * part // count) * RASTER_TILE, height) for part in range(count + 1)]
-    edges[0], edges[-1] = 0, height
-    return list(itertools.pairwise(edges))
 
 
 def rounds(scales: Sequence[int], ranks: int) -> list[list[int]]:

@@ -28,9 +28,9 @@ from sgsst_core.features.partition import (
 from sgsst_core.features.vgg import layer_stride
 from sgsst_core.loss.nearest import MATCH_BYTES, MOST_VECTORS, working_bytes
 from sgsst_core.loss.scale_weights import ScaleWeights
-from sgsst_core.loss.tiling import Tiling
+from sgsst_core.loss.tiling import RENDERING, Tiling
 from sgsst_core.parallel.collectives import Traffic
-from sgsst_core.parallel.division import Piece, Size, divide, loads, rounds
+from sgsst_core.parallel.division import Piece, Shares, Size, divide, loads, rounds
 from sgsst_core.parallel.shown import gaussians_sent
 from sgsst_core.planning.facts import Link, Probe, Rate
 from sgsst_core.planning.measuring import (
@@ -393,7 +393,7 @@ class ViewCosts:
 class IterationWork:
     """Work of an iteration on one view, divided among ranks by `division`.
 
-    Communication is counted in bytes and messages, assuming ring algorithms.
+    Communication is counted in bytes and messages, assuming ring algorithms for sums.
 
     Attributes:
         pieces: One piece for each computed scale.
@@ -409,6 +409,9 @@ class IterationWork:
         shown: Number of Gaussians that the view shows, whose gradients are sent; None for all.
         matching: Time in seconds of the nearest-neighbor search on one rank.
         largest_tile: Maximum pixels of a partition tile; None for no limit.
+        rendered: One piece for each scale of the job, whose division determines what each rank renders; empty if these
+            are `pieces`.
+        rendering: Cost of rendering a pixel that the division assumes; see `Tiling`.
     """
 
     pieces: tuple[Piece, ...]
@@ -424,6 +427,8 @@ class IterationWork:
     shown: float | None = None
     matching: float = 0.0
     largest_tile: int | None = None
+    rendered: tuple[Piece, ...] = ()
+    rendering: float = 0.0
 
     def computing(self, ranks: int, groups: int = 1) -> float:
         """Return the computing time in seconds of the rank with most work.
@@ -432,10 +437,15 @@ class IterationWork:
             ranks: Number of ranks per group.
             groups: Number of groups, each of which takes a view.
         """
-        shards = divide(self.pieces, self.halo, (1.0,) * ranks)
+        shards = self._shards(ranks)
         held = self.held / min(ranks * groups, self.sharing)
-        network = max(self._network(shard, ranks, held) for shard in shards)
-        return network + (self.raster + self.matching) / ranks + self.fixed
+        windows = [window.pixels for window in self._shares(ranks).windows]
+        whole = max(self._shares(1).windows[0].pixels, 1)
+        own = (
+            self._network(shard, ranks, held) + self.raster * window / whole
+            for shard, window in zip(shards, windows, strict=True)
+        )
+        return max(own) + self.matching / ranks + self.fixed
 
     def _network(self, shard: Sequence[Piece], ranks: int, held: float) -> float:
         """Return the time in seconds of a rank's pieces, split into partition tiles as its memory requires."""
@@ -460,25 +470,47 @@ class IterationWork:
         """
         if ranks == 1:
             return 0.0
-        image = 2 * link.all_gather(self._image_bytes, ranks)
+        busiest = max(max(sent, received) for sent, received in self._image_bytes(ranks))
+        image = 2 * (link.all_gather(0, ranks) + busiest / link.bandwidth)
         statistics = link.all_reduce(_FIRST_BYTES, ranks) + link.all_reduce(_SECOND_BYTES, ranks)
         return image + statistics + link.all_reduce(self._gradient_bytes, ranks)
 
     def sent(self, ranks: int) -> dict[Traffic, int]:
-        """Return the bytes that a rank sends for each purpose, at all scales, as counted by `Collectives.sent`."""
+        """Return the bytes that a rank sends for each purpose, at all scales, as counted by `Collectives.sent`.
+
+        Ranks send different parts of the image; the value is that of the rank that sends most.
+        """
         twice = 2 * (ranks - 1) / ranks  # once to reduce, once to distribute
         statistics = len(self.pieces) * (_FIRST_BYTES + _SECOND_BYTES)
         return {
-            "image": int(twice * self._image_bytes),
+            "image": max(sent + received for sent, received in self._image_bytes(ranks)),
             "statistics": int(twice * statistics),
             "gradient": int(twice * self._gradient_bytes),
         }
 
-    @property
-    def _image_bytes(self) -> int:
-        # full size, whichever scales are computed from it
-        height, width = max((piece.size[0] << piece.scale, piece.size[1] << piece.scale) for piece in self.pieces)
-        return 12 * height * width
+    def _shares(self, ranks: int) -> Shares:
+        pieces = self.rendered or self.pieces
+        height, width = max((piece.size[0] << piece.scale, piece.size[1] << piece.scale) for piece in pieces)
+        by_rank = divide(pieces, self.halo, (1.0,) * ranks, self.rendering)
+        return Shares.of((height, width), by_rank, self.halo)
+
+    def _shards(self, ranks: int) -> tuple[tuple[Piece, ...], ...]:
+        rendering = self.rendering if self.rendered in ((), self.pieces) else 0.0
+        return divide(self.pieces, self.halo, (1.0,) * ranks, rendering)
+
+    def _image_bytes(self, ranks: int) -> list[tuple[int, int]]:
+        """Return the bytes of the image that each rank sends and receives; those of its gradient go the other way."""
+        shares = self._shares(ranks)
+        scale = shares.exchanged_scale(piece.scale for piece in self.pieces)
+        if scale is None:
+            return [(0, 0)] * ranks
+        windows = shares.coarse_windows(self._shards(ranks), self.halo, scale)
+        parts = [part.at_scale(scale) for part in shares.parts]
+        shared = [[12 * part.intersection(window).pixels for window in windows] for part in parts]
+        return [
+            (sum(shared[rank]) - shared[rank][rank], sum(row[rank] for row in shared) - shared[rank][rank])
+            for rank in range(ranks)
+        ]
 
     @property
     def _gradient_bytes(self) -> int:
@@ -667,8 +699,10 @@ class CostModel:
                 shown=plan.survey.shown,
                 matching=network.rate.search * sum(map(pairs_of, pieces)),
                 largest_tile=network.largest_tile,
+                rendered=rendered,
+                rendering=self.tiling.rendering,
             )
-            for pieces in self._pieces(sample, coarsest=coarsest)
+            for pieces, rendered in zip(self._pieces(sample, coarsest=coarsest), self._pieces(sample), strict=True)
         ]
 
     def whole_job(self, steps: Prediction, activations: int) -> tuple[Prediction, int, int]:
@@ -748,6 +782,7 @@ def tiling_of(probe: Probe, settings: Settings) -> Tiling:
         cache_activations="activations" not in settings.keep,
         weights=ScaleWeights(settings.scales),
         largest=network.largest_tile,
+        rendering=RENDERING[probe.machine.device],
     )
 
 

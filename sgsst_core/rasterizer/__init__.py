@@ -12,7 +12,7 @@ import torch
 
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.base import Color, Rasterizer, Rows
+from sgsst_core.rasterizer.base import Color, Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.cuda import CudaRasterizer
@@ -20,7 +20,7 @@ from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.gaussians import Scene
 
-__all__ = ["RASTERIZERS", "Rasterizer", "Rows", "gpu_rasterizers", "make_rasterizer", "rasterizer_for"]
+__all__ = ["RASTERIZERS", "Rasterizer", "gpu_rasterizers", "make_rasterizer", "rasterizer_for"]
 
 #: All rasterizers by name; those for GPUs in order of preference.
 RASTERIZERS: dict[str, type[Rasterizer]] = {

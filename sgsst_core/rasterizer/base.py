@@ -23,41 +23,27 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.timing import wait_for
 
 Color = tuple[float, float, float]
-#: Half-open band (start, stop) of pixel rows of a view.
-Rows = tuple[int, int]
-
 #: Precision of cached blend weights. `half` stores weights times a power of two as float16, with a relative error of at
 #: most 2^-11 per weight.
 Precision = Literal["float32", "half"]
 
 #: Cache key of a camera. It contains everything that rendering depends on, so cameras with equal keys render equal
 #: images. The camera's name is not part of it.
-CameraKey = tuple[int, int, float, float, float, float, bytes]
+CameraKey = tuple[int, int, tuple[float, ...], bytes]
 
 
 def camera_key(camera: Camera) -> CameraKey:
     """Return the cache key of a camera."""
     pose = camera.world_to_camera.detach().cpu().double().contiguous().numpy().tobytes()
-    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, pose
-
-
-def check_rows(camera: Camera, rows: Rows | None) -> Rows:
-    """Validate a band of rows and return it as (start, stop); None stands for the whole view.
-
-    Raises:
-        ValueError: If the band is empty or extends beyond the view.
-    """
-    start, stop = (0, camera.height) if rows is None else rows
-    if not 0 <= start < stop <= camera.height:
-        raise ValueError(f"rows {start} to {stop}: a band of view {camera.name!r} lies within 0 to {camera.height}")
-    return start, stop
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.slope_limits)
+    return camera.width, camera.height, intrinsics, pose
 
 
 class CachedWeights(Protocol):
-    """Cached blend weights of one band of a view, on the device where they are applied.
+    """Cached blend weights of a view, on the device where they are applied.
 
     Attributes:
-        transmittance: [h, width] float32, final transmittance.
+        transmittance: [h, w] float32, final transmittance.
     """
 
     transmittance: Tensor
@@ -68,16 +54,16 @@ class CachedWeights(Protocol):
         ...
 
     def render(self, colors: Tensor) -> Tensor:
-        """Return the float32 image [h, width, 3] of colors [N, 3] over the background."""
+        """Return the float32 image [h, w, 3] of colors [N, 3] over the background."""
         ...
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
-        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, width, 3]."""
+        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, w, 3]."""
         ...
 
 
 class CountedWeights(Protocol):
-    """Blend weights of one band of a view, counted but not stored."""
+    """Blend weights of a view, counted but not stored."""
 
     def nbytes(self, precision: Precision) -> int:
         """Return the size that the weights would have in bytes."""
@@ -162,33 +148,31 @@ class Rasterizer(ABC):
             raise SettingsError(f"rasterizer {cls.name!r} runs on the CPU, not on {device}: choose 'cached' or 'cuda'")
         return torch.device("cpu")
 
-    def render(self, colors: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return the image [h, width, 3] of colors [N, 3] over the background.
+    def render(self, colors: Tensor, camera: Camera) -> Tensor:
+        """Return the image [h, w, 3] of colors [N, 3] over the background.
 
         Args:
             colors: Colors of one view, after spherical harmonics and clamping.
-            camera: Camera of the view.
-            rows: Band of rows to render; None for the whole view.
+            camera: Camera of the view, or of a rectangle of it (`Camera.cropped`).
         """
-        band, expected = check_rows(camera, rows), (len(self.scene), 3)
+        expected = (len(self.scene), 3)
         if tuple(colors.shape) != expected:
             raise ValueError(f"colors of shape {tuple(colors.shape)}: the scene needs {expected}")
-        return self._render(self._converted(colors), camera, band)
+        return self._render(self._converted(colors), camera)
 
-    def coverage(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return 1 - T_final, [h, width] in [0, 1]: how much of each pixel the Gaussians cover."""
-        return self._coverage(camera, check_rows(camera, rows))
+    def coverage(self, camera: Camera) -> Tensor:
+        """Return 1 - T_final, [h, w] in [0, 1]: how much of each pixel the Gaussians cover."""
+        return self._coverage(camera)
 
-    def color_gradient(self, image_gradient: Tensor, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3] of the rows."""
-        band = check_rows(camera, rows)
-        expected = (band[1] - band[0], camera.width, 3)
+    def color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
+        """Return W^T dL/dimage, [N, 3], given the image gradient [h, w, 3]."""
+        expected = (camera.height, camera.width, 3)
         if tuple(image_gradient.shape) != expected:
-            raise ValueError(f"image gradient of shape {tuple(image_gradient.shape)}: the band needs {expected}")
-        return self._color_gradient(self._converted(image_gradient), camera, band)
+            raise ValueError(f"image gradient of shape {tuple(image_gradient.shape)}: the view needs {expected}")
+        return self._color_gradient(self._converted(image_gradient), camera)
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Return coverage [h, width] of the whole view, and each Gaussian's blend weight summed over all pixels [N].
+        """Return coverage [h, w], and each Gaussian's blend weight summed over all pixels [N].
 
         The latter is a column of the color gradient for an image gradient of ones.
         """
@@ -197,15 +181,15 @@ class Rasterizer(ABC):
         return coverage, self.color_gradient(ones, camera)[:, 0]
 
     @abstractmethod
-    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
+    def _render(self, colors: Tensor, camera: Camera) -> Tensor:
         """Implement `render` for valid arguments on the rasterizer's device, in its dtype."""
 
     @abstractmethod
-    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
-        """Implement `coverage` for a valid band."""
+    def _coverage(self, camera: Camera) -> Tensor:
+        """Implement `coverage`."""
 
     @abstractmethod
-    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
         """Implement `color_gradient` for valid arguments on the rasterizer's device, in its dtype."""
 
     def _converted(self, values: Tensor) -> Tensor:
@@ -248,24 +232,20 @@ class Rasterizer(ABC):
         """Rasterizer whose images are bit-identical whether or not weights are cached."""
         return self
 
-    def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
-        """Count a band's weights without storing them; takes about as long as one render.
+    def count_weights(self, camera: Camera) -> CountedWeights:
+        """Count a view's weights without storing them; takes about as long as one render.
 
         Raises:
             NotImplementedError: If `can_cache` is False.
         """
-        raise NotImplementedError(f"rasterizer {self.name!r} cannot cache the blend weights of {camera.name!r}, {rows}")
+        raise NotImplementedError(f"rasterizer {self.name!r} cannot cache the blend weights of {camera.name!r}")
 
-    def cache_weights(self, camera: Camera, rows: Rows | None = None) -> bool:
-        """Cache a band's weights if possible, and return whether they are cached."""
+    def cache_weights(self, camera: Camera) -> bool:
+        """Cache a view's weights if possible, and return whether they are cached."""
         return False
 
-    def temporary_weights(
-        self,
-        camera: Camera,
-        rows: Rows | None = None,
-    ) -> AbstractContextManager[None]:
-        """Use cached weights for a band inside a `with` block if this rasterizer caches any."""
+    def temporary_weights(self, camera: Camera) -> AbstractContextManager[None]:
+        """Use cached weights for a view inside a `with` block if this rasterizer caches any."""
         return nullcontext()
 
     def release_view(self, camera: Camera, budget: int) -> None:
@@ -273,6 +253,9 @@ class Rasterizer(ABC):
 
         Only rasterizers whose data share a memory budget with cached weights need this.
         """
+
+    def forget_views(self) -> None:
+        """Drop all cached data of views, because other views or other rectangles of them are rendered from now on."""
 
     # --- cost ---
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -24,22 +23,12 @@ from sgsst_core.rasterizer.base import (
     Precision,
     Rasterizer,
     RenderCost,
-    Rows,
     camera_key,
-    check_rows,
 )
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-
-
-@dataclass(frozen=True)
-class _CachedBand:
-    """Cached weights of a band of rows."""
-
-    band: Rows
-    weights: CachedWeights
 
 
 class CachedRasterizer(Rasterizer):
@@ -49,10 +38,9 @@ class CachedRasterizer(Rasterizer):
     would exceed `max_bytes`. Nothing is ever evicted: views are visited in rounds, so evicted weights would be needed
     again before the remaining ones.
 
-    If a view or band has no cached weights, `uncached` computes it in every call. Compared with cached float32 weights,
-    images are then bit-identical on the CPU and equal up to rounding on a GPU; gradients are equal up to rounding on
-    both. If the weights of a whole view are cached, they serve all of its bands. Color gradients are reproducible bit
-    for bit.
+    If a view has no cached weights, `uncached` computes it in every call. Compared with cached float32 weights, images
+    are then bit-identical on the CPU and equal up to rounding on a GPU; gradients are equal up to rounding on both.
+    Color gradients are reproducible bit for bit.
 
     Args:
         scene: Scene, whose geometry must not change during this object's lifetime.
@@ -96,8 +84,8 @@ class CachedRasterizer(Rasterizer):
         self.max_bytes = max_bytes
         self.least_intersection_bytes = least_intersection_bytes
         self._at_first_use = at_first_use
-        self._cached: Cache[tuple[CameraKey, Rows], _CachedBand] = Cache(max_bytes)
-        self._temporary: dict[tuple[CameraKey, Rows], _CachedBand] = {}
+        self._cached: Cache[CameraKey, CachedWeights] = Cache(max_bytes)
+        self._temporary: dict[CameraKey, CachedWeights] = {}
         self._lock = threading.Lock()
 
     @classmethod
@@ -121,43 +109,48 @@ class CachedRasterizer(Rasterizer):
         exact = self.precision == "float32" and self.uncached.caches_exactly
         return self if exact else self.uncached
 
-    def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
-        """Count a band's weights without storing them; takes about as long as one render."""
-        return self.uncached.count_weights(camera, rows)
+    def count_weights(self, camera: Camera) -> CountedWeights:
+        """Count a view's weights without storing them; takes about as long as one render."""
+        return self.uncached.count_weights(camera)
 
-    def cache_weights(self, camera: Camera, rows: Rows | None = None) -> bool:
-        """Cache a band's weights if they fit, and return whether the band has cached weights.
+    def cache_weights(self, camera: Camera) -> bool:
+        """Cache a view's weights if they fit, and return whether the view has cached weights.
 
-        The first call for a band decides whether its weights fit; later calls do not reconsider this.
+        The first call for a view decides whether its weights fit; later calls do not reconsider this.
         """
-        key, band = camera_key(camera), check_rows(camera, rows)
+        key = camera_key(camera)
         with self._lock:
-            if self._serving(key, band, camera) is None:
-                self._cached.add((key, band), lambda: self._counted(camera, band))
-            return self._serving(key, band, camera) is not None
+            if self._serving(key) is None:
+                self._cached.add(key, lambda: self._counted(camera))
+            return self._serving(key) is not None
+
+    def forget_views(self) -> None:
+        """Drop the weights and the tile intersections of all views."""
+        self._cached.clear()
+        self.uncached.forget_views()
 
     @contextmanager
-    def temporary_weights(self, camera: Camera, rows: Rows | None = None) -> Iterator[None]:
-        """Use temporary cached weights for a band inside a `with` block.
+    def temporary_weights(self, camera: Camera) -> Iterator[None]:
+        """Use temporary cached weights for a view inside a `with` block.
 
-        If the band already has cached weights, those are used. If the weights alone would exceed `max_bytes`, they are
-        not computed, and the band is rendered without them.
+        If the view already has cached weights, those are used. If the weights alone would exceed `max_bytes`, they are
+        not computed, and the view is rendered without them.
         """
-        key, band = camera_key(camera), check_rows(camera, rows)
-        counted = None if self._serving(key, band, camera) else self.count_weights(camera, band)
+        key = camera_key(camera)
+        counted = None if self._serving(key) else self.count_weights(camera)
         if counted is not None and (self.max_bytes is None or counted.nbytes(self.precision) <= self.max_bytes):
-            self._temporary[key, band] = _CachedBand(band, counted.store(self.precision))
+            self._temporary[key] = counted.store(self.precision)
         try:
             yield
         finally:
-            self._temporary.pop((key, band), None)
+            self._temporary.pop(key, None)
 
-    def is_cached(self, camera: Camera, rows: Rows | None = None) -> bool:
-        """Return whether the band has cached weights."""
-        return self._serving(camera_key(camera), check_rows(camera, rows), camera) is not None
+    def is_cached(self, camera: Camera) -> bool:
+        """Return whether the view has cached weights."""
+        return self._serving(camera_key(camera)) is not None
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Return coverage [h, width] of the whole view, and each Gaussian's blend weight summed over all pixels [N].
+        """Return coverage [h, w], and each Gaussian's blend weight summed over all pixels [N].
 
         Does not cache any weights.
         """
@@ -167,51 +160,39 @@ class CachedRasterizer(Rasterizer):
         """Measure the cost of rendering some views with gradient without cached weights."""
         return self.uncached.probe_cost(cameras)
 
-    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
-        cached = self._cached_for(camera, band)
-        if cached is None:
-            return self.uncached.render(colors, camera, band)
-        return cached.weights.render(colors)[band[0] - cached.band[0] : band[1] - cached.band[0]]
+    def _render(self, colors: Tensor, camera: Camera) -> Tensor:
+        cached = self._cached_for(camera)
+        return self.uncached.render(colors, camera) if cached is None else cached.render(colors)
 
-    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
-        cached = self._cached_for(camera, band)
-        if cached is None:
-            return self.uncached.coverage(camera, band)
-        return 1 - cached.weights.transmittance[band[0] - cached.band[0] : band[1] - cached.band[0]]
+    def _coverage(self, camera: Camera) -> Tensor:
+        cached = self._cached_for(camera)
+        return self.uncached.coverage(camera) if cached is None else 1 - cached.transmittance
 
-    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
-        cached = self._cached_for(camera, band)
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
+        cached = self._cached_for(camera)
         if cached is None:
-            return self.uncached.color_gradient(image_gradient, camera, band)
-        if cached.band != band:  # weights of the whole view: pad the gradient with zeros in all other rows
-            whole = image_gradient.new_zeros((camera.height, camera.width, 3))
-            whole[band[0] : band[1]] = image_gradient
-            image_gradient = whole
-        return cached.weights.color_gradient(image_gradient)
+            return self.uncached.color_gradient(image_gradient, camera)
+        return cached.color_gradient(image_gradient)
 
-    def _cached_for(self, camera: Camera, band: Rows) -> _CachedBand | None:
-        """Return the cached weights for a band, or None. With `at_first_use` they are computed first, if they fit."""
+    def _cached_for(self, camera: Camera) -> CachedWeights | None:
+        """Return the cached weights for a view, or None. With `at_first_use` they are computed first, if they fit."""
         if self._at_first_use:
-            self.cache_weights(camera, band)
-        return self._serving(camera_key(camera), band, camera)
+            self.cache_weights(camera)
+        return self._serving(camera_key(camera))
 
-    def _serving(self, key: CameraKey, band: Rows, camera: Camera) -> _CachedBand | None:
-        """Return the currently cached weights that serve a band; None if there are none.
+    def _serving(self, key: CameraKey) -> CachedWeights | None:
+        """Return the cached or temporary weights of a view; None if there are none."""
+        return self._cached.values.get(key) or self._temporary.get(key)
 
-        Weights of the whole view take precedence over those of the band, and these over temporary weights.
-        """
-        whole = self._cached.values.get((key, (0, camera.height)))
-        return whole or self._cached.values.get((key, band)) or self._temporary.get((key, band))
+    def _counted(self, camera: Camera) -> tuple[int, Callable[[], CachedWeights]]:
+        """Return the size in bytes of a view's weights, and a function that computes them."""
+        counted = self.count_weights(camera)
 
-    def _counted(self, camera: Camera, band: Rows) -> tuple[int, Callable[[], _CachedBand]]:
-        """Return the size in bytes of a band's weights, and a function that computes them."""
-        counted = self.count_weights(camera, band)
-
-        def make() -> _CachedBand:
+        def make() -> CachedWeights:
             weights = counted.store(self.precision)
             if self.max_bytes is not None:
                 left = self.max_bytes - self.cached_bytes - weights.nbytes
                 self.uncached.release_view(camera, max(left, self.least_intersection_bytes))
-            return _CachedBand(band, weights)
+            return weights
 
         return counted.nbytes(self.precision), make

@@ -17,7 +17,7 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import ALPHA_MAX
 from sgsst_core.rasterizer import kernels
-from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost, Rows, check_rows
+from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost
 from sgsst_core.rasterizer.projection import Shapes
 from sgsst_core.rasterizer.tile_intersections import (
     TileIntersections,
@@ -35,9 +35,8 @@ DEFAULT_INTERSECTION_BYTES = 1 << 30
 class CpuRasterizer(Rasterizer):
     """Rasterizer in compiled float32 code.
 
-    The order of summation is fixed. Results are therefore bit-identical for any number of threads, and the concatenated
-    images of bands are bit-identical to that of the whole view. Tile intersections are cached within a budget
-    (`ViewCache`).
+    The order of summation is fixed, so results are bit-identical for any number of threads. Tile intersections are
+    cached within a budget (`ViewCache`).
 
     Args:
         scene, background, near, device: As in `Rasterizer`.
@@ -115,11 +114,15 @@ class CpuRasterizer(Rasterizer):
         self._intersections.take(camera)
         self._intersections.limit(budget)
 
-    def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
-        """Count a band's weights without storing them; takes about as long as one render."""
+    def forget_views(self) -> None:
+        """Drop the tile intersections of all views."""
+        self._intersections.clear()
+
+    def count_weights(self, camera: Camera) -> CountedWeights:
+        """Count a view's weights without storing them; takes about as long as one render."""
         from sgsst_core.rasterizer.cpu_cached import CountedStrips
 
-        return CountedStrips(self, camera, check_rows(camera, rows))
+        return CountedStrips(self, camera)
 
     def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
         """Measure the cost of rendering some views with gradient; reuses their tile intersections if cached."""
@@ -135,13 +138,13 @@ class CpuRasterizer(Rasterizer):
             preparation += time.perf_counter() - started
         return RenderCost(seconds, preparation / len(cameras), size // len(cameras))
 
-    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
-        return self._blend(colors.numpy(), camera, band)[0]
+    def _render(self, colors: Tensor, camera: Camera) -> Tensor:
+        return self._blend(colors.numpy(), camera)[0]
 
-    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
-        return 1 - self._blend(np.zeros((len(self.scene), 3), dtype=np.float32), camera, band)[1]
+    def _coverage(self, camera: Camera) -> Tensor:
+        return 1 - self._blend(np.zeros((len(self.scene), 3), dtype=np.float32), camera)[1]
 
-    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
         isects = self.intersections(camera)
         projection = isects.projection
         slot_gradients = np.empty((len(isects.ranks), 3), dtype=np.float32)
@@ -153,7 +156,6 @@ class CpuRasterizer(Rasterizer):
                 isects.starts,
                 projection.values,
                 image_gradient.numpy(),
-                band[0],
                 self.alpha_max,
                 slot_gradients,
             )
@@ -161,7 +163,7 @@ class CpuRasterizer(Rasterizer):
         return torch.from_numpy(gradient)
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N], in one pass.
+        """Return coverage [h, w], and each Gaussian's blend weight summed over all pixels [N], in one pass.
 
         Bit-identical to `coverage`, and to a column of `color_gradient` for an image gradient of ones.
         """
@@ -177,12 +179,11 @@ class CpuRasterizer(Rasterizer):
             kernels.add_slot_weights(slot_weights, isects.first_slots, isects.projection.gaussians, weights)
         return 1 - torch.from_numpy(transmittance), torch.from_numpy(weights)
 
-    def _blend(self, colors: NDArray[np.float32], camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
-        """Return the image and the final transmittance of a band."""
+    def _blend(self, colors: NDArray[np.float32], camera: Camera) -> tuple[Tensor, Tensor]:
+        """Return the image and the final transmittance of a view."""
         isects = self.intersections(camera)
-        height = band[1] - band[0]
-        image = np.empty((height, camera.width, 3), dtype=np.float32)
-        transmittance = np.empty((height, camera.width), dtype=np.float32)
+        image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
+        transmittance = np.empty((camera.height, camera.width), dtype=np.float32)
         with kernel_threads():
             kernels.render(
                 isects.ranks,
@@ -191,7 +192,6 @@ class CpuRasterizer(Rasterizer):
                 isects.projection.gaussians,
                 colors,
                 self.background.numpy(),
-                band[0],
                 self.alpha_max,
                 image,
                 transmittance,

@@ -14,7 +14,7 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import kernels
-from sgsst_core.rasterizer.base import Precision, Rows
+from sgsst_core.rasterizer.base import Precision
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import run_starts
 from sgsst_core.scene.camera import Camera
@@ -24,7 +24,7 @@ _PIECE_BYTES = 4  # item index
 
 
 class CountedStrips:
-    """Sizes of a band's weights, counted before the weights are stored. Counting takes about as long as one render.
+    """Sizes of a view's weights, counted before the weights are stored. Counting takes about as long as one render.
 
     Attributes:
         items: [strips], number of items in each strip.
@@ -32,8 +32,8 @@ class CountedStrips:
         slot_items: [E], number of items of each pair of Gaussian and raster tile.
     """
 
-    def __init__(self, rasterizer: CpuRasterizer, camera: Camera, band: Rows) -> None:
-        self.rasterizer, self.camera, self.band = rasterizer, camera, band
+    def __init__(self, rasterizer: CpuRasterizer, camera: Camera) -> None:
+        self.rasterizer, self.camera = rasterizer, camera
         self.intersections = isects = rasterizer.intersections(camera)
         strips = (len(isects.starts) - 1) * (RASTER_TILE // kernels.STRIP)
         sizes = (strips, strips * kernels.BLOCKS, len(isects.ranks))
@@ -41,11 +41,11 @@ class CountedStrips:
         tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values)
         counts = (self.items, self.pieces, self.slot_items)
         with kernel_threads():
-            kernels.count_weights(*tiles, band, camera.width, rasterizer.alpha_max, *counts)
+            kernels.count_weights(*tiles, camera.height, camera.width, rasterizer.alpha_max, *counts)
 
     def nbytes(self, precision: Precision) -> int:
         """Return the size of the weights in bytes."""
-        pixels = (self.band[1] - self.band[0]) * self.camera.width
+        pixels = self.camera.height * self.camera.width
         index = self.items.nbytes + self.pieces.nbytes + 4 * pixels + _ITEM_BYTES * int(self.items.sum())
         piece = _PIECE_BYTES + kernels.PIECE * (4 if precision == "float32" else 2)
         return index + int(self.pieces.sum()) * piece
@@ -56,15 +56,14 @@ class CountedStrips:
 
 
 class WeightStrips:
-    """Cached blend weights of one band of a view.
+    """Cached blend weights of a view.
 
     A strip is 8 columns by 16 rows. Weights are stored in float32 or float16, for those blocks of 4 rows of a strip in
     which a Gaussian has weights.
     """
 
     def __init__(self, counted: CountedStrips, precision: Precision) -> None:
-        rasterizer, isects, band = counted.rasterizer, counted.intersections, counted.band
-        self.first_row = band[0]
+        rasterizer, isects = counted.rasterizer, counted.intersections
         self.background = rasterizer.background.numpy()
         self.gaussians = isects.projection.gaussians
         self.nbytes = counted.nbytes(precision)
@@ -85,27 +84,27 @@ class WeightStrips:
             items=np.empty(pieces, dtype=np.int32),
             weights=weights,
         )
-        transmittance = np.ones((band[1] - band[0], counted.camera.width), dtype=np.float32)
+        transmittance = np.ones((counted.camera.height, counted.camera.width), dtype=np.float32)
         self.transmittance = torch.from_numpy(transmittance)
         # This buffer can be reused, because `kernel_threads` lets only one thread run kernels at a time.
         self._slot_gradients = np.empty((items, 3), dtype=np.float32)
         tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values, self.gaussians)
         with kernel_threads():
-            kernels.store_weights(*tiles, band, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
+            kernels.store_weights(*tiles, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
 
     def render(self, colors: Tensor) -> Tensor:
-        """Return the image [h, width, 3] of colors [N, 3] over the background."""
+        """Return the image [h, w, 3] of colors [N, 3] over the background."""
         transmittance = self.transmittance.numpy()
         image = np.empty((*transmittance.shape, 3), dtype=np.float32)
         with kernel_threads():
-            kernels.apply_weights(self.strips, colors.numpy(), self.background, transmittance, self.first_row, image)
+            kernels.apply_weights(self.strips, colors.numpy(), self.background, transmittance, image)
         return torch.from_numpy(image)
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
-        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3]."""
+        """Return W^T dL/dimage, [N, 3], given the image gradient [h, w, 3]."""
         gradient = np.zeros((self._total, 3), dtype=np.float32)
         pixels = image_gradient.numpy()
         with kernel_threads():
-            kernels.apply_transposed_weights(self.strips, pixels, self.first_row, self._slot_gradients)
+            kernels.apply_transposed_weights(self.strips, pixels, self._slot_gradients)
             kernels.add_slots(self._slot_gradients, self.first_slots, self.gaussians, gradient)
         return torch.from_numpy(gradient)

@@ -3,8 +3,8 @@
 It calls the public stages of gsplat's `rasterization` separately. Geometry is frozen, so projection and tile
 intersections are computed once per view.
 
-Bands of rows are exact, because Gaussians are always projected onto the whole view, to whose frustum slopes are
-clamped. For a band, the projected centers are then shifted up by its first row, and tiles outside the band are dropped.
+Cropped cameras are exact, because Gaussians are always projected onto the whole view, to whose frustum slopes are
+clamped. The projected centers are then shifted to the crop, and tiles outside it are dropped.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from torch import Tensor
 
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.base import CameraKey, Rasterizer, Rows, camera_key
+from sgsst_core.rasterizer.base import CameraKey, Rasterizer, camera_key
+from sgsst_core.rasterizer.tile_intersections import tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -48,7 +49,7 @@ def gsplat_alpha_max(version: str) -> float:
 
 @dataclass(frozen=True)
 class _Splats:
-    """Projected Gaussians and tile intersections of a band in gsplat's format, with a batch dimension of 1."""
+    """Projected Gaussians and tile intersections of a view in gsplat's format, with a batch dimension of 1."""
 
     means: Tensor
     conics: Tensor
@@ -61,7 +62,7 @@ class CudaRasterizer(Rasterizer):
     """Rasterizer that calls gsplat on one GPU.
 
     Results are gsplat's in float32. Its backward pass uses atomics, so gradients are reproducible only up to rounding.
-    Projection and tile intersections of the latest view and band are cached.
+    Projection and tile intersections of the latest view are cached.
 
     Args:
         scene, background, near: As in `Rasterizer`.
@@ -83,7 +84,7 @@ class CudaRasterizer(Rasterizer):
         self._quats = scene.quats.to(self.device)
         self._scales = scene.scales.to(self.device).exp()
         self._opacities = scene.opacities.to(self.device).sigmoid()
-        self._latest: tuple[CameraKey, Rows, _Splats] | None = None
+        self._latest: tuple[CameraKey, _Splats] | None = None
 
     @classmethod
     def usable_device(cls, device: torch.device | str | None) -> torch.device:
@@ -100,52 +101,53 @@ class CudaRasterizer(Rasterizer):
         return chosen
 
     @torch.no_grad()
-    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
-        image, alpha = self._rasterize(colors, camera, band)
+    def _render(self, colors: Tensor, camera: Camera) -> Tensor:
+        image, alpha = self._rasterize(colors, camera)
         return image + (1 - alpha) * self.background
 
     @torch.no_grad()
-    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
+    def _coverage(self, camera: Camera) -> Tensor:
         nothing = torch.zeros(len(self.scene), 3, device=self.device)
-        return self._rasterize(nothing, camera, band)[1][..., 0]
+        return self._rasterize(nothing, camera)[1][..., 0]
 
-    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
         # The image is linear in the colors, so the gradient of <image, image_gradient> is the same at any colors.
         with torch.enable_grad():
             colors = torch.zeros(len(self.scene), 3, device=self.device, requires_grad=True)
-            image, _ = self._rasterize(colors, camera, band)
+            image, _ = self._rasterize(colors, camera)
             (gradient,) = torch.autograd.grad(image, colors, image_gradient)
         return gradient
 
-    def _rasterize(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
-        """Return the image [h, width, 3] over black, and 1 - T_final [h, width, 1]."""
-        splats = self._splats(camera, band)
+    def _rasterize(self, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Return the image [h, w, 3] over black, and 1 - T_final [h, w, 1]."""
+        splats = self._splats(camera)
         image, alpha = self._gsplat.rasterize_to_pixels(
             splats.means,
             splats.conics,
             colors[None],
             splats.opacities,
             camera.width,
-            band[1] - band[0],
+            camera.height,
             RASTER_TILE,
             splats.tile_offsets,
             splats.flat_ids,
         )
         return image[0], alpha[0]
 
-    def _splats(self, camera: Camera, band: Rows) -> _Splats:
-        """Return the projection of the whole view shifted into the band, and the band's tile intersections."""
+    def _splats(self, camera: Camera) -> _Splats:
+        """Return the projection of a view and its tile intersections."""
         key = camera_key(camera)
-        if self._latest is None or self._latest[:2] != (key, band):
+        if self._latest is None or self._latest[0] != key:
             self._latest = None  # free its memory before the next one is built
-            self._latest = (key, band, self._project(camera, band))
-        return self._latest[2]
+            self._latest = (key, self._project(camera))
+        return self._latest[1]
 
     @torch.no_grad()
-    def _project(self, camera: Camera, band: Rows) -> _Splats:
+    def _project(self, camera: Camera) -> _Splats:
+        whole = camera.whole or camera
         pose = camera.world_to_camera.to(device=self.device, dtype=torch.float32)[None]
         intrinsics = torch.tensor(
-            [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=self.device
+            [[whole.fx, 0, whole.cx], [0, whole.fy, whole.cy], [0, 0, 1]], dtype=torch.float32, device=self.device
         )[None]
         rendering, opacities = self.scene.rendering, self._opacities[None]
         radii, means, depths, conics, compensations = self._gsplat.fully_fused_projection(
@@ -155,8 +157,8 @@ class CudaRasterizer(Rasterizer):
             self._scales,
             pose,
             intrinsics,
-            camera.width,
-            camera.height,
+            whole.width,
+            whole.height,
             eps2d=rendering.eps2d,
             near_plane=self.near,
             calc_compensations=rendering.antialiased,
@@ -164,8 +166,8 @@ class CudaRasterizer(Rasterizer):
         )
         if rendering.antialiased:
             opacities = opacities * compensations
-        means = means - means.new_tensor([0, band[0]])
-        across, down = -(-camera.width // RASTER_TILE), -(-(band[1] - band[0]) // RASTER_TILE)
+        means = means - means.new_tensor([whole.cx - camera.cx, whole.cy - camera.cy])
+        across, down = tile_grid(camera)
         _, ids, flat_ids = self._gsplat.isect_tiles(means, radii, depths, RASTER_TILE, across, down)
         offsets = self._gsplat.isect_offset_encode(ids, 1, across, down)
         return _Splats(means, conics, opacities, offsets.reshape(1, down, across), flat_ids)

@@ -53,8 +53,8 @@ _BLOCK_TILES, _STRIDE = 8, 1_000_003
 
 
 @compiled()
-def _blend(block, alive, value, x, y, low, high, alpha_max):
-    """Blend one Gaussian into rows low..high of the tile at pixel (x, y).
+def _blend(block, alive, value, x, y, high, alpha_max):
+    """Blend one Gaussian into the first `high` rows of the tile at pixel (x, y).
 
     The weights are written to block[1, first:stop]. alive[row] is non-zero if the row has unfinished pixels; alive[16]
     is the number of such rows.
@@ -66,7 +66,7 @@ def _blend(block, alive, value, x, y, low, high, alpha_max):
     top = y + 0.5 - value[1]
     skew, u_scale, w_scale, log2_opacity, extent_y = value[2], value[3], value[4], value[5], value[7]
     # Use np.ceil: in compiled code, math.ceil returns int64, which overflows for extents above 9e18 pixels.
-    begin = max(np.float64(low), np.ceil(-extent_y - top))
+    begin = max(0.0, np.ceil(-extent_y - top))
     end = min(np.float64(high), np.floor(extent_y - top) + 1.0)
     first, stop = 0, 0
     for row in range(int(begin), int(end)):
@@ -95,24 +95,24 @@ def _blend(block, alive, value, x, y, low, high, alpha_max):
 
 
 @compiled()
-def _start_tile(block, alive, columns, low, high):
-    """Reset the transmittance of a tile to 1. Pixels outside the image or the band are marked as finished."""
+def _start_tile(block, alive, columns, high):
+    """Reset the transmittance of a tile to 1. Pixels outside the image are marked as finished."""
     alive[:] = 0
     for row in range(_TILE):
         for i in range(_TILE):
-            inside = low <= row < high and i < columns
+            inside = row < high and i < columns
             block[0, row, i] = _ONE if inside else -_ONE
-    for row in range(low, high):
+    for row in range(high):
         alive[row] = 1
-    alive[_TILE] = max(high - low, 0)
+    alive[_TILE] = high
 
 
 @compiled()
-def _load_pixels(image, y, x, low, high, columns, pixels):
-    """Load rows low..high of an image patch at (y, x) into `pixels` [P, 3, 8]; zero outside the patch."""
+def _load_pixels(image, y, x, high, columns, pixels):
+    """Load the first `high` rows of an image patch at (y, x) into `pixels` [P, 3, 8]; zero outside the patch."""
     pixels[:] = _ZERO
     across = pixels.shape[0] // _TILE
-    for row in range(low, high):
+    for row in range(high):
         line = image[y + row, x : x + columns]
         for i in range(columns):
             vector, lane = row * across + i // LANES, i % LANES
@@ -122,11 +122,11 @@ def _load_pixels(image, y, x, low, high, columns, pixels):
 
 
 @compiled()
-def _store_pixels(pixels, transmittance, background, y, x, low, high, columns, image):
-    """Store `pixels` [P, 3, 8] in rows low..high of an image patch at (y, x), over the background."""
+def _store_pixels(pixels, transmittance, background, y, x, high, columns, image):
+    """Store `pixels` [P, 3, 8] in the first `high` rows of an image patch at (y, x), over the background."""
     red, green, blue = background[0], background[1], background[2]
     across = pixels.shape[0] // _TILE
-    for row in range(low, high):
+    for row in range(high):
         line, left = image[y + row, x : x + columns], transmittance[y + row, x : x + columns]
         for i in range(columns):
             vector, lane = row * across + i // LANES, i % LANES
@@ -154,45 +154,9 @@ def _scattered(step, tiles):
 
 
 @compiled(parallel=True)
-def render(entries, starts, values, gaussians, colors, background, first_row, alpha_max, image, transmittance):
-    """Render the image [h, width, 3] and the final transmittance [h, width] of the rows from `first_row`."""
-    width, last_row = image.shape[1], first_row + image.shape[0]
-    across = (width + _LAST) // _TILE
-    first_tile = first_row // _TILE * across
-    flat = values.reshape(values.size)
-    tiles = (last_row + _LAST) // _TILE * across - first_tile
-    for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
-        index = _scattered(step, tiles)
-        if index >= tiles:
-            continue
-        tile = first_tile + index
-        x, y = tile % across * _TILE, tile // across * _TILE
-        low, high, columns = max(first_row - y, 0), min(last_row - y, _TILE), min(width - x, _TILE)
-        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
-        alive = np.empty(_TILE + 1, dtype=np.int32)
-        pixels = np.zeros((_PIXELS // LANES, 3, LANES), dtype=np.float32)
-        weights = block.reshape(2 * _PIXELS)
-        _start_tile(block, alive, columns, low, high)
-        end = starts[tile + 1]
-        for position in range(starts[tile], end):
-            if alive[_TILE] == 0:
-                break
-            prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
-            rank = entries[position]
-            first, stop = _blend(block, alive, values[rank], x, y, low, high, alpha_max)
-            color = colors[gaussians[rank]]
-            begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
-            add_scaled(weights, _PIXELS + begin * LANES, vectors, pixels, begin, color[0], color[1], color[2])
-        for row in range(low, high):
-            for i in range(columns):
-                transmittance[y + row - first_row, x + i] = abs(block[0, row, i])
-        _store_pixels(pixels, transmittance, background, y - first_row, x, low, high, columns, image)
-
-
-@compiled(parallel=True)
-def color_gradient(entries, slots, starts, values, image_gradient, first_row, alpha_max, slot_gradients):
-    """Write dL/dcolor of every (Gaussian, tile) pair to its slot [E, 3]; zero if the tile is outside the band."""
-    width, last_row = image_gradient.shape[1], first_row + image_gradient.shape[0]
+def render(entries, starts, values, gaussians, colors, background, alpha_max, image, transmittance):
+    """Render the image [h, w, 3] and the final transmittance [h, w] of a view."""
+    height, width = transmittance.shape
     across = (width + _LAST) // _TILE
     flat = values.reshape(values.size)
     tiles = starts.size - 1
@@ -201,19 +165,53 @@ def color_gradient(entries, slots, starts, values, image_gradient, first_row, al
         if tile >= tiles:
             continue
         x, y = tile % across * _TILE, tile // across * _TILE
-        low, high, columns = max(first_row - y, 0), min(last_row - y, _TILE), min(width - x, _TILE)
+        high, columns = min(height - y, _TILE), min(width - x, _TILE)
+        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
+        alive = np.empty(_TILE + 1, dtype=np.int32)
+        pixels = np.zeros((_PIXELS // LANES, 3, LANES), dtype=np.float32)
+        weights = block.reshape(2 * _PIXELS)
+        _start_tile(block, alive, columns, high)
+        end = starts[tile + 1]
+        for position in range(starts[tile], end):
+            if alive[_TILE] == 0:
+                break
+            prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
+            rank = entries[position]
+            first, stop = _blend(block, alive, values[rank], x, y, high, alpha_max)
+            color = colors[gaussians[rank]]
+            begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
+            add_scaled(weights, _PIXELS + begin * LANES, vectors, pixels, begin, color[0], color[1], color[2])
+        for row in range(high):
+            for i in range(columns):
+                transmittance[y + row, x + i] = abs(block[0, row, i])
+        _store_pixels(pixels, transmittance, background, y, x, high, columns, image)
+
+
+@compiled(parallel=True)
+def color_gradient(entries, slots, starts, values, image_gradient, alpha_max, slot_gradients):
+    """Write dL/dcolor of every (Gaussian, tile) pair to its slot [E, 3]."""
+    height, width = image_gradient.shape[0], image_gradient.shape[1]
+    across = (width + _LAST) // _TILE
+    flat = values.reshape(values.size)
+    tiles = starts.size - 1
+    for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
+        tile = _scattered(step, tiles)
+        if tile >= tiles:
+            continue
+        x, y = tile % across * _TILE, tile // across * _TILE
+        high, columns = min(height - y, _TILE), min(width - x, _TILE)
         block = np.empty((2, _TILE, _TILE), dtype=np.float32)
         alive = np.empty(_TILE + 1, dtype=np.int32)
         pixels = np.empty((_PIXELS // LANES, 3, LANES), dtype=np.float32)
         weights = block.reshape(2 * _PIXELS)
-        _start_tile(block, alive, columns, low, high)
-        _load_pixels(image_gradient, y - first_row, x, low, high, columns, pixels)
+        _start_tile(block, alive, columns, high)
+        _load_pixels(image_gradient, y, x, high, columns, pixels)
         end = starts[tile + 1]
         for position in range(starts[tile], end):
             first, stop = 0, 0
             if alive[_TILE] > 0:
                 prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
-                first, stop = _blend(block, alive, values[entries[position]], x, y, low, high, alpha_max)
+                first, stop = _blend(block, alive, values[entries[position]], x, y, high, alpha_max)
             begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
             total = dot_pixels(weights, _PIXELS + begin * LANES, vectors, pixels, begin)
             slot_gradients[slots[position], 0] = total[0]
@@ -253,11 +251,11 @@ def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittanc
         block = np.empty((2, _TILE, _TILE), dtype=np.float32)
         alive = np.empty(_TILE + 1, dtype=np.int32)
         weights = block.reshape(2 * _PIXELS)
-        _start_tile(block, alive, columns, 0, high)
+        _start_tile(block, alive, columns, high)
         position, end = starts[tile], starts[tile + 1]
         while position < end and alive[_TILE] > 0:
             prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
-            first, stop = _blend(block, alive, values[entries[position]], x, y, 0, high, alpha_max)
+            first, stop = _blend(block, alive, values[entries[position]], x, y, high, alpha_max)
             begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
             slot_weights[slots[position]] = sum_weights(weights, _PIXELS + begin * LANES, vectors)
             position += 1
@@ -290,7 +288,7 @@ _STRIPS = RASTER_TILE // STRIP
 
 
 class Strips(NamedTuple):
-    """Cached weights of a band with I items and P pieces. Strips are in the row-major order of raster tiles.
+    """Cached weights of a view with I items and P pieces. Strips are in the row-major order of raster tiles.
 
     Kernels unpack this tuple before their parallel loop, because Numba's parallel loops do not support tuple fields.
     """
@@ -323,20 +321,20 @@ def _has_weight(block, row, column):
 
 
 @compiled(parallel=True)
-def count_weights(entries, slots, starts, values, band, width, alpha_max, items, pieces, slot_items):
+def count_weights(entries, slots, starts, values, height, width, alpha_max, items, pieces, slot_items):
     """Count the items of every strip, the pieces of every block and the items of every slot, to size their arrays."""
     across = (width + _LAST) // _TILE
     for tile in numba.prange(starts.size - 1):
         x, y = tile % across * _TILE, tile // across * _TILE
-        low, high, columns = max(band[0] - y, 0), min(band[1] - y, _TILE), min(width - x, _TILE)
+        high, columns = min(height - y, _TILE), min(width - x, _TILE)
         block = np.empty((2, _TILE, _TILE), dtype=np.float32)
         alive = np.empty(_TILE + 1, dtype=np.int32)
-        _start_tile(block, alive, columns, low, high)
+        _start_tile(block, alive, columns, high)
         for position in range(starts[tile], starts[tile + 1]):
             slot_items[slots[position]] = 0
             if alive[_TILE] == 0:
                 continue
-            first, stop = _blend(block, alive, values[entries[position]], x, y, low, high, alpha_max)
+            first, stop = _blend(block, alive, values[entries[position]], x, y, high, alpha_max)
             _fill_blocks(block, first, stop)
             for side in range(_STRIPS):
                 strip, used = tile * _STRIPS + side, 0
@@ -349,25 +347,25 @@ def count_weights(entries, slots, starts, values, band, width, alpha_max, items,
 
 
 @compiled(parallel=True)
-def store_weights(entries, slots, starts, values, gaussians, band, alpha_max, slot_starts, strips, transmittance):
-    """Store the items and weights counted by `count_weights`, and the final transmittance [h, width] of the band."""
+def store_weights(entries, slots, starts, values, gaussians, alpha_max, slot_starts, strips, transmittance):
+    """Store the items and weights counted by `count_weights`, and the final transmittance [h, w] of the view."""
     item_starts, piece_starts, item_gaussians, item_slots, piece_items, weights = strips
-    width = transmittance.shape[1]
+    height, width = transmittance.shape
     across = (width + _LAST) // _TILE
     for tile in numba.prange(starts.size - 1):
         x, y = tile % across * _TILE, tile // across * _TILE
-        low, high, columns = max(band[0] - y, 0), min(band[1] - y, _TILE), min(width - x, _TILE)
+        high, columns = min(height - y, _TILE), min(width - x, _TILE)
         block = np.empty((2, _TILE, _TILE), dtype=np.float32)
         alive = np.empty(_TILE + 1, dtype=np.int32)
         blended = block.reshape(2 * _PIXELS)
         items = item_starts[tile * _STRIPS : (tile + 1) * _STRIPS].copy()
         pieces = piece_starts[tile * _STRIPS * BLOCKS : (tile + 1) * _STRIPS * BLOCKS].copy()
-        _start_tile(block, alive, columns, low, high)
+        _start_tile(block, alive, columns, high)
         for position in range(starts[tile], starts[tile + 1]):
             if alive[_TILE] == 0:
                 break
             rank, slot = entries[position], slot_starts[slots[position]]
-            first, stop = _blend(block, alive, values[rank], x, y, low, high, alpha_max)
+            first, stop = _blend(block, alive, values[rank], x, y, high, alpha_max)
             _fill_blocks(block, first, stop)
             for side in range(_STRIPS):
                 item, used = items[side], 0
@@ -385,13 +383,13 @@ def store_weights(entries, slots, starts, values, gaussians, band, alpha_max, sl
                     item_gaussians[item], item_slots[item] = gaussians[rank], slot
                     items[side] += 1
                     slot += 1
-        for row in range(low, high):
+        for row in range(high):
             for i in range(columns):
-                transmittance[y + row - band[0], x + i] = abs(block[0, row, i])
+                transmittance[y + row, x + i] = abs(block[0, row, i])
 
 
 @compiled(parallel=True)
-def apply_weights(strips, colors, background, transmittance, first_row, image):
+def apply_weights(strips, colors, background, transmittance, image):
     """Render an image from cached weights. With float32 weights it is bit-identical to `render`."""
     item_starts, piece_starts, item_gaussians, _, piece_items, weights = strips
     height, width = transmittance.shape
@@ -409,13 +407,12 @@ def apply_weights(strips, colors, background, transmittance, first_row, image):
             piece = piece_starts[strip * BLOCKS + block]
             count = piece_starts[strip * BLOCKS + block + 1] - piece
             add_pieces(weights, piece_items, piece, count, strip_colors, pixels, block * BLOCK_ROWS)
-        low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
-        columns = min(width - x, STRIP)
-        _store_pixels(pixels, transmittance, background, y - first_row, x, low, high, columns, image)
+        high, columns = min(height - y, _TILE), min(width - x, STRIP)
+        _store_pixels(pixels, transmittance, background, y, x, high, columns, image)
 
 
 @compiled(parallel=True)
-def apply_transposed_weights(strips, image_gradient, first_row, slot_gradients):
+def apply_transposed_weights(strips, image_gradient, slot_gradients):
     """Write dL/dcolor of every item to its slot, using cached weights; equals `color_gradient` up to rounding."""
     item_starts, piece_starts, _, item_slots, piece_items, weights = strips
     height, width = image_gradient.shape[0], image_gradient.shape[1]
@@ -425,8 +422,7 @@ def apply_transposed_weights(strips, image_gradient, first_row, slot_gradients):
         begin, end = item_starts[strip], item_starts[strip + 1]
         pixels = np.empty((_TILE, 3, LANES), dtype=np.float32)
         sums = np.zeros((end - begin, 3, LANES), dtype=np.float32)
-        low, high = max(first_row - y, 0), min(first_row + height - y, _TILE)
-        _load_pixels(image_gradient, y - first_row, x, low, high, min(width - x, STRIP), pixels)
+        _load_pixels(image_gradient, y, x, min(height - y, _TILE), min(width - x, STRIP), pixels)
         for block in range(BLOCKS):
             piece = piece_starts[strip * BLOCKS + block]
             count = piece_starts[strip * BLOCKS + block + 1] - piece

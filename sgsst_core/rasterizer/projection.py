@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled, kernel_threads
-from sgsst_core.constants import FRUSTUM_MARGIN, LOG2_ALPHA_MIN, NEAR, TO_POWER_OF_TWO
+from sgsst_core.constants import LOG2_ALPHA_MIN, NEAR, TO_POWER_OF_TWO
 from sgsst_core.rasterizer.depth_order import depth_order
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -152,7 +152,10 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
     count = len(scene)
     values, depths = np.empty((count, len(Column))), np.empty(count)
     gaussians = np.empty(count, dtype=np.int32)
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float64)
+    intrinsics = np.array(
+        [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, *camera.slope_limits],
+        dtype=np.float64,
+    )
     with kernel_threads():
         threads = numba.get_num_threads()
         chunks = np.linspace(0, count, threads * _CHUNKS + 1).astype(np.int64)
@@ -263,9 +266,8 @@ def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, blur, v
     support = opacity - LOG2_ALPHA_MIN
     if support < 0:
         return _FAINT, z
-    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
-    slope_x = min((width - cx) / fx + margin_x, max(-cx / fx - margin_x, x / z))
-    slope_y = min((height - cy) / fy + margin_y, max(-cy / fy - margin_y, y / z))
+    slope_x = min(intrinsics[7], max(intrinsics[6], x / z))
+    slope_y = min(intrinsics[9], max(intrinsics[8], y / z))
     row0 = _row(fx / z, slope_x, pose[0], pose[2])
     row1 = _row(fy / z, slope_y, pose[1], pose[2])
     u, v = fx * (x / z) + cx, fy * (y / z) + cy

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
-from sgsst_core.rasterizer.base import CameraKey, Rasterizer, Rows, camera_key, check_rows
+from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
+from sgsst_core.rasterizer.base import CameraKey, Rasterizer, camera_key
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rotations import unit_rotations
@@ -48,10 +48,8 @@ def perspective_derivative(centers: Tensor, camera: Camera) -> Tensor:
     Slopes are clamped to the frustum plus a margin.
     """
     x, y, z = centers.unbind(-1)
-    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
-    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
-    slope_x = (x / z).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
-    slope_y = (y / z).clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    left, right, top, bottom = camera.slope_limits
+    slope_x, slope_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
     zero = torch.zeros_like(z)
     along_x = torch.stack([camera.fx / z, zero, -camera.fx * slope_x / z], dim=-1)
     along_y = torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], dim=-1)
@@ -123,49 +121,46 @@ class ReferenceRasterizer(Rasterizer):
         self.alpha_max = alpha_max
         self._prepared: tuple[CameraKey, Splats, Tensor, Tensor] | None = None
 
-    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
-        start, stop = band
-        image = self.background.expand((stop - start) * camera.width + 1, 3).clone()
-        for pixels, gaussians, weights, left in self._blended(camera, band):
+    def _render(self, colors: Tensor, camera: Camera) -> Tensor:
+        image = self.background.expand(camera.height * camera.width + 1, 3).clone()
+        for pixels, gaussians, weights, left in self._blended(camera):
             image[pixels] = torch.bmm(weights, colors[gaussians]) + left[..., None] * self.background
-        return image[:-1].view(stop - start, camera.width, 3)
+        return image[:-1].view(camera.height, camera.width, 3)
 
-    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
-        start, stop = band
-        coverage = torch.zeros((stop - start) * camera.width + 1, dtype=self.dtype)
-        for pixels, _, _, left in self._blended(camera, band):
+    def _coverage(self, camera: Camera) -> Tensor:
+        coverage = torch.zeros(camera.height * camera.width + 1, dtype=self.dtype)
+        for pixels, _, _, left in self._blended(camera):
             coverage[pixels] = 1 - left
-        return coverage[:-1].view(stop - start, camera.width)
+        return coverage[:-1].view(camera.height, camera.width)
 
-    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
         flat = torch.cat([image_gradient.view(-1, 3), image_gradient.new_zeros(1, 3)])
         gradient = torch.zeros(len(self.scene), 3, dtype=self.dtype)
-        for pixels, gaussians, weights, _ in self._blended(camera, band):
+        for pixels, gaussians, weights, _ in self._blended(camera):
             gradient.index_add_(0, gaussians.flatten(), torch.bmm(weights.mT, flat[pixels]).flatten(0, 1))
         return gradient
 
-    def near_cutoff(self, camera: Camera, tolerance: float, rows: Rows | None = None) -> Tensor:
+    def near_cutoff(self, camera: Camera, tolerance: float) -> Tensor:
         """Return the mask [h, width] bool of pixels with an alpha or a transmittance close to its cutoff.
 
         Close means within a relative `tolerance`. Only in these pixels can a rasterizer with other rounding skip a
         Gaussian that this rasterizer blends, or the reverse.
         """
-        start, stop = check_rows(camera, rows)
-        doubtful = torch.zeros((stop - start) * camera.width + 1, dtype=torch.bool)
-        for pixels, splats in self._batches(camera, (start, stop)):
-            alpha = self._alpha(splats, pixels, camera, start)
+        doubtful = torch.zeros(camera.height * camera.width + 1, dtype=torch.bool)
+        for pixels, splats in self._batches(camera):
+            alpha = self._alpha(splats, pixels, camera)
             after = (1 - torch.where(alpha >= ALPHA_MIN, alpha, 0)).cumprod(-1)
             before = torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], dim=-1)
             at_alpha = (alpha / ALPHA_MIN - 1).abs() < tolerance
             at_end = (after / TRANSMITTANCE_MIN - 1).abs() < tolerance
             running = before > TRANSMITTANCE_MIN * (1 - tolerance)
             doubtful[pixels] = ((at_alpha | at_end) & running).any(-1)
-        return doubtful[:-1].view(stop - start, camera.width)
+        return doubtful[:-1].view(camera.height, camera.width)
 
-    def _blended(self, camera: Camera, band: Rows) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Yield batches of pixel indices [b, n] in the band, Gaussians [b, k], weights [b, n, k] and T_final [b, n]."""
-        for pixels, splats in self._batches(camera, band):
-            alpha = self._alpha(splats, pixels, camera, band[0])
+    def _blended(self, camera: Camera) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Yield batches of pixel indices [b, n], Gaussians [b, k], weights [b, n, k] and T_final [b, n]."""
+        for pixels, splats in self._batches(camera):
+            alpha = self._alpha(splats, pixels, camera)
             alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
             after = (1 - alpha).cumprod(-1)
             unfinished = after > TRANSMITTANCE_MIN
@@ -175,21 +170,19 @@ class ReferenceRasterizer(Rasterizer):
             left = torch.where(unfinished, after, 1).amin(-1)
             yield pixels, splats.gaussians, weights, left
 
-    def _alpha(self, splats: Splats, pixels: Tensor, camera: Camera, first_row: int) -> Tensor:
-        """Return the clamped alpha [b, n, k] of splats [b, k] at pixels [b, n] of the band from `first_row`."""
+    def _alpha(self, splats: Splats, pixels: Tensor, camera: Camera) -> Tensor:
+        """Return the clamped alpha [b, n, k] of splats [b, k] at pixels [b, n]."""
         dx = (pixels % camera.width + 0.5).to(self.dtype)[..., None] - splats.x[:, None]
-        dy = (pixels // camera.width + (first_row + 0.5)).to(self.dtype)[..., None] - splats.y[:, None]
+        dy = (pixels // camera.width + 0.5).to(self.dtype)[..., None] - splats.y[:, None]
         w = dx * splats.w_scale[:, None]
         u = (dy - splats.skew[:, None] * dx) * splats.u_scale[:, None]
         return (splats.opacity[:, None] * ((u * u + w * w) * -0.5).exp()).clamp_max(self.alpha_max)
 
-    def _batches(self, camera: Camera, band: Rows) -> Iterator[tuple[Tensor, Splats]]:
+    def _batches(self, camera: Camera) -> Iterator[tuple[Tensor, Splats]]:
         """Yield the pixels [b, n] of b raster tiles with the splats [b, k] to blend, padded with empty splats."""
         splats, ranks, counts = self._intersections(camera)
         starts = counts.cumsum(0) - counts
-        first_row = torch.arange(len(counts)) // -(-camera.width // RASTER_TILE) * RASTER_TILE
-        inside = (counts > 0) & (first_row < band[1]) & (first_row + RASTER_TILE > band[0])
-        order = torch.nonzero(inside)[:, 0]
+        order = torch.nonzero(counts)[:, 0]
         order = order[counts[order].argsort(descending=True)]
         while len(order) > 0:
             longest = int(counts[order[0]])
@@ -198,7 +191,7 @@ class ReferenceRasterizer(Rasterizer):
             listed = ranks[torch.where(position < counts[tiles, None], starts[tiles, None] + position, len(ranks) - 1)]
             batch = Splats(*(getattr(splats, field)[listed] for field in Splats.__dataclass_fields__))
             at_once = max(1, _BATCH_PAIRS // (longest * len(tiles)))
-            for pixels in tile_pixels(tiles, camera, band).split(at_once, dim=1):
+            for pixels in tile_pixels(tiles, camera).split(at_once, dim=1):
                 yield pixels, batch
 
     def _intersections(self, camera: Camera) -> tuple[Splats, Tensor, Tensor]:
@@ -243,14 +236,14 @@ def tile_intersections(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
     return ranks[order], torch.bincount(tile, minlength=across * down)
 
 
-def tile_pixels(tiles: Tensor, camera: Camera, band: Rows) -> Tensor:
-    """Return the pixels [b, 256] of raster tiles as indices into the band.
+def tile_pixels(tiles: Tensor, camera: Camera) -> Tensor:
+    """Return the pixels [b, 256] of raster tiles as indices into the view.
 
-    Pixels outside the view or the band get the index one past the end.
+    Pixels outside the view get the index one past the end.
     """
     across = -(-camera.width // RASTER_TILE)
     offset = torch.arange(RASTER_TILE**2)
     x = (tiles % across * RASTER_TILE)[:, None] + offset % RASTER_TILE
     y = (tiles // across * RASTER_TILE)[:, None] + offset // RASTER_TILE
-    inside = (x < camera.width) & (y >= band[0]) & (y < band[1])
-    return torch.where(inside, (y - band[0]) * camera.width + x, (band[1] - band[0]) * camera.width)
+    inside = (x < camera.width) & (y < camera.height)
+    return torch.where(inside, y * camera.width + x, camera.height * camera.width)

@@ -20,15 +20,13 @@ from torch import Tensor
 from sgsst_core.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
-    FRUSTUM_MARGIN,
     LOG2_ALPHA_MIN,
-    RASTER_TILE,
     TO_POWER_OF_TWO,
     TRANSMITTANCE_MIN,
 )
 from sgsst_core.devices import on_device
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost, Rows, check_rows
+from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost
 from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
 from sgsst_core.rasterizer.view_cache import ViewCache
 from sgsst_core.scene.camera import Camera
@@ -72,8 +70,7 @@ class TritonRasterizer(Rasterizer):
     """Rasterizer in float32 Triton kernels.
 
     Color gradients are reproducible bit for bit on one machine: every pair of Gaussian and tile has a separate slot,
-    and slots are added in a fixed order. The concatenated images of bands are bit-identical to that of the whole view.
-    Tile intersections are cached within a budget (`ViewCache`).
+    and slots are added in a fixed order. Tile intersections are cached within a budget (`ViewCache`).
 
     Args:
         scene, background, near: As in `Rasterizer`.
@@ -169,19 +166,23 @@ class TritonRasterizer(Rasterizer):
         pairs = max(len(isects.ranks) for isects in built)
         return replace(cost, preparation_bytes=sum(isects.nbytes for isects in built) // len(built), most_pairs=pairs)
 
-    def count_weights(self, camera: Camera, rows: Rows | None = None) -> CountedWeights:
-        """Count a band's weights without storing them; takes about as long as one render."""
+    def forget_views(self) -> None:
+        """Drop the tile intersections of all views."""
+        self._intersections.clear()
+
+    def count_weights(self, camera: Camera) -> CountedWeights:
+        """Count a view's weights without storing them; takes about as long as one render."""
         from sgsst_core.rasterizer.triton_cached import CountedPieces
 
-        return CountedPieces(self, camera, check_rows(camera, rows))
+        return CountedPieces(self, camera)
 
-    def _render(self, colors: Tensor, camera: Camera, band: Rows) -> Tensor:
-        return self._blend(colors, camera, band)[0]
+    def _render(self, colors: Tensor, camera: Camera) -> Tensor:
+        return self._blend(colors, camera)[0]
 
-    def _coverage(self, camera: Camera, band: Rows) -> Tensor:
-        return 1 - self._blend(torch.zeros((len(self.scene), 3), device=self.device), camera, band)[1]
+    def _coverage(self, camera: Camera) -> Tensor:
+        return 1 - self._blend(torch.zeros((len(self.scene), 3), device=self.device), camera)[1]
 
-    def _color_gradient(self, image_gradient: Tensor, camera: Camera, band: Rows) -> Tensor:
+    def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         gradient = torch.zeros((len(self.scene), 3), device=self.device)
@@ -190,18 +191,18 @@ class TritonRasterizer(Rasterizer):
         if not visible:
             return gradient
         slots = torch.zeros((len(isects.ranks), 3), device=self.device)
-        across, tiles = tiles_of(camera, band)
+        across, tiles = tiles_of(camera)
         with on_device(self.device):
             kernels.slot_gradients[(tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, image_gradient, slots,
-                camera.width, *band, across,
+                camera.width, 0, camera.height, across,
                 **self.cuts(kernels.SUMMING_WARPS),
             )  # fmt: skip
         add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
         return gradient
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Return coverage [height, width], and each Gaussian's blend weight summed over all pixels [N], in one pass.
+        """Return coverage [h, w], and each Gaussian's blend weight summed over all pixels [N], in one pass.
 
         Bit-identical to `coverage`, and to a column of `color_gradient` for an image gradient of ones.
         """
@@ -211,7 +212,7 @@ class TritonRasterizer(Rasterizer):
         weights = torch.zeros(len(self.scene), device=self.device)
         slots = torch.zeros(len(isects.ranks), device=self.device)
         transmittance = torch.empty((camera.height, camera.width), device=self.device)
-        across, tiles = tiles_of(camera, (0, camera.height))
+        across, tiles = tiles_of(camera)
         with on_device(self.device):
             kernels.survey[(tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, slots, transmittance,
@@ -227,19 +228,18 @@ class TritonRasterizer(Rasterizer):
                 )  # fmt: skip
         return 1 - transmittance, weights
 
-    def _blend(self, colors: Tensor, camera: Camera, band: Rows) -> tuple[Tensor, Tensor]:
-        """Return the image and the final transmittance of a band."""
+    def _blend(self, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Return the image and the final transmittance of a view."""
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         isects = self.intersections(camera)
-        height = band[1] - band[0]
-        image = torch.empty((height, camera.width, 3), device=self.device)
-        transmittance = torch.empty((height, camera.width), device=self.device)
-        across, tiles = tiles_of(camera, band)
+        image = torch.empty((camera.height, camera.width, 3), device=self.device)
+        transmittance = torch.empty((camera.height, camera.width), device=self.device)
+        across, tiles = tiles_of(camera)
         with on_device(self.device):
             kernels.render[(tiles,)](
                 isects.ranks, isects.starts, isects.gaussians, isects.values, colors, self.background,
-                image, transmittance, camera.width, *band, across,
+                image, transmittance, camera.width, 0, camera.height, across,
                 **self.cuts(kernels.PIXEL_WARPS),
             )  # fmt: skip
         return image, transmittance
@@ -262,7 +262,7 @@ class TritonRasterizer(Rasterizer):
             with on_device(self.device):
                 kernels.project[(-(-count // block),)](
                     *self._geometry, view, values, depths, counts, count,
-                    EPS2D=rendering.eps2d, ANTIALIASED=rendering.antialiased, MARGIN=FRUSTUM_MARGIN,
+                    EPS2D=rendering.eps2d, ANTIALIASED=rendering.antialiased,
                     SUPPORT=-LOG2_ALPHA_MIN, POWER=TO_POWER_OF_TWO, BLOCK=block,
                 )  # fmt: skip
         ordered, order = torch.sort(depths, stable=True)
@@ -306,10 +306,20 @@ def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: 
 def _numbers(camera: Camera, near: float) -> list[float]:
     """Return the camera parameters in the order that the projection kernel expects."""
     pose = camera.world_to_camera.double()[:3].flatten().tolist()
-    return [*pose, camera.fx, camera.fy, camera.cx, camera.cy, float(camera.width), float(camera.height), near]
+    return [
+        *pose,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        float(camera.width),
+        float(camera.height),
+        near,
+        *camera.slope_limits,
+    ]
 
 
-def tiles_of(camera: Camera, band: Rows) -> tuple[int, int]:
-    """Return the number of raster tiles per tile row, and in all tile rows that a band intersects."""
-    across = tile_grid(camera)[0]
-    return across, across * (-(-band[1] // RASTER_TILE) - band[0] // RASTER_TILE)
+def tiles_of(camera: Camera) -> tuple[int, int]:
+    """Return the number of raster tiles per tile row, and in the whole view."""
+    across, down = tile_grid(camera)
+    return across, across * down

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.devices import on_device
-from sgsst_core.rasterizer.base import Precision, Rows
+from sgsst_core.rasterizer.base import Precision
 from sgsst_core.rasterizer.triton import TritonRasterizer, add_slots_, tiles_of
 from sgsst_core.scene.camera import Camera
 
@@ -19,26 +19,26 @@ _DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "half": torch
 
 
 class CountedPieces:
-    """Sizes of a band's weights, counted before the weights are stored.
+    """Sizes of a view's weights, counted before the weights are stored.
 
     Counting takes one pass over the view and one synchronization with the device.
 
     Attributes:
         pieces: P, number of pieces.
         slot_pieces: [E] int32, number of pieces of each pair of Gaussian and raster tile.
-        block_pieces: [16 tiles] int32, pieces of every block in the band's tiles.
+        block_pieces: [16 tiles] int32, pieces of every block.
         masks: [E] int32, bit mask of the blocks of its tile in which each pair has weights.
         ends: [tiles] int64, entry of each tile after which all of its pixels are finished.
     """
 
-    def __init__(self, rasterizer: TritonRasterizer, camera: Camera, band: Rows) -> None:
+    def __init__(self, rasterizer: TritonRasterizer, camera: Camera) -> None:
         from sgsst_core.rasterizer import triton_cached_kernels as kernels
         from sgsst_core.rasterizer.triton_kernels import SUMMING_WARPS
 
-        self.rasterizer, self.camera, self.band = rasterizer, camera, band
+        self.rasterizer, self.camera = rasterizer, camera
         self.intersections = isects = rasterizer.intersections(camera)
         device = rasterizer.device
-        self.across, self.tiles = tiles_of(camera, band)
+        self.across, self.tiles = tiles_of(camera)
         self.masks = torch.zeros(len(isects.ranks), dtype=torch.int32, device=device)
         self.slot_pieces = torch.zeros_like(self.masks)
         self.block_pieces = torch.empty(self.tiles * kernels.BLOCKS.value, dtype=torch.int32, device=device)
@@ -46,7 +46,7 @@ class CountedPieces:
         with on_device(device):
             kernels.count_pieces[(self.tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces,
-                self.block_pieces, self.ends, camera.width, *band, self.across,
+                self.block_pieces, self.ends, camera.width, 0, camera.height, self.across,
                 **rasterizer.cuts(SUMMING_WARPS),
             )  # fmt: skip
         self.pieces = int(self.block_pieces.sum())
@@ -61,7 +61,7 @@ class CountedPieces:
         from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
         index, visible = self.index_type.itemsize, len(self.intersections.gaussians)
-        pixels = (self.band[1] - self.band[0]) * self.camera.width
+        pixels = self.camera.height * self.camera.width
         piece = 4 + index + kernels.PIECE.value * _DTYPES[precision].itemsize
         starts = len(self.block_pieces) + 1 + visible + 1
         return int(self.pieces * piece + starts * index + 4 * (visible + pixels))
@@ -72,7 +72,7 @@ class CountedPieces:
 
 
 class WeightPieces:
-    """Cached blend weights of one band of a view, with P pieces and V visible Gaussians.
+    """Cached blend weights of a view, with P pieces and V visible Gaussians.
 
     Attributes:
         block_starts: [16 tiles + 1], first piece of each block.
@@ -81,7 +81,7 @@ class WeightPieces:
         weights: [16 P] float32, or float16 multiplied by `triton_cached_kernels.HALF_SCALE`.
         first_slots: [V + 1], first slot of each rank.
         gaussians: [V] int32, index into the scene of each rank.
-        transmittance: [h, width] float32, final transmittance.
+        transmittance: [h, w] float32, final transmittance.
     """
 
     def __init__(self, counted: CountedPieces, precision: Precision) -> None:
@@ -89,7 +89,7 @@ class WeightPieces:
         from sgsst_core.rasterizer.triton_kernels import PIXEL_WARPS
 
         rasterizer, isects, index_type = counted.rasterizer, counted.intersections, counted.index_type
-        self._rasterizer, self.camera, self.band = rasterizer, counted.camera, counted.band
+        self._rasterizer, self.camera = rasterizer, counted.camera
         self.scale = kernels.HALF_SCALE if precision == "half" else 1.0
         slot_starts = _offsets(counted.slot_pieces, index_type)
         self.block_starts = _offsets(counted.block_pieces, index_type)
@@ -102,12 +102,12 @@ class WeightPieces:
         self.piece_gaussians = empty(counted.pieces, dtype=torch.int32)
         self.piece_slots = empty(counted.pieces, dtype=index_type)
         self.weights = empty(counted.pieces * kernels.PIECE.value, dtype=_DTYPES[precision])
-        self.transmittance = empty(self.band[1] - self.band[0], self.camera.width, dtype=torch.float32)
+        self.transmittance = empty(self.camera.height, self.camera.width, dtype=torch.float32)
         with on_device(rasterizer.device):
             kernels.store_pieces[(counted.tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
                 slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights,
-                self.transmittance, self.camera.width, *self.band, counted.across,
+                self.transmittance, *self._view_arguments(),
                 **rasterizer.cuts(PIXEL_WARPS), SCALE=self.scale,
             )  # fmt: skip
 
@@ -121,20 +121,20 @@ class WeightPieces:
         return sum(tensor.nbytes for tensor in tensors)
 
     def render(self, colors: Tensor) -> Tensor:
-        """Return the image [h, width, 3] of colors [N, 3] over the background."""
+        """Return the image [h, w, 3] of colors [N, 3] over the background."""
         from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
         image = torch.empty((*self.transmittance.shape, 3), device=colors.device)
         with on_device(colors.device):
             kernels.apply_pieces[self._grid()](
                 self.block_starts, self.piece_gaussians, self.weights, colors, self._rasterizer.background,
-                self.transmittance, image, *self._band_arguments(),
+                self.transmittance, image, *self._view_arguments(),
                 SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
             )  # fmt: skip
         return image
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
-        """Return W^T dL/dimage, [N, 3], given the image gradient [h, width, 3]."""
+        """Return W^T dL/dimage, [N, 3], given the image gradient [h, w, 3]."""
         from sgsst_core.rasterizer import triton_cached_kernels as kernels
 
         gradient = torch.zeros((len(self._rasterizer.scene), 3), device=image_gradient.device)
@@ -143,7 +143,7 @@ class WeightPieces:
         slots = torch.empty((len(self.piece_slots), 3), device=image_gradient.device)
         with on_device(image_gradient.device):
             kernels.piece_gradients[self._grid()](
-                self.block_starts, self.piece_slots, self.weights, image_gradient, slots, *self._band_arguments(),
+                self.block_starts, self.piece_slots, self.weights, image_gradient, slots, *self._view_arguments(),
                 SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
             )  # fmt: skip
         add_slots_(gradient, slots, self.first_slots, self.gaussians)
@@ -153,9 +153,9 @@ class WeightPieces:
         """Return the launch grid: one program per block."""
         return (len(self.block_starts) - 1,)
 
-    def _band_arguments(self) -> tuple[int, int, int, int]:
-        """Return the kernel arguments that describe the band."""
-        return self.camera.width, *self.band, tiles_of(self.camera, self.band)[0]
+    def _view_arguments(self) -> tuple[int, int, int, int]:
+        """Return the kernel arguments that describe the view: width, rows, and raster tiles per row."""
+        return self.camera.width, 0, self.camera.height, tiles_of(self.camera)[0]
 
 
 def _offsets(counts: Tensor, dtype: torch.dtype) -> Tensor:

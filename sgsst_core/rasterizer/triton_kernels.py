@@ -86,13 +86,14 @@ def _span_of_row(down, first, last, x, y, skew, u_scale, w_scale, support, exten
 @triton.jit
 def project(
     means, quats, scales, logits, camera, values, depths, counts, total,
-    EPS2D: tl.constexpr, ANTIALIASED: tl.constexpr, MARGIN: tl.constexpr, SUPPORT: tl.constexpr,
-    POWER: tl.constexpr, BLOCK: tl.constexpr,
+    EPS2D: tl.constexpr, ANTIALIASED: tl.constexpr, SUPPORT: tl.constexpr, POWER: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Run `projection.project` for BLOCK Gaussians per program, and count the raster tiles that each intersects.
 
     Args:
-        camera: [19] float64: the upper three rows of world_to_camera, fx, fy, cx, cy, width, height, near.
+        camera: [23] float64: the upper three rows of world_to_camera, fx, fy, cx, cy, width, height, near, and
+            `Camera.slope_limits`.
         values: Output [N, 8] float64, see `projection.Column`; rows of invisible Gaussians are not written.
         depths: Output [N] float64, infinite for invisible Gaussians.
         counts: Output [N] int32, 0 for invisible Gaussians.
@@ -118,9 +119,8 @@ def project(
     opacity = -tl.log(1 + tl.exp(-logit)) / _LN2
     support = opacity + SUPPORT
     visible = visible & (support >= 0)
-    margin_x, margin_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
-    slope_x = tl.minimum((width - cx) / fx + margin_x, tl.maximum(-cx / fx - margin_x, x / z))
-    slope_y = tl.minimum((height - cy) / fy + margin_y, tl.maximum(-cy / fy - margin_y, y / z))
+    slope_x = tl.minimum(tl.load(camera + 20), tl.maximum(tl.load(camera + 19), x / z))
+    slope_y = tl.minimum(tl.load(camera + 22), tl.maximum(tl.load(camera + 21), y / z))
     qw = tl.load(quats + 4 * p, mask=there, other=1.0).to(tl.float64)
     qx = tl.load(quats + 4 * p + 1, mask=there, other=0.0).to(tl.float64)
     qy = tl.load(quats + 4 * p + 2, mask=there, other=0.0).to(tl.float64)

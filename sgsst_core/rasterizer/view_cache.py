@@ -105,6 +105,13 @@ class ViewCache(Generic[L]):
                 return data
             return self._previous.take(camera) if self._previous else None
 
+    def clear(self) -> None:
+        """Remove the data of all views, including those in `previous`."""
+        with self._lock:
+            self._previous = self._latest = None
+            self._cached.clear()
+            self._cached_bytes = 0
+
     def limit(self, max_bytes: int) -> None:
         """Set the memory budget, and evict the most recent entries until the rest fits."""
         with self._lock:

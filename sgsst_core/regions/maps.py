@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.rasterizer import Rasterizer, Rows
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 
 
@@ -26,18 +26,16 @@ class RegionMaps:
         self._rasterizer = rasterizer
         self._labels, self._active = labels.to(rasterizer.device), active
 
-    def render(self, camera: Camera, rows: Rows | None = None) -> Tensor:
-        """Return the maps [h, w, regions] in 0..1 of a view, or of some of its rows.
+    def render(self, camera: Camera) -> Tensor:
+        """Return the maps [h, w, regions] in 0..1 of a view.
 
         They are exactly 0 where a region is not visible.
         """
-        background = self._pass(camera, rows, ())
-        parts = [
-            self._pass(camera, rows, self._active[first : first + 3]) - background for first in range(0, self.count, 3)
-        ]
+        background = self._pass(camera, ())
+        parts = [self._pass(camera, self._active[first : first + 3]) - background for first in range(0, self.count, 3)]
         return torch.cat(parts, dim=2)[:, :, : self.count].clamp(0, 1)
 
-    def _pass(self, camera: Camera, rows: Rows | None, regions: tuple[int, ...]) -> Tensor:
+    def _pass(self, camera: Camera, regions: tuple[int, ...]) -> Tensor:
         """Render up to three region masks; without regions, render the background.
 
         The background is bit-identical in all passes, so it can be subtracted.
@@ -46,4 +44,4 @@ class RegionMaps:
         colors = torch.zeros((len(self._labels), 3), dtype=rasterizer.dtype, device=rasterizer.device)
         for channel, region in enumerate(regions):
             colors[:, channel] = self._labels == region
-        return rasterizer.render(colors, camera, rows)
+        return rasterizer.render(colors, camera)

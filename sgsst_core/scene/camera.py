@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
+from sgsst_core.constants import FRUSTUM_MARGIN
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.scene.rotations import exact_rotation
 
@@ -35,6 +36,7 @@ class Camera:
         resolution: Longer side in pixels of the 4:3 view with the same number of pixels, for cameras whose aspect ratio
             was fitted to the content. None if resolutions refer to the camera's own longer side.
         lens: Lens that took the camera's photos; None if they are those of a pinhole. Renders never have distortion.
+        whole: Camera of the whole view, if this is the camera of a rectangle of it (`cropped`); None otherwise.
 
     Example:
         >>> camera = Camera("front", 640, 480, 500.0, 500.0, 320.0, 240.0, torch.eye(4, dtype=torch.float64))
@@ -52,6 +54,7 @@ class Camera:
     world_to_camera: Tensor  # [4, 4] float64
     resolution: int | None = None
     lens: Lens | None = None
+    whole: Camera | None = None
 
     @staticmethod
     def from_matrix(
@@ -105,6 +108,36 @@ class Camera:
         """Camera position in the world, [3] float64."""
         rotation = self.world_to_camera[:3, :3]
         return -rotation.T @ self.world_to_camera[:3, 3]
+
+    @property
+    def slope_limits(self) -> tuple[float, float, float, float]:
+        """Limits (left, right, top, bottom) to which projections clamp slopes: the whole view plus a margin."""
+        view = self.whole or self
+        margin_x = FRUSTUM_MARGIN * 0.5 * view.width / view.fx
+        margin_y = FRUSTUM_MARGIN * 0.5 * view.height / view.fy
+        return (
+            -view.cx / view.fx - margin_x,
+            (view.width - view.cx) / view.fx + margin_x,
+            -view.cy / view.fy - margin_y,
+            (view.height - view.cy) / view.fy + margin_y,
+        )
+
+    def cropped(self, top: int, left: int, bottom: int, right: int) -> Camera:
+        """Return the camera of a rectangle of the view; its image is that part of the view's image.
+
+        Raises:
+            ValueError: If the rectangle is empty or extends beyond the view.
+        """
+        if not (0 <= top < bottom <= self.height and 0 <= left < right <= self.width):
+            raise ValueError(
+                f"rows {top} to {bottom}, columns {left} to {right}: not a rectangle of view {self.name!r} "
+                f"({self.width}x{self.height})"
+            )
+        if (top, left, bottom, right) == (0, 0, self.height, self.width):
+            return self
+        return replace(
+            self, width=right - left, height=bottom - top, cx=self.cx - left, cy=self.cy - top, whole=self.whole or self
+        )
 
 
 def _matrix(name: str, argument: str, values: Tensor | ArrayLike, *shapes: tuple[int, ...]) -> NDArray[np.float64]:

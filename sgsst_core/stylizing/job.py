@@ -298,6 +298,8 @@ def prepare_job(
     rendered = attenuated if plan.seen.all() else attenuated.subset(plan.seen)
     rendered = rendered if "sh" in settings.keep else rendered.without_zero_bands()
     rasterizer = _make_rasterizer(plan, settings, rendered, memory, planning_context)
+    if team.group.size > 1:  # the survey's tile intersections are those of whole views
+        rasterizer.forget_views()
     regions_seen = plan.survey.regions if plan.weighted else None
     views = Views(
         rendered,
@@ -307,7 +309,7 @@ def prepare_job(
         memory=view_memory(plan, memory),
         clamp_aware_gradient=settings.clamp_aware_gradient,
         regions=regions_seen,
-        collectives=team.group,
+        divider=loss.divider,
         timer=loss.timer,
     )
     view_targets = ViewTargets(

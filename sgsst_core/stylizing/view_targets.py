@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from torch import Tensor
 
 from sgsst_core.budget import Cache, content_fraction, tensor_bytes
 from sgsst_core.features.partition import PartitionTile, Rectangle
+from sgsst_core.loss.position_term import ScaledView
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.targets import ContentFeatures, ViewTarget
 from sgsst_core.loss.tiling import Division
+from sgsst_core.loss.view_images import ViewImages
 from sgsst_core.parallel.division import Piece
 from sgsst_core.regions.maps import RegionMaps
-from sgsst_core.scene.pyramid import downscale
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
 from sgsst_core.stylizing.training_background import Color, replace_background
 from sgsst_core.stylizing.views import Views
@@ -73,7 +75,7 @@ class ViewTargets:
         )
         cached = content if cache_content else 0
         images = cached // 2 if drawn else 0
-        self._images: Cache[_ImageKey, Tensor] = Cache(images, tensor_bytes)
+        self._images: Cache[_ContentKey, ScaledView] = Cache(images, _image_bytes)
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
         self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
 
@@ -90,22 +92,30 @@ class ViewTargets:
         """
         coverage = self.coverage(index) if self.weighted else None
         division = self._division(index, scales, coverage)
-        target = ViewTarget(coverage=coverage, division=division, regions=self.region_weights(index))
+        target = ViewTarget(
+            coverage=coverage,
+            division=division,
+            regions=self.region_weights(index),
+            background=background or self._background,
+        )
+        images = functools.cache(lambda: self._content_images(index, division))
         if self.loss.content_weight and background is not None:
-            for scale, content in self._content_images(index, scales).items():
-                over = self._content_over(index, content, background, scale)
-                target.content[scale] = self.loss.targets.content_features(over, 0, division.tiles[scale])
+            for scale in scales:
+                content = self._images.get(
+                    (index, scale, division.pieces[scale]), functools.partial(_scaled, images, scale)
+                )
+                over = self._content_over(index, content, background)
+                target.content[scale] = self.loss.targets.content_features(over, division.tiles[scale])
         elif self.loss.content_weight:
-            image = functools.cache(lambda: self.content(index))
             for scale in scales:
                 pieces = division.pieces[scale]
-                make = functools.partial(self._features, image, scale, division.tiles[scale])
+                make = functools.partial(self._features, images, scale, division.tiles[scale])
                 size = self.loss.targets.content_bytes(pieces)
                 target.content[scale] = self._content.get((index, scale, pieces), make, size)
         return target
 
     def content(self, index: int) -> Tensor:
-        """Return the content image [H, W, 3]: the photo, or the render of the unstylized scene.
+        """Return the content image: the photo [H, W, 3], or `Views.unstylized`.
 
         Photos are on the GPU if there is one.
         """
@@ -127,14 +137,15 @@ class ViewTargets:
         maps = self._maps
         return None if maps is None else self._region_weights.get(index, lambda: self._rendered_regions(index, maps))
 
-    def replace_background(self, index: int, image: Tensor, color: Color, scale: int = 0) -> Tensor:
-        """Replace the background color of a view's image [h, w, 3] at a scale.
+    def replace_background(self, index: int, image: Tensor, color: Color) -> Tensor:
+        """Replace the background color of a view's `Views.render` [h, w, 3].
 
         The result is on the network's device.
         """
-        return replace_background(
-            image.to(self.loss.network.device), self.coverage(index)[scale], color, self._background
-        )
+        coverage, shares = self.coverage(index)[0], self.views.shares(index)
+        if shares is not None:
+            coverage = coverage[shares.windows[self.views.collectives.rank].slices]
+        return replace_background(image.to(self.loss.network.device), coverage, color, self._background)
 
     def prefetch(self, index: int, scales: Sequence[int]) -> None:
         """Start reading, on a GPU, the photo of the view whose target is requested next, if it will be needed."""
@@ -149,35 +160,38 @@ class ViewTargets:
     def forget_division(self) -> None:
         """Clear the caches that depend on the division of work, because it is about to change."""
         self._content.clear()
+        self._images.clear()
         self._divisions.clear()
+        self.views.forget_shares()
 
     def _needs_content(self, index: int, scales: Sequence[int]) -> bool:
         """Return whether the content features of a view at some scales, or their images, are not cached."""
         if not self.loss.content_weight:
             return False
-        if self._drawn:
-            return any((index, scale) not in self._images for scale in scales)
-        division = self._divisions.get((index, tuple(scales)))  # features are cached only after their division is known
-        return division is None or any((index, scale, division.pieces[scale]) not in self._content for scale in scales)
+        cache = self._images if self._drawn else self._content
+        division = self._divisions.get((index, tuple(scales)))  # content is cached only after its division is known
+        return division is None or any((index, scale, division.pieces[scale]) not in cache for scale in scales)
 
-    def _content_images(self, index: int, scales: Sequence[int]) -> dict[int, Tensor]:
-        """Return the content of a view at some scales, [H >> s, W >> s, 3] on the network's device."""
-        whole = functools.cache(lambda: self.content(index).to(self.loss.network.device))
+    def _content_images(self, index: int, division: Division) -> ViewImages:
+        """Return the content image of a view at the scales of a division."""
+        image = self.content(index).to(self.loss.network.device)
+        if self.photos is not None:  # every rank has the whole photo
+            division = replace(division, shares=None)
+        return ViewImages(image, division, self._background, self.loss.collectives, self.loss.timer)
 
-        def scaled(scale: int) -> Tensor:
-            return downscale(whole(), scale)
-
-        return {scale: self._images.get((index, scale), functools.partial(scaled, scale)) for scale in scales}
-
-    def _content_over(self, index: int, image: Tensor, color: Color, scale: int) -> Tensor:
+    def _content_over(self, index: int, content: ScaledView, color: Color) -> ScaledView:
         """Return the content of a view at a scale with another background color.
 
         In a photo, the color replaces everything that no Gaussian covers.
         """
-        if self.photos is None:
-            return self.replace_background(index, image, color, scale)
-        coverage = self.coverage(index)[scale]
-        return replace_background(image * coverage[..., None].to(image.dtype), coverage, color, (0.0, 0.0, 0.0))
+        coverage, image, present = (
+            self.coverage(index)[content.scale][content.area.slices],
+            content.image,
+            self._background,
+        )
+        if self.photos is not None:
+            image, present = image * coverage[..., None].to(image.dtype), (0.0, 0.0, 0.0)
+        return replace(content, image=replace_background(image, coverage, color, present))
 
     def _division(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> Division:
         """Return the division of work on some scales of a view.
@@ -186,28 +200,42 @@ class ViewTargets:
         """
         key = (index, tuple(scales))
         if key not in self._divisions:
-            camera = self.views.cameras[index]
+            camera, divider = self.views.cameras[index], self.loss.divider
             sizes = {scale: (camera.height >> scale, camera.width >> scale) for scale in scales}
-            known = self._regions[index] if self._regions and self.loss.network.device.type != "cpu" else None
-            self._divisions[key] = self.loss.divider.divide(sizes, coverage, known)
+            known = self._regions[index] if self._regions else None
+            if self.views.shares(index) is not None:
+                self._divisions[key] = divider.divide_view((camera.height, camera.width), scales, coverage, known)
+            elif self.loss.network.device.type != "cpu":
+                self._divisions[key] = divider.divide(sizes, coverage, known)
+            else:
+                self._divisions[key] = divider.divide(sizes, coverage)
         return self._divisions[key]
 
     def _rendered_coverage(self, index: int) -> list[Tensor]:
-        rows = self.views.own_rows(index, self.views.rasterizer.repeatable.coverage)
-        return self.loss.targets.position_weights(self.views.gathered(index, rows))
+        window = self.views.window(index, self.views.rasterizer.repeatable.coverage)
+        return self.loss.targets.position_weights(self.views.whole(index, window))
 
     def _rendered_regions(self, index: int, maps: RegionMaps) -> list[list[Tensor]]:
-        whole = self.views.gathered(index, self.views.own_rows(index, maps.render, maps.count))
+        whole = self.views.whole(index, self.views.window(index, maps.render, maps.count))
         return [self.loss.targets.position_weights(weights) for weights in whole.unbind(2)]
 
-    def _features(self, image: Callable[[], Tensor], scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures:
-        return self.loss.targets.content_features(image(), scale, tiles)
+    def _features(
+        self, images: Callable[[], ViewImages], scale: int, tiles: Sequence[PartitionTile]
+    ) -> ContentFeatures:
+        return self.loss.targets.content_features(images().scaled(scale), tiles)
 
 
-#: Index of the view, and scale.
-_ImageKey = tuple[int, int]
 #: Index of the view, scale, and every rank's pieces of it.
 _ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
+
+
+def _scaled(images: Callable[[], ViewImages], scale: int) -> ScaledView:
+    return images().scaled(scale)
+
+
+def _image_bytes(view: ScaledView) -> int:
+    """Return the size in bytes of a whole scaled view, which all ranks agree on."""
+    return view.size[0] * view.size[1] * 3 * view.image.itemsize
 
 
 def _pyramid_bytes(pyramid: list[Tensor]) -> int:

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from sgsst_core.budget import Cache
 from sgsst_core.features.partition import Rectangle
+from sgsst_core.loss.tiling import Divider
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.parallel.division import divide_rows
+from sgsst_core.parallel.division import Shares
 from sgsst_core.parallel.shown import ShownGaussians
-from sgsst_core.rasterizer import Rasterizer, Rows
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import view_colors_gradient
@@ -22,7 +23,7 @@ from sgsst_core.timing import Timer
 
 
 class Views:
-    """Renderer of a job's views. With several ranks, each renders a band of rows.
+    """Renderer of a job's views. With several ranks, each renders a rectangle of every view.
 
     Args:
         scene: Scene that provides the frozen part of the colors.
@@ -32,11 +33,12 @@ class Views:
         memory: Memory budget in bytes for everything that is cached about views; a quarter of it is for colors.
         clamp_aware_gradient: Whether to use the clamp-aware gradient (`view_colors_gradient`).
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
-        collectives: Ranks that render each view together.
+        divider: Divider of each view among the ranks that render it together; None for a single rank.
         timer: Timer for `prepare` and `communication`; None for one of its own.
 
     Attributes:
         colors: Function that returns the colors [N, 3] of a view for `sh_dc` [N, 3].
+        collectives: Collectives of the ranks that render each view together.
     """
 
     def __init__(
@@ -49,7 +51,7 @@ class Views:
         memory: int = 1 << 30,
         clamp_aware_gradient: bool = False,
         regions: Sequence[Rectangle] | None = None,
-        collectives: Collectives = ALONE,
+        divider: Divider | None = None,
         timer: Timer | None = None,
     ) -> None:
         self.scene = scene
@@ -57,15 +59,12 @@ class Views:
         self.rasterizer = rasterizer
         self.covered = covered
         self.clamp_aware_gradient = clamp_aware_gradient
-        self.collectives = collectives
+        self.collectives: Collectives = divider.collectives if divider else ALONE
         self.timer = timer or Timer()
-        self._bands = [
-            divide_rows(
-                camera.height, collectives.size, (regions[index].top, regions[index].bottom) if regions else None
-            )
-            for index, camera in enumerate(cameras)
-        ]
-        shown = memory // 16 if collectives.size > 1 else 0
+        self._divider = divider
+        self._regions = regions
+        self._shares: dict[int, Shares] = {}
+        shown = memory // 16 if self.collectives.size > 1 else 0
         self._shown: Cache[int, ShownGaussians] = Cache(shown)
         self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4 - shown)
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
@@ -74,7 +73,7 @@ class Views:
         return len(self.cameras)
 
     def render(self, index: int, colors: Tensor, rasterizer: Rasterizer | None = None) -> Tensor:
-        """Return the image [h, w, 3] of a view.
+        """Return the image of a view; with several ranks, of the rectangle [h, w, 3] that this rank renders.
 
         Args:
             index: Index of the view.
@@ -82,58 +81,79 @@ class Views:
             rasterizer: Replacement for the views' own rasterizer.
         """
         chosen = rasterizer or self.rasterizer
-        rows = self.own_rows(index, lambda camera, band: chosen.render(colors, camera, band), 3)
-        with self.timer("communication"):
-            return self.gathered(index, rows)
+        return self.window(index, lambda camera: chosen.render(colors, camera), 3)
 
     def unstylized(self, index: int) -> Tensor:
-        """Return the image [h, w, 3] of a view of the unstylized scene.
+        """Return the `render` of a view of the unstylized scene.
 
         It does not depend on which blend weights are cached, because it is cached itself over many steps.
         """
         return self.render(index, self.colors(index, self._sh_dc), self.rasterizer.repeatable)
 
-    def own_rows(self, index: int, make: Callable[[Camera, Rows], Tensor], *shape: int) -> Tensor:
-        """Return this rank's band of a view, [h, w, *shape], from a function of camera and band.
+    def window(self, index: int, make: Callable[[Camera], Tensor], *shape: int) -> Tensor:
+        """Return this rank's rectangle [h, w, *shape] of a view, from a function of its camera.
 
-        The function is not called if the band has no rows.
+        The function is not called if the rectangle is empty.
         """
-        camera, band = self.cameras[index], self._own_band(index)
-        return make(camera, band) if band[0] < band[1] else self._nothing(0, camera.width, *shape)
+        camera = self._own_camera(index)
+        return self._nothing(0, 0, *shape) if camera is None else make(camera)
 
-    def gathered(self, index: int, rows: Tensor) -> Tensor:
-        """Return the whole view [H, w, ...] from all ranks' bands [h, w, ...]."""
-        return self.collectives.all_gather_rows(rows, self._bands[index])
+    def whole(self, index: int, window: Tensor) -> Tensor:
+        """Return the whole view [H, W, ...] from every rank's rectangle [h, w, ...]; 0 where no rank renders."""
+        shares = self.shares(index)
+        if shares is None:
+            return window
+        rank = self.collectives.rank
+        own = window[shares.parts[rank].within(shares.windows[rank]).slices]
+        image = own.new_zeros((*shares.size, *own.shape[2:]))
+        with self.timer("communication"):
+            everything = Rectangle(0, 0, *shares.size)
+            self.collectives.gather_parts(own, shares.parts, image, [everything] * self.collectives.size)
+        return image
+
+    def shares(self, index: int) -> Shares | None:
+        """Return the rectangles of a view that the ranks render; None for a single rank."""
+        if self._divider is None or self.collectives.size == 1:
+            return None
+        if index not in self._shares:
+            camera = self.cameras[index]
+            region = self._regions[index] if self._regions else None
+            self._shares[index] = self._divider.shares((camera.height, camera.width), region)
+        return self._shares[index]
+
+    def forget_shares(self) -> None:
+        """Clear what depends on the rectangles that the ranks render, because they are about to change."""
+        self._shares.clear()
+        self._shown.clear()
+        self.rasterizer.forget_views()
 
     def gradient(self, index: int, image_gradient: Tensor, colors: Tensor) -> Tensor:
         """Return dL/dsh_dc [N, 3].
 
         Args:
             index: Index of the view.
-            image_gradient: [h, w, 3], this rank's summand of dL/dimage.
+            image_gradient: [h, w, 3], this rank's summand of dL/dimage in the rectangle that it renders.
             colors: [N, 3], colors that were rendered.
         """
-        camera, band = self.cameras[index], self._own_band(index)
-        with self.timer("communication"):
-            rows = self.collectives.reduce_scatter_rows(image_gradient, self._bands[index])
-        some = len(rows) > 0
-        gradient = self.rasterizer.color_gradient(rows, camera, band) if some else self._nothing(len(colors), 3)
-        gradient = self._sum(gradient, self._shown_by(index, rows, band))
+        camera = self._own_camera(index)
+        if camera is None:
+            gradient = self._nothing(len(colors), 3)
+        else:
+            gradient = self.rasterizer.color_gradient(image_gradient, camera)
+        gradient = self._sum(gradient, self._shown_by(index))
         # After the sum, because which colors pass the clamp depends on the sign of their total gradient.
         return view_colors_gradient(gradient, colors, clamp_aware_gradient=self.clamp_aware_gradient)
 
     def cache_weights(self, index: int) -> None:
-        """Cache the blend weights of this rank's band of a view, if the rasterizer can cache them and they fit."""
-        band = self._own_band(index)
-        if band[0] < band[1]:
-            self.rasterizer.cache_weights(self.cameras[index], band)
+        """Cache the blend weights of this rank's rectangle of a view, if the rasterizer can and they fit."""
+        camera = self._own_camera(index)
+        if camera is not None:
+            self.rasterizer.cache_weights(camera)
 
     def temporary_weights(self, index: int) -> AbstractContextManager[None]:
         """Use in a `with` block the blend weights that `cache_weights` would cache, even if they are not cached."""
-        band = self._own_band(index)
-        if band[0] < band[1]:
-            return self.rasterizer.temporary_weights(self.cameras[index], band)
-        return nullcontext()
+        camera = self._own_camera(index)
+        return nullcontext() if camera is None else self.rasterizer.temporary_weights(camera)
 
     def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
         """Return the sum [N, 3] of all ranks' gradients, which are 0 for all Gaussians but those in `shown`."""
@@ -143,16 +163,11 @@ class Views:
             indices = shown.indices()
             return gradient.index_copy_(0, indices, self.collectives.all_reduce(gradient.index_select(0, indices)))
 
-    def _shown_by(self, index: int, rows: Tensor, band: Rows) -> ShownGaussians | None:
-        """Return the Gaussians that any rank's band of a view shows.
+    def _shown_by(self, index: int) -> ShownGaussians | None:
+        """Return the Gaussians that any rank's rectangle of a view shows.
 
         Ranks agree on them at the first visit, using the same blend weights as gradients do. Blend weights of another
-        rasterizer, or of the whole view instead of its bands, may differ by rounding at the smallest opacity.
-
-        Args:
-            index: Index of the view.
-            rows: [h, w, 3], image gradient of this rank's band, used for its shape.
-            band: Rows of the band.
+        rasterizer, or of the whole view instead of its rectangles, may differ by rounding at the smallest opacity.
 
         Returns:
             The Gaussians; None if there is only one rank, or if they do not fit in the cache.
@@ -164,16 +179,25 @@ class Views:
         def find() -> ShownGaussians:
             mask = torch.zeros(len(self.scene), dtype=torch.bool, device=self.rasterizer.device)
             with self.timer("prepare"):
-                if len(rows):  # weights are never negative, so their sum is 0 only if all are
-                    mask = self.rasterizer.color_gradient(torch.ones_like(rows), self.cameras[index], band)[:, 0] > 0
+                camera = self._own_camera(index)
+                if camera is not None:  # weights are never negative, so their sum is 0 only if all are
+                    ones = torch.ones((camera.height, camera.width, 3))
+                    mask = self.rasterizer.color_gradient(ones, camera)[:, 0] > 0
             with self.timer("communication"):
                 return ShownGaussians(self.collectives.union(mask))
 
         return self._shown.get(index, find, size)
 
     def _nothing(self, *shape: int) -> Tensor:
-        """Return zeros: the contribution of a rank that has no rows of a view."""
+        """Return zeros: the contribution of a rank that has no pixels of a view."""
         return torch.zeros(shape, dtype=self.rasterizer.dtype, device=self.rasterizer.device)
 
-    def _own_band(self, index: int) -> Rows:
-        return self._bands[index][self.collectives.rank]
+    def _own_camera(self, index: int) -> Camera | None:
+        """Return the camera of this rank's rectangle of a view; None if it is empty."""
+        shares = self.shares(index)
+        if shares is None:
+            return self.cameras[index]
+        window = shares.windows[self.collectives.rank]
+        if not window.pixels:
+            return None
+        return self.cameras[index].cropped(window.top, window.left, window.bottom, window.right)

@@ -25,9 +25,9 @@ from torch import Tensor
 from torch.distributed.distributed_c10d import _set_pg_timeout
 
 from sgsst_core.errors import SgsstError
+from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, Merged, Traffic
-from sgsst_core.rasterizer import Rows
 from worker.processes import interface_towards, listen, split_address
 from worker.ranks.messages import decode, encode
 
@@ -196,25 +196,51 @@ class ProcessGroupCollectives:
             subgroup.close()
         self._background.shutdown(cancel_futures=True)
 
-    def all_gather_rows(self, band: Tensor, bands: Sequence[Rows]) -> Tensor:
+    def gather_parts(
+        self, part: Tensor, parts: Sequence[Rectangle], window: Tensor, windows: Sequence[Rectangle]
+    ) -> None:
         """See `Collectives`."""
-        largest = max(stop - start for start, stop in bands)
-        # The back ends require the same number of rows from all ranks.
-        padded = band.new_zeros((largest, *band.shape[1:]))
-        padded[: len(band)] = band
-        gathered = [torch.empty_like(padded) for _ in bands]
-        self.sent["image"] += (self.size - 1) * padded.nbytes
-        dist.all_gather(gathered, padded, group=self._group)
-        return torch.cat([part[: stop - start] for part, (start, stop) in zip(gathered, bands, strict=True)])
+        own_part, own_window = parts[self.rank], windows[self.rank]
+        sent = [own_part.intersection(other).within(own_part) for other in windows]
+        received = [own_window.intersection(other).within(own_window) for other in parts]
+        for area, values in zip(received, self._exchange(part, sent, received), strict=True):
+            window[area.slices] = values
 
-    def reduce_scatter_rows(self, image: Tensor, bands: Sequence[Rows]) -> Tensor:
+    def reduce_parts(self, window: Tensor, parts: Sequence[Rectangle], windows: Sequence[Rectangle]) -> Tensor:
         """See `Collectives`."""
-        own = bands[self.rank][1] - bands[self.rank][0]
-        received = image.new_empty((self.size * own, *image.shape[1:]))
-        rows = [stop - start for start, stop in bands]
-        self.sent["image"] += image.nbytes // max(len(image), 1) * (len(image) - own)
-        dist.all_to_all_single(received, image.contiguous(), [own] * self.size, rows, group=self._group)
-        return received.view(self.size, own, *image.shape[1:]).sum(dim=0)
+        own_part, own_window = parts[self.rank], windows[self.rank]
+        sent = [own_window.intersection(other).within(own_window) for other in parts]
+        received = [own_part.intersection(other).within(own_part) for other in windows]
+        total = window.new_zeros((*own_part.shape, *window.shape[2:]))
+        for area, values in zip(received, self._exchange(window, sent, received), strict=True):
+            total[area.slices] += values  # in the order of ranks, whichever this one is
+        return total
+
+    def _exchange(self, image: Tensor, sent: Sequence[Rectangle], received: Sequence[Rectangle]) -> list[Tensor]:
+        """Send a rectangle of an image [h, w, ...] to each rank.
+
+        Args:
+            image: Image of this rank.
+            sent: Rectangle of the image for each rank; may be empty.
+            received: Rectangle of the size that each rank sends to this one.
+
+        Returns:
+            Values [h, w, ...] from each rank.
+        """
+        beside = image.shape[2:]
+        values = [image[area.slices] for area in sent]
+        others = [part.reshape(-1) for rank, part in enumerate(values) if rank != self.rank]
+        flat = torch.cat(others)
+        counts = [area.pixels * beside.numel() for area in sent]
+        expected = [area.pixels * beside.numel() for area in received]
+        counts[self.rank] = expected[self.rank] = 0
+        into = image.new_empty(sum(expected))
+        self.sent["image"] += flat.nbytes
+        dist.all_to_all_single(into, flat, expected, counts, group=self._group)
+        return [
+            values[rank] if rank == self.rank else part.view(*area.shape, *beside)
+            for rank, (part, area) in enumerate(zip(into.split(expected), received, strict=True))
+        ]
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         """See `Collectives`."""

@@ -134,7 +134,10 @@ def test_each_kind_of_evaluation_has_its_own_graph(tiny_weights: BackboneWeights
 
     def view(scales: list[int]) -> ViewTarget:
         share = loss.divider.divide({scale: (HEIGHT >> scale, WIDTH >> scale) for scale in scales})
-        own = {scale: loss.targets.content_features(content, scale, tiles) for scale, tiles in share.tiles.items()}
+        own = {
+            scale: loss.targets.content_features(loss.targets.scaled(content, scale), tiles)
+            for scale, tiles in share.tiles.items()
+        }
         return ViewTarget(content=own, division=share)
 
     for step in range(3):

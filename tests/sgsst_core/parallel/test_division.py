@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.parallel.division import Piece, divide, divide_rows, loads, rounds
+from sgsst_core.parallel.division import Piece, Shares, divide, loads, rounds
 
 HALO = 64
 
@@ -62,21 +62,46 @@ def test_ranks_without_work_have_no_pieces() -> None:
     assert sum(loads(divide(nothing, HALO, (1.0, 1.0)), HALO)) == 0
 
 
-@settings(max_examples=100, deadline=None)
-@given(height=st.integers(1, 500), count=st.integers(1, 40), data=st.data())
-def test_bands_partition_all_rows(height: int, count: int, data: st.DataObject) -> None:
-    top = data.draw(st.integers(0, height - 1))
-    bottom = data.draw(st.integers(top + 1, height))
-    bands = divide_rows(height, count, (top, bottom))
-    assert len(bands) == count
-    assert bands[0][0] == 0
-    assert bands[-1][1] == height
-    assert all(first[1] == second[0] and first[0] <= first[1] for first, second in itertools.pairwise(bands))
-    assert all(start % 16 == 0 for start, _ in bands if start < height)
+@settings(max_examples=60, deadline=None)
+@given(
+    height=st.integers(1, 700),
+    width=st.integers(1, 700),
+    finest=st.integers(0, 2),
+    ranks=st.integers(1, 9),
+)
+def test_shares_contain_each_pixel_of_the_finest_scale_once(height: int, width: int, finest: int, ranks: int) -> None:
+    pieces = tuple(piece for piece in view(height, width, 4) if piece.scale >= finest)
+    by_rank = divide(pieces, HALO, (1.0,) * ranks)
+    shares = Shares.of((height, width), by_rank, HALO)
+    owners = torch.zeros(height, width, dtype=torch.int64)
+    for part, window, own in zip(shares.parts, shares.windows, by_rank, strict=True):
+        owners[part.slices] += 1
+        inside = torch.zeros(height, width, dtype=torch.bool)
+        inside[window.slices] = True
+        assert bool(inside[part.slices].all())
+        for piece in own:
+            if piece.scale == finest and piece.region.pixels:
+                assert window.at_scale(finest) == piece.tile(HALO).outer
+    complete = (height >> finest << finest, width >> finest << finest)
+    assert bool((owners[: complete[0], : complete[1]] == 1).all())
+    assert int(owners.sum()) == complete[0] * complete[1]
 
 
-def test_covered_rows_are_divided_equally() -> None:
-    assert divide_rows(480, 2, (320, 384)) == [(0, 352), (352, 480)]
+@settings(max_examples=60, deadline=None)
+@given(height=st.integers(64, 700), width=st.integers(64, 700), scales=st.integers(2, 7), ranks=st.integers(1, 9))
+def test_coarse_windows_contain_the_pixels_of_coarser_pieces(height: int, width: int, scales: int, ranks: int) -> None:
+    by_rank = divide(tuple(piece for piece in view(height, width, scales) if piece.region.pixels), HALO, (1.0,) * ranks)
+    shares = Shares.of((height, width), by_rank, HALO)
+    scale = shares.exchanged_scale({piece.scale for pieces in by_rank for piece in pieces})
+    assert scale == 1
+    for pieces, window in zip(by_rank, shares.coarse_windows(by_rank, HALO, scale), strict=True):
+        coarser = [piece for piece in pieces if piece.scale > 0 and piece.region.pixels]
+        assert bool(window.pixels) == bool(coarser)
+        for piece in coarser:
+            outer, area = piece.tile(HALO).outer, window.at_scale(piece.scale - scale)
+            assert outer.intersection(area) == outer
+            assert area.top << piece.scale - scale == window.top
+            assert area.left << piece.scale - scale == window.left
 
 
 def test_several_ranks_evaluate_all_scales_together() -> None:

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +22,11 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
-from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, Rows, make_rasterizer
+from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
-from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, check_intersections
+from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, build_tile_intersections, check_intersections
 from sgsst_core.rasterizer.vectors import as_float
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
@@ -49,7 +48,7 @@ from tests.sgsst_core.splat_scenes import (
 CLOSE = 2e-5
 ALL = [name for name, kind in RASTERIZERS.items() if not kind.on_gpu]
 OTHERS = [name for name in ALL if name != "reference"]
-#: Rasterizers whose results are bit-identical for any band and any number of threads.
+#: Rasterizers whose results are bit-identical for any number of threads.
 REPRODUCIBLE = ["cpu", "cached"]
 BLACK = (0.0, 0.0, 0.0)
 
@@ -105,27 +104,24 @@ def test_survey_equals_coverage_and_gradient_of_ones(case: tuple[Scene, Camera])
         assert float((weights - summed).abs().max()) <= 1e-4 * float(summed.max()) + 2 * int(band.sum())
 
 
-def assert_agree(
-    names: list[str], scene: Scene, view: Camera, background: tuple[float, float, float], rows: Rows | None = None
-) -> int:
+def assert_agree(names: list[str], scene: Scene, view: Camera, background: tuple[float, float, float]) -> int:
     """Assert that images agree within 1e-4 and gradients within 1e-5, except at pixels very close to a cutoff.
 
     Return the largest number of differing pixels close to a cutoff.
     """
-    rows = (0, view.height) if rows is None else rows
-    colors, pixels = colors_of(scene), pixels_like(view)[rows[0] : rows[1]]
+    colors, pixels = colors_of(scene), pixels_like(view)
     reference = ReferenceRasterizer(scene, background=background)
-    band = reference.near_cutoff(view, CLOSE, rows)
+    band = reference.near_cutoff(view, CLOSE)
     pixels[band] = 0
-    image, coverage = reference.render(colors, view, rows), reference.coverage(view, rows)
-    expected = reference.color_gradient(pixels, view, rows)
+    image, coverage = reference.render(colors, view), reference.coverage(view)
+    expected = reference.color_gradient(pixels, view)
     flipped = 0
     for name in names:
         fast = make_rasterizer(name, scene, background=background)
-        flips = assert_close_outside_band(fast.render(colors, view, rows), image, band, tolerance=1e-4)
+        flips = assert_close_outside_band(fast.render(colors, view), image, band, tolerance=1e-4)
         flipped = max(flipped, flips)
-        assert_close_outside_band(fast.coverage(view, rows), coverage, band, tolerance=1e-4)
-        actual = fast.color_gradient(pixels, view, rows)
+        assert_close_outside_band(fast.coverage(view), coverage, band, tolerance=1e-4)
+        actual = fast.color_gradient(pixels, view)
         assert actual.dtype == torch.float32
         assert relative_error(actual, expected) < 1e-5
         assert float((actual - expected).abs().max()) <= 1e-5 * float(expected.abs().max())
@@ -177,27 +173,41 @@ def test_gradient_is_transpose_and_agrees_with_differences(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-@pytest.mark.parametrize("cuts", [(0, 7, 45), (0, 16, 32, 45), (0, 1, 44, 45)])
-def test_concatenated_bands_equal_whole_view(name: str, cuts: tuple[int, ...]) -> None:
-    scene, view = cloud(seed=12), camera()
+@pytest.mark.parametrize(("row", "column"), [(7, 32), (16, 16), (32, 1)])
+def test_crops_of_a_view_make_up_the_whole_view(name: str, row: int, column: int) -> None:
+    """Gaussians near the border are large on screen, so that the slopes of their projections are clamped."""
+    scene, view = cloud(seed=12, log_scale=-1.0), camera(focal=20.0)
     colors, pixels = colors_of(scene), pixels_like(view)
-    bands = list(pairwise(cuts))
-    whole, parts = (make_rasterizer(name, scene, background=(1, 1, 1)) for _ in range(2))
-    image = torch.cat([parts.render(colors, view, band) for band in bands])
-    coverage = torch.cat([parts.coverage(view, band) for band in bands])
-    gradient = torch.stack([parts.color_gradient(pixels[a:b], view, (a, b)) for a, b in bands]).sum(0)
-    tolerance = 4 * torch.finfo(whole.dtype).eps
-    if name in REPRODUCIBLE:
-        assert torch.equal(image, whole.render(colors, view))
-        assert torch.equal(coverage, whole.coverage(view))
-    else:
-        assert torch.allclose(image, whole.render(colors, view), atol=tolerance)
-        assert torch.allclose(coverage, whole.coverage(view), atol=tolerance)
-    assert relative_error(gradient, whole.color_gradient(pixels, view)) < 1e-6
-    # Bands give the same result from the cached operator of the whole view.
-    of_band = [rasterizer.color_gradient(pixels[5:20], view, (5, 20)) for rasterizer in (whole, parts)]
-    assert relative_error(*of_band) < 1e-6
-    assert torch.allclose(whole.render(colors, view, (5, 20)), image[5:20], atol=tolerance)
+    rasterizer = make_rasterizer(name, scene, background=(1, 1, 1))
+    image, coverage = torch.zeros(view.height, view.width, 3), torch.zeros(view.height, view.width)
+    gradient = torch.zeros(len(scene), 3, dtype=rasterizer.dtype)
+    for top, bottom in ((0, row), (row, view.height)):
+        for left, right in ((0, column), (column, view.width)):
+            crop, area = view.cropped(top, left, bottom, right), (slice(top, bottom), slice(left, right))
+            image[area] = rasterizer.render(colors, crop).float()
+            coverage[area] = rasterizer.coverage(crop).float()
+            gradient += rasterizer.color_gradient(pixels[area], crop)
+    assert torch.allclose(image, rasterizer.render(colors, view).float(), atol=1e-6)
+    assert torch.allclose(coverage, rasterizer.coverage(view).float(), atol=1e-6)
+    assert relative_error(gradient, rasterizer.color_gradient(pixels, view)) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["cpu", "cached"])
+def test_crops_have_tile_intersections_of_their_own(name: str) -> None:
+    """A crop takes a fraction of the memory, and nothing remains once its view is forgotten."""
+    scene, view = cloud(2000, seed=13), camera(200, 120)
+    rasterizer = make_rasterizer(name, scene)
+    crop = view.cropped(0, 0, 64, 96)
+    whole, part = (build_tile_intersections(scene, each) for each in (view, crop))
+    assert part.nbytes < 0.5 * whole.nbytes
+    rasterizer.render(colors_of(scene), crop)
+    cpu = rasterizer.uncached
+    assert isinstance(cpu, CpuRasterizer)
+    assert cpu.intersections(crop).nbytes == part.nbytes
+    rasterizer.forget_views()
+    assert not cpu.has_intersections(crop)
+    if isinstance(rasterizer, CachedRasterizer):
+        assert not rasterizer.is_cached(crop)
 
 
 @pytest.mark.parametrize("name", REPRODUCIBLE)
@@ -336,7 +346,7 @@ def test_half_precision_weights_are_rounded_to_float16() -> None:
     assert relative_error(half.color_gradient(pixels, view), full.color_gradient(pixels, view)) < 5e-4
     assert half.cached_bytes < 0.65 * full.cached_bytes
     (one,), (two,) = full._cached.values.values(), half._cached.values.values()
-    exact, rounded = (as_float(cached.weights.strips.weights) for cached in (one, two))  # type: ignore[attr-defined]
+    exact, rounded = (as_float(cached.strips.weights) for cached in (one, two))  # type: ignore[attr-defined]
     assert np.array_equal(rounded, (exact * np.float32(2**14)).astype(np.float16).astype(np.float32) / 2**14)
     assert 0 < float(exact[exact > 0].min()) < 1e-5
 
@@ -354,7 +364,7 @@ def test_weights_beyond_the_budget_are_recomputed() -> None:
             assert relative_error(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
     assert [cached.is_cached(view) for view in views] == [True, True, False]
     assert cached.cached_bytes == budget
-    weights = [k.weights for k in cached._cached.values.values()]
+    weights = cached._cached.values.values()
     real = sum(array.nbytes for each in weights for array in each.strips)  # type: ignore[attr-defined]
     assert 0.7 * budget < real <= budget
 
@@ -391,13 +401,10 @@ def test_arguments_are_checked_before_any_work() -> None:
     scene, view = cloud(10), camera()
     for name in ALL:
         rasterizer = make_rasterizer(name, scene)
-        for rows in ((0, 0), (5, 3), (-1, 4), (0, view.height + 1)):
-            with pytest.raises(ValueError, match="band of view 'test' lies within 0 to 45"):
-                rasterizer.render(colors_of(scene), view, rows)
         with pytest.raises(ValueError, match="colors of shape"):
             rasterizer.render(torch.zeros(9, 3), view)
         with pytest.raises(ValueError, match="image gradient of shape"):
-            rasterizer.color_gradient(torch.zeros(45, 70, 3), view, (0, 10))
+            rasterizer.color_gradient(torch.zeros(45, 70, 3), view.cropped(0, 0, 10, 70))
 
 
 def test_unknown_rasterizers_and_devices_are_refused() -> None:
@@ -460,7 +467,8 @@ def test_real_scenes_agree_with_the_reference(shared_data: Path, name: str, side
     view = resized(views[2], side)
     background = BLACK if name == "snowmiku_plush" else (1.0, 1.0, 1.0)
     middle = view.height // 2
-    flipped = assert_agree(OTHERS, scene, view, background, (middle - 10, middle + 11))
+    part = view.cropped(middle - 10, 0, middle + 11, view.width)
+    flipped = assert_agree(OTHERS, scene, part, background)
     assert flipped <= 1e-3 * 21 * view.width
 
 

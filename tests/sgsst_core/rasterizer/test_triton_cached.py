@@ -108,22 +108,19 @@ def test_gradient_is_transpose_and_reproducible(precision: Precision) -> None:
     assert torch.equal(cached_on_device(scene, precision=precision).color_gradient(pixels, view), gradient)
 
 
-def test_concatenated_bands_equal_whole_view() -> None:
+def test_crops_of_a_view_make_up_the_whole_view() -> None:
     scene, view = cloud(100, seed=14), camera(20, 35)
     colors, pixels, uncached = colors_of(scene), pixels_like(view), on_device(scene)
-    whole, parts = (CachedRasterizer(scene, uncached=uncached) for _ in range(2))
-    bands = [(0, 16), (16, 21), (21, 35)]
-    image, gradient = whole.render(colors, view), whole.color_gradient(pixels, view)
-    # A block that a band divides may have fewer pieces, which are then summed in other groups.
-    together = torch.cat([parts.render(colors, view, rows) for rows in bands])
-    assert float((together - image).abs().max()) < 1e-6
-    assert torch.equal(together[:16], image[:16])
-    assert torch.equal(torch.cat([parts.coverage(view, rows) for rows in bands]), whole.coverage(view))
-    own = [parts.color_gradient(pixels[start:stop], view, (start, stop)) for start, stop in bands]
+    cached = CachedRasterizer(scene, uncached=uncached)
+    image, gradient = cached.render(colors, view), cached.color_gradient(pixels, view)
+    rows = [(0, 16), (16, 21), (21, 35)]
+    crops = [view.cropped(start, 0, stop, 20) for start, stop in rows]
+    # A block that the border of a crop divides may have fewer pieces, which are then summed in other groups.
+    assert float((torch.cat([cached.render(colors, crop) for crop in crops]) - image).abs().max()) < 1e-6
+    coverage = torch.cat([cached.coverage(crop) for crop in crops])
+    assert torch.allclose(coverage, cached.coverage(view), atol=1e-6)
+    own = [cached.color_gradient(pixels[start:stop], crop) for (start, stop), crop in zip(rows, crops, strict=True)]
     assert relative_error(torch.stack(own).sum(0), gradient) < 1e-6
-    # A band gives the same result from the cached weights of the whole view.
-    assert torch.equal(whole.render(colors, view, (16, 21)), image[16:21])
-    assert relative_error(whole.color_gradient(pixels[16:21], view, (16, 21)), own[1]) < 1e-6
 
 
 @pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
@@ -152,11 +149,11 @@ def test_weights_beyond_the_budget_are_recomputed_on_the_device() -> None:
     assert torch.equal(cached.render(colors, views[2]), uncached.render(colors, views[2]))
     gradient = cached.color_gradient(pixels_like(views[2]), views[2])
     assert torch.equal(gradient, uncached.color_gradient(pixels_like(views[2]), views[2]))
-    band = (3, 16)
-    assert cached.count_weights(views[2], band).nbytes(precision) < cached.count_weights(views[2]).nbytes(precision)
+    crop = views[2].cropped(3, 0, 16, 17)
+    assert cached.count_weights(crop).nbytes(precision) < cached.count_weights(views[2]).nbytes(precision)
     alone = CachedRasterizer(scene, uncached=uncached)
-    alone.color_gradient(pixels[3:16], views[0], band)
-    assert alone.cached_bytes == alone.count_weights(views[0], band).nbytes(alone.precision)
+    alone.color_gradient(pixels[3:16, :17], crop)
+    assert alone.cached_bytes == alone.count_weights(crop).nbytes(alone.precision)
 
 
 def test_pieces_have_weights_and_slots_are_filled_once() -> None:

@@ -93,7 +93,7 @@ def test_caller_decides_which_views_are_cached() -> None:
     assert torch.equal(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view))
     assert (cached.is_cached(view), cached.cached_bytes) == (False, 0)
     assert cached.cache_weights(view)
-    assert cached.is_cached(view, (3, 9))
+    assert cached.is_cached(view)
     assert not cached.is_cached(VIEWS[1])
     assert not CachedRasterizer(scene, at_first_use=False, max_bytes=10).cache_weights(view)
 

@@ -27,8 +27,8 @@ Place = Literal[
     "render",
     "loss",
     "optimizer",
-    "all_gather_rows",
-    "reduce_scatter_rows",
+    "gather_parts",
+    "reduce_parts",
     "all_reduce",
     "all_reduce_statistics",
     "all_gather",
@@ -153,7 +153,7 @@ def _places() -> dict[str, tuple[Any, str]]:
     from sgsst_core.stylizing.views import Views
     from worker.ranks.process_group import ProcessGroupCollectives
 
-    exchanges = ("all_gather_rows", "reduce_scatter_rows", "all_reduce", "all_reduce_statistics", "all_gather")
+    exchanges = ("gather_parts", "reduce_parts", "all_reduce", "all_reduce_statistics", "all_gather")
     return {
         "render": (Views, "render"),
         "loss": (SosLoss, "evaluate"),

@@ -142,7 +142,7 @@ def test_two_ranks_reach_the_loss_of_one_rank(undisturbed: tuple[float, bytes], 
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
-        (Fault(1, "all_gather_rows", 30, "SIGKILL", 0.001), "was killed"),
+        (Fault(1, "all_reduce", 30, "SIGKILL", 0.001), "was killed"),
         (Fault(0, "checkpoint", 4, "SIGKILL"), "was killed"),
         (Fault(1, "render", 25, "SIGSTOP"), "not answered"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -47,15 +49,24 @@ def gradient(
     memory: int = 1 << 34,
     style_loss: StyleLossName = "sos",
     regions: Regions | None = None,
+    scales: tuple[int, ...] | None = None,
+    coarsest: int = 40,
+    scale_weights: ScaleWeights = EVEN,
 ) -> tuple[Tensor, float, list[bool]]:
-    """Return the color gradient [N, 3] and the SOS loss of one view at two or three scales.
+    """Return the color gradient [N, 3] and the SOS loss of one view at some scales, or at all two or three.
 
     Also return for each of this rank's tiles whether its activations are cached.
     """
     weights = comparing_pixels(tiny_weights())
     network = FeatureNetwork(weights, layers_of(style_loss, weights, content=True), dtype)
     loss = SosLoss(
-        network, style_loss=style_loss, memory=memory, tile_size=tile_size, coarsest=40, collectives=collectives
+        network,
+        style_loss=style_loss,
+        memory=memory,
+        tile_size=tile_size,
+        coarsest=coarsest,
+        scales=scale_weights,
+        collectives=collectives,
     )
     loss.divider.speeds = speeds or loss.divider.speeds
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
@@ -70,7 +81,7 @@ def gradient(
         rasterizer,
         covered=[0],
         regions=survey.regions if weighted else None,
-        collectives=collectives,
+        divider=loss.divider,
     )
     view_targets = ViewTargets(
         views,
@@ -79,7 +90,7 @@ def gradient(
         regions=survey.regions if weighted else None,
         maps=styles.maps(rasterizer),
     )
-    scales = range(loss.tiling.scale_count((camera.height, camera.width)))
+    scales = scales or tuple(loss.tiling.scales((camera.height, camera.width)))
     target = view_targets.target(0, scales)
     targets = styles.targets(loss, (camera.height, camera.width))
     colors = views.colors(0, torch.roll(scene.sh_dc, 1, dims=0).to(dtype))
@@ -135,6 +146,29 @@ def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> No
     for actual, actual_loss, _ in on_ranks(3, gradient, *arguments):
         assert relative_error(actual, expected) < 1e-9
         assert actual_loss == pytest.approx(loss, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("scales", "coarsest", "scale_weights"),
+    [
+        ((0,), 40, EVEN),
+        ((2,), 20, EVEN),
+        ((1, 2), 20, EVEN),
+        ((0, 2), 20, EVEN),
+        ((5,), 4, EVEN),  # its blocks are larger than the multiples of 16 pixels at which views are divided
+        (None, 20, ScaleWeights((0.0, 1.0, 2.0))),  # full size is not computed
+    ],
+)
+@pytest.mark.parametrize("scene", [wall(), ball()], ids=["wall", "ball"])
+def test_gradient_of_some_scales_matches_one_rank(
+    scales: tuple[int, ...] | None, coarsest: int, scale_weights: ScaleWeights, scene: Scene
+) -> None:
+    arguments = scene, cameras(1, 157, 131)[0], torch.float64, None, None, 1 << 34
+    some = functools.partial(gradient, scales=scales, coarsest=coarsest, scale_weights=scale_weights)
+    expected, loss, _ = some(ALONE, *arguments)
+    for found, found_loss, _ in on_ranks(3, some, *arguments):
+        assert relative_error(found, expected) < 1e-9
+        assert found_loss == pytest.approx(loss, rel=1e-9)
 
 
 def test_partly_cached_activations_preserve_the_gradient() -> None:

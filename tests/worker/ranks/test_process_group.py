@@ -14,9 +14,9 @@ import torch.distributed as dist
 from torch import Tensor
 
 from sgsst_core.errors import RanksDriftedError, SceneError
+from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut, same_on_all
-from sgsst_core.parallel.division import divide_rows
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights
@@ -62,20 +62,46 @@ def image(rank: int, rows: int = HEIGHT) -> Tensor:
     return torch.randn(rows, 9, 3, generator=torch.Generator().manual_seed(rank))
 
 
-def exchange_rows(collectives: Collectives, covered: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    bands = divide_rows(HEIGHT, collectives.size, covered)
-    start, stop = bands[collectives.rank]
-    gathered = collectives.all_gather_rows(image(7)[start:stop], bands)
-    return gathered, collectives.reduce_scatter_rows(image(collectives.rank), bands)
+def areas(ranks: int) -> list[Rectangle]:
+    """Return disjoint parts of different shapes, of which one is empty with three or more ranks."""
+    found = [Rectangle(5, 2, 50, 9), Rectangle(50, 0, HEIGHT, 4), Rectangle(0, 0, 0, 0), Rectangle(0, 0, 5, 9)]
+    return found[:ranks]
 
 
-@pytest.mark.parametrize(("ranks", "covered"), [(2, (0, HEIGHT)), (3, (20, 41)), (4, (60, 64))])
-def test_rows_are_gathered_and_scattered(ranks: int, covered: tuple[int, int]) -> None:
-    results = on_ranks(ranks, exchange_rows, covered)
-    total = torch.stack([image(rank) for rank in range(ranks)]).sum(dim=0)
-    for gathered, _ in results:
-        assert torch.equal(gathered, image(7))
-    assert torch.allclose(torch.cat([own for _, own in results]), total, atol=1e-6)
+WHOLE, NOTHING = Rectangle(0, 0, HEIGHT, 9), Rectangle(0, 0, 0, 0)
+
+
+def window(rank: int, area: Rectangle) -> Tensor:
+    return image(rank)[area.slices]
+
+
+def exchange_parts(collectives: Collectives, windows: list[Rectangle]) -> tuple[Tensor, Tensor]:
+    parts, own = areas(collectives.size), windows[collectives.rank]
+    filled = torch.full((*own.shape, 3), 0.5)
+    collectives.gather_parts(window(7, parts[collectives.rank]), parts, filled, windows)
+    return filled, collectives.reduce_parts(window(collectives.rank, own), parts, windows)
+
+
+@pytest.mark.parametrize(
+    "windows",
+    [
+        [WHOLE, WHOLE],
+        [NOTHING, WHOLE],
+        [NOTHING] * 3,
+        [Rectangle(3, 1, 53, 5), WHOLE, Rectangle(60, 0, HEIGHT, 9)],
+        [Rectangle(10, 3, 20, 8), NOTHING, Rectangle(0, 0, 6, 9), Rectangle(49, 2, 52, 4)],
+    ],
+)
+def test_windows_are_gathered_and_reduced(windows: list[Rectangle]) -> None:
+    parts = areas(len(windows))
+    gathered, total = torch.full((HEIGHT, 9, 3), 0.5), torch.zeros(HEIGHT, 9, 3)
+    for rank, (part, area) in enumerate(zip(parts, windows, strict=True)):
+        gathered[part.slices] = image(7)[part.slices]
+        total[area.slices] += window(rank, area)
+    results = on_ranks(len(windows), exchange_parts, windows)
+    for (filled, own), part, area in zip(results, parts, windows, strict=True):
+        assert torch.equal(filled, gathered[area.slices])
+        assert torch.equal(own, total[part.slices])
 
 
 def features(rank: int) -> Tensor:
@@ -208,8 +234,10 @@ def test_ranks_that_only_add_communication_are_excluded() -> None:
 
 def test_single_rank_collectives_return_their_input() -> None:
     band = image(0)
-    assert ALONE.all_gather_rows(band, [(0, HEIGHT)]) is band
-    assert ALONE.reduce_scatter_rows(band, [(0, HEIGHT)]) is band
+    filled = torch.zeros_like(band)
+    ALONE.gather_parts(band, [WHOLE], filled, [WHOLE])
+    assert torch.equal(filled, band)
+    assert torch.equal(ALONE.reduce_parts(band, [WHOLE], [WHOLE]), band)
     assert ALONE.all_reduce(band) is band
     assert ALONE.all_gather("a") == ["a"]
 

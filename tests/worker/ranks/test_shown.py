@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,10 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import STYLE_LAYERS
 from sgsst_core.loss.terms import TERMS
+from sgsst_core.loss.tiling import Divider, Tiling
 from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
-from sgsst_core.parallel.division import divide_rows
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -28,12 +31,14 @@ from tests.worker.ranks.spawn import on_ranks
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 WIDTH, HEIGHT = 128, 96
+#: Two ranks render 80 columns each of a view of this size, and one rank a view of 15 rows.
+TILING = Tiling(halo=16, held=math.inf, working=0.0, coarsest=511)
 
 
 def make_views(collectives: Collectives, scene: Scene, camera: Camera, memory: int = 1 << 30) -> Views:
     """Return views with this memory budget for caches; they cache nothing if it is 0."""
-    rasterizer = make_rasterizer("cpu", scene)
-    return Views(scene, [camera], rasterizer, covered=[0], memory=memory, collectives=collectives)
+    rasterizer, divider = make_rasterizer("cpu", scene), Divider(TILING, collectives)
+    return Views(scene, [camera], rasterizer, covered=[0], memory=memory, divider=divider)
 
 
 def pixels(camera: Camera, seed: int) -> Tensor:
@@ -49,8 +54,8 @@ def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[st
         sent = [dict(collectives.sent)]
         results[name] = []
         for visit in range(2):
-            own = pixels(camera, 10 * visit + collectives.rank)
-            results[name].append(views.gradient(0, own, colors))
+            make = functools.partial(pixels, seed=10 * visit + collectives.rank)
+            results[name].append(views.gradient(0, views.window(0, make, 3), colors))
             sent.append(dict(collectives.sent))
         results[f"bytes {name}"] = [
             {kind: after[kind] - before[kind] for kind in after} for before, after in itertools.pairwise(sent)
@@ -64,17 +69,17 @@ def shown_of(scene: Scene, camera: Camera) -> Tensor:
     return make_rasterizer("cpu", scene).color_gradient(ones, camera)[:, 0] > 0
 
 
-def upper(scene: Scene) -> Scene:
-    """Return the Gaussians that project to the upper half of the views; y points down."""
-    return scene.subset(scene.means[:, 1] < -0.5)
+def left(scene: Scene) -> Scene:
+    """Return the Gaussians that project to the left third of the views."""
+    return scene.subset(scene.means[:, 0] < -1)
 
 
 @pytest.mark.parametrize(
     ("scene", "height"),
     [
         pytest.param(wall(sh_degree=1), HEIGHT, id="wall"),
-        pytest.param(upper(wall()), HEIGHT, id="nothing in the lower band"),
-        pytest.param(wall(), 15, id="no rows for one rank"),
+        pytest.param(left(wall()), HEIGHT, id="nothing on the right"),
+        pytest.param(wall(), 15, id="narrow"),
     ],
 )
 def test_exchange_of_shown_gaussians_is_bit_identical_to_all(scene: Scene, height: int) -> None:
@@ -91,13 +96,16 @@ def test_exchange_of_shown_gaussians_is_bit_identical_to_all(scene: Scene, heigh
         assert [sent["gradient"] for sent in result["bytes shown"]] == [len(scene) + 12 * shown, 12 * shown]
 
 
-def test_lower_band_shows_no_gaussians() -> None:
+def coverage_sum(collectives: Collectives, scene: Scene, camera: Camera) -> float:
+    views = make_views(collectives, scene, camera)
+    return float(views.window(0, views.rasterizer.coverage).sum())
+
+
+def test_second_rank_shows_no_gaussians() -> None:
     """Check the assumption of the second test case above."""
-    scene, camera = upper(wall()), cameras(1, WIDTH, HEIGHT)[0]
-    first, second = divide_rows(HEIGHT, 2)
-    rasterizer = make_rasterizer("cpu", scene)
-    assert rasterizer.coverage(camera, first).any()
-    assert not rasterizer.coverage(camera, second).any()
+    first, second = on_ranks(2, coverage_sum, left(wall()), cameras(1, WIDTH, HEIGHT)[0])
+    assert first > 0
+    assert second == 0
 
 
 def test_four_ranks_differ_by_rounding_only() -> None:
@@ -120,11 +128,20 @@ def test_whole_gradient_is_sent_if_nearly_all_is_shown() -> None:
         assert [sent["gradient"] for sent in result["bytes shown"]] == [13 * len(scene), 12 * len(scene)]
 
 
+def quarters() -> list[Rectangle]:
+    return [Rectangle(top, 0, top + 24, WIDTH) for top in range(0, HEIGHT, 24)]
+
+
+def windows() -> list[Rectangle]:
+    """Return the windows of four ranks: the whole image, nothing, the two lower quarters, and nothing."""
+    nothing = Rectangle(0, 0, 0, 0)
+    return [Rectangle(0, 0, HEIGHT, WIDTH), nothing, Rectangle(48, 0, HEIGHT, WIDTH), nothing]
+
+
 def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
-    bands = divide_rows(HEIGHT, collectives.size)
-    start, stop = bands[collectives.rank]
-    collectives.all_gather_rows(torch.zeros(stop - start, WIDTH, 3), bands)
-    collectives.reduce_scatter_rows(torch.zeros(HEIGHT, WIDTH, 3), bands)
+    parts, own = quarters(), windows()[collectives.rank]
+    collectives.gather_parts(torch.zeros(24, WIDTH, 3), parts, torch.zeros(*own.shape, 3), windows())
+    collectives.reduce_parts(torch.zeros(*own.shape, 3), parts, windows())
     collectives.all_reduce(torch.zeros(1000, 3))
     collectives.union(torch.zeros(300, dtype=torch.bool))
     pair = collectives.split_group(collectives.size // 2)
@@ -133,11 +150,10 @@ def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
 
 
 def test_sent_bytes_follow_ring_algorithms() -> None:
-    for rank, sent in enumerate(on_ranks(4, exchange_everything)):
-        bands = divide_rows(HEIGHT, 4)
-        rows = [stop - start for start, stop in bands]
-        image = 3 * max(rows) + sum(rows) - rows[rank]
-        assert sent == {"image": 12 * WIDTH * image, "gradient": 6 * (12_000 + 300) // 4, "statistics": 2000}
+    """Parts are sent directly to the two ranks that need them, and their gradients back."""
+    for sent, quarters_sent in zip(on_ranks(4, exchange_everything), (0 + 3, 1 + 0, 1 + 1, 2 + 0), strict=True):
+        image = 12 * WIDTH * 24 * quarters_sent
+        assert sent == {"image": image, "gradient": 6 * (12_000 + 300) // 4, "statistics": 2000}
 
 
 def test_one_rank_sends_nothing() -> None:
@@ -159,13 +175,13 @@ def run_two_steps(collectives: Collectives) -> dict[str, Any]:
 
 
 def test_step_record_has_sent_bytes() -> None:
-    """Each of two ranks sends twice half of what they add, and twice its half of the image."""
+    """Each of two ranks sends twice half of what they add. Of the image, only the coarser scales are exchanged."""
     layer = CHANNELS + 1 + CHANNELS * (CHANNELS + 1) // 2
     statistics = 8 * (len(STYLE_LAYERS) * layer + len(TERMS))
     for result in on_ranks(2, run_two_steps):
         assert result["shown"] == int(shown_of(wall(), cameras(1, WIDTH, HEIGHT)[0]).sum())
         assert result["steps"][1] == {
-            "image": 12 * WIDTH * HEIGHT,
+            "image": 12 * (WIDTH // 2) * (HEIGHT // 2),
             "statistics": result["scales"] * statistics,
             "gradient": 12 * result["shown"],
         }

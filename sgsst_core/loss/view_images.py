@@ -1,0 +1,152 @@
+"""Image of a view at the scales of an evaluation, and the gradient with respect to it.
+
+A single rank has the whole image. Each of several ranks has the pixels that it renders: its piece of the finest scale,
+and the halo of this piece. Each rank's pixels of coarser scales are put together from all ranks' pieces.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from sgsst_core.features.partition import Rectangle
+from sgsst_core.loss.position_term import ScaledView
+from sgsst_core.loss.tiling import Division
+from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.parallel.division import Shares
+from sgsst_core.scene.pyramid import add_upscaled_, downscale
+from sgsst_core.timing import Timer
+
+
+class ViewImages:
+    """Image of a view at several scales.
+
+    All ranks must create it and call `gradient` together.
+
+    Args:
+        image: [h, w, 3], image of the view, or of this rank's window of `division.shares`.
+        division: Division of the work on the scales of the evaluation.
+        background: Color of the pixels that no rank renders.
+        collectives: Collectives of the ranks.
+        timer: Timer for `communication`.
+    """
+
+    def __init__(
+        self,
+        image: Tensor,
+        division: Division,
+        background: tuple[float, float, float],
+        collectives: Collectives,
+        timer: Timer,
+    ) -> None:
+        shares = division.shares
+        whole = Rectangle(0, 0, image.shape[0], image.shape[1])
+        self._own = _Pixels(image, 0, whole if shares is None else shares.windows[collectives.rank])
+        self._size = whole.shape if shares is None else shares.size
+        self._finest: int | None = None if shares is None else shares.scale
+        self._coarse: _Pixels | None = None
+        self._exchange: _Exchange | None = None
+        scale = None if shares is None else shares.exchanged_scale(division.pieces)
+        if shares is not None and scale is not None:
+            self._exchange = _Exchange.of(shares, division, scale, collectives, timer)
+            self._coarse = self._exchange.gathered(self._own, background)
+
+    def scaled(self, scale: int) -> ScaledView:
+        """Return the pixels of a scale that this rank needs."""
+        return self._source(scale).scaled(scale, (self._size[0] >> scale, self._size[1] >> scale))
+
+    def add_gradient(self, scale: int, gradient: Tensor, factor: float) -> None:
+        """Add the gradient with respect to the pixels of `scaled(scale)`, times a factor."""
+        self._source(scale).add_gradient(scale, gradient, factor)
+
+    def gradient(self) -> Tensor:
+        """Return this rank's summand of the gradient with respect to the image, [h, w, 3]."""
+        if self._exchange is not None and self._coarse is not None:
+            self._exchange.add_gradient(self._coarse, self._own)
+        assert self._own.gradient is not None
+        return self._own.gradient
+
+    def _source(self, scale: int) -> _Pixels:
+        """Return the pixels from which those of a scale are computed."""
+        return self._own if self._coarse is None or scale == self._finest else self._coarse
+
+
+@dataclass
+class _Pixels:
+    """Rectangle of a scaled view, and the gradient with respect to it.
+
+    Attributes:
+        image: [h, w, 3].
+        scale: Scale of the image.
+        area: Rectangle of the scaled view.
+        gradient: [h, w, 3]; None before the first `add_gradient`.
+    """
+
+    image: Tensor
+    scale: int
+    area: Rectangle
+    gradient: Tensor | None = None
+
+    def scaled(self, scale: int, size: tuple[int, int]) -> ScaledView:
+        """Return these pixels at a scale of the view of size (height, width)."""
+        further = scale - self.scale
+        return ScaledView(downscale(self.image, further), scale, size, self.area.at_scale(further))
+
+    def add_gradient(self, scale: int, gradient: Tensor, factor: float = 1.0, area: Rectangle | None = None) -> None:
+        """Add the gradient with respect to these pixels at a scale, or to an area of them, times a factor."""
+        if self.gradient is None:
+            self.gradient = gradient.new_zeros(self.image.shape)
+        target = self.gradient if area is None else self.gradient[area.slices]
+        add_upscaled_(target, gradient, scale - self.scale, factor)
+
+
+@dataclass(frozen=True)
+class _Exchange:
+    """Exchange of a coarser image between ranks.
+
+    Attributes:
+        scale: Scale of the image.
+        own: This rank's part of the view, relative to its window.
+        parts: Rectangle of the image that each rank computes.
+        windows: Rectangle of the image that each rank needs.
+        collectives: Collectives of the ranks.
+        timer: Timer for `communication`.
+    """
+
+    scale: int
+    own: Rectangle
+    parts: Sequence[Rectangle]
+    windows: Sequence[Rectangle]
+    collectives: Collectives
+    timer: Timer
+
+    @staticmethod
+    def of(shares: Shares, division: Division, scale: int, collectives: Collectives, timer: Timer) -> _Exchange:
+        rank = collectives.rank
+        by_rank = [list(itertools.chain(*own)) for own in zip(*division.pieces.values(), strict=True)]
+        return _Exchange(
+            scale,
+            shares.parts[rank].within(shares.windows[rank]),
+            [part.at_scale(scale) for part in shares.parts],
+            shares.coarse_windows(by_rank, division.halo, scale),
+            collectives,
+            timer,
+        )
+
+    def gathered(self, pixels: _Pixels, background: tuple[float, float, float]) -> _Pixels:
+        """Return the pixels of the image that this rank needs, given those that it renders."""
+        own, area = downscale(pixels.image[self.own.slices], self.scale), self.windows[self.collectives.rank]
+        image = own.new_tensor(background).expand(*area.shape, 3).clone()
+        with self.timer("communication"):
+            self.collectives.gather_parts(own, self.parts, image, self.windows)
+        return _Pixels(image, self.scale, area)
+
+    def add_gradient(self, coarse: _Pixels, pixels: _Pixels) -> None:
+        """Add the sum of all ranks' gradients of the image to the gradient of the pixels that this rank renders."""
+        assert coarse.gradient is not None
+        with self.timer("communication"):
+            own = self.collectives.reduce_parts(coarse.gradient, self.parts, self.windows)
+        pixels.add_gradient(self.scale, own, area=self.own)
