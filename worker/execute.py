@@ -118,6 +118,8 @@ def execute(
         callbacks.progress, callbacks.stop, callbacks.finish = progress, stop, finish
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
         callbacks.preview_seconds = 0.0  # `Previews` itself limits how often a preview is written
+        if preview and not _has_rows_of_file(job):
+            preview.live.share_scene(stylizer.job.scene)
     stopped = run(stylizer, callbacks)
     if stopped == "interrupted":
         if checkpoint.error is not None:
@@ -230,8 +232,13 @@ def _write_ply(job: Job) -> None:
 
 def _only_colors_change(job: Job) -> bool:
     """Return whether the result has the same rows as the scene's file, with only f_dc changed."""
-    file, attenuation = job.scene_file, job.stylizer.job.settings.sh_attenuation
-    return file.retained is None and file.copies is None and not (attenuation and file.scene.sh_degree)
+    attenuation = job.stylizer.job.settings.sh_attenuation
+    return _has_rows_of_file(job) and not (attenuation and job.scene_file.scene.sh_degree)
+
+
+def _has_rows_of_file(job: Job) -> bool:
+    """Return whether the job's Gaussians are the rows of the scene's file: none was dropped or split."""
+    return job.scene_file.retained is None and job.scene_file.copies is None
 
 
 def _write_packed(job: Job) -> CompressionLoss | None:

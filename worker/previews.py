@@ -1,4 +1,4 @@
-"""Preview images of a running job."""
+"""Preview images of a running job, and its colors for clients that watch it in 3D."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from sgsst_core.files.images import save_jpg
 from sgsst_core.scene.camera import resized
 from sgsst_core.stylizing.result_colors import transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
+from worker.live import LiveColors
 
 #: Minimum time between two previews, as a fraction of the job's elapsed time. It limits the number of previews.
 _SHARE = 0.05
@@ -31,10 +32,14 @@ class Previews:
     step, with the colors of a warm start, so that users get a first impression of the result within seconds.
 
     Args:
-        folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview.
+        folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview. Colors are written to
+            the folder `live` beside it.
         seconds: Minimum seconds between two previews.
         written: Callback that receives the path of each preview.
         warn: Callback that receives the reason why a preview is missing. A missing preview does not fail the job.
+
+    Attributes:
+        live: Writer of the colors.
     """
 
     def __init__(
@@ -45,9 +50,11 @@ class Previews:
         self._written = written
         self._warn = warn
         self._started = self._last = time.monotonic()
+        self.live = LiveColors(folder.parent / "live", warn)
 
     def __call__(self, stylizer: Stylizer) -> None:
-        """Write a preview if enough time has passed since the last one."""
+        """Write a preview and the colors, each if enough time has passed since the last time."""
+        self.live(stylizer)
         now = time.monotonic()
         if stylizer.step and now - self._last < max(self._seconds, _SHARE * (now - self._started)):
             return

@@ -154,6 +154,7 @@ export class JobView {
   /** @param {{name: string}} artifact */
   onArtifact({ name }) {
     if (name.startsWith("previews/")) this.showPreview(name);
+    else if (name.startsWith("live/") && this.live) this.live.refresh();
     else this.filesLater();
   }
 
@@ -177,7 +178,7 @@ export class JobView {
     const { job } = this;
     this.title = nameOf(job);
     document.title = words.page.title(this.title);
-    if (this.result) this.result.stage.title = this.title;
+    for (const stage of [this.result, this.live]) if (stage) stage.stage.title = this.title;
     this.heading.textContent = this.title;
     put(this.badge, badge(job.status));
     const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
@@ -290,13 +291,31 @@ export class JobView {
     const previews = found.map(({ name }) => name).filter((name) => name.startsWith("previews/")).sort();
     if (previews.length) this.showPreview(previews[previews.length - 1]);
     else if (!this.preview && !this.result) put(this.picture, h("p.quiet", UNFINISHED.has(this.job.status) ? say.noPreview : ""));
-    this.showFiles(found.filter(({ name }) => !name.startsWith("previews/")), names);
+    this.showFiles(found.filter(({ name }) => !/^(previews|live)\//.test(name)), names);
     if (names.has("plan.json") && this.plan.hidden) await this.loadPlan();
     const result = found.find(({ name }) => name === "stylized.ply"), video = found.find(({ name }) => name === "video.mp4");
+    if (names.has("live/colors.f16")) this.showLive(names);
     if (this.job.status === "succeeded" && result) this.offerVideo(video);
-    if (this.job.status !== "succeeded" || !result || this.result) return;
+    if (this.job.status !== "succeeded" || !result || this.result || this.finishing) return;
+    this.finishing = true;
     this.offerDownload(result.size);
-    this.showResult(names);
+    const { live } = this;
+    this.live = undefined;
+    await live?.loading;
+    const kept = await live?.finish(this.job);
+    if (!kept) live?.end();
+    if (!this.leaving.signal.aborted) this.showResult(names, kept ? live : undefined);
+  }
+
+  /** Show the scene with its colors so far. @param {Set<string>} names names of artifacts */
+  showLive(names) {
+    if (this.live || this.result || this.job.status === "succeeded") return;
+    const live = new ResultStage([this.job], { signal: this.leaving.signal, live: { ownScene: names.has("live/scene.ply") } });
+    if (!live.stage.viewer) return;
+    this.live = live;
+    live.stage.title = this.title;
+    const open = this.showTabs([[say.threeD, live.element], [say.preview, this.picture]]);
+    live.loading.then(() => live.original || open(1)); // this format cannot be shown in a browser
   }
 
   /** @param {any} video artifact; undefined if there is none yet */
@@ -348,9 +367,12 @@ export class JobView {
       h("details.fold", h("summary", say.settings), h("dl.facts", told.map(([name, value]) => fact(name.replaceAll("_", " "), typeof value === "object" ? JSON.stringify(value) : String(value))))));
   }
 
-  /** @param {Set<string>} names names of artifacts */
-  showResult(names) {
-    this.result = new ResultStage([this.job], { signal: this.leaving.signal });
+  /**
+   * @param {Set<string>} names names of artifacts
+   * @param {ResultStage} [kept] stage that has shown the job while it ran
+   */
+  showResult(names, kept) {
+    this.result = kept ?? new ResultStage([this.job], { signal: this.leaving.signal });
     this.result.stage.title = this.title;
     const stage = h("div", this.result.element), sheet = h("figure.sheet", { hidden: true });
     /** @type {[string, HTMLElement][]} */
@@ -359,13 +381,27 @@ export class JobView {
       if (this.result.stage.viewer) tabs.push([say.sheet, sheet]);
       else tabs.unshift([say.sheet, sheet]);
     }
+    const fillSheet = () => put(sheet, h("a", { href: artifactPath(this.id, "before_after.jpg"), target: "_blank", rel: "noopener" }, h("img", { src: artifactPath(this.id, "before_after.jpg"), alt: say.sheetOf(this.title) })));
+    this.showTabs(tabs, (body) => body === sheet && !sheet.firstChild && fillSheet(), this.compareLink());
+  }
+
+  /**
+   * @param {[string, HTMLElement][]} tabs titles and bodies; the first one is opened
+   * @param {(body: HTMLElement) => void} [opened] called when a tab is opened
+   * @param {HTMLElement} [beside] element beside the titles
+   * @returns {(index: number) => void} function that opens a tab
+   */
+  showTabs(tabs, opened = () => {}, beside) {
+    const inputs = tabs.map((_, i) => h("input", { type: "radio", name: `tab${this.id}`, onchange: () => open(i) }));
     const open = (/** @type {number} */ at) => {
+      inputs[at].checked = true;
       tabs.forEach(([, body], i) => (body.hidden = i !== at));
-      if (tabs[at][1] === sheet && !sheet.firstChild) put(sheet, h("a", { href: artifactPath(this.id, "before_after.jpg"), target: "_blank", rel: "noopener" }, h("img", { src: artifactPath(this.id, "before_after.jpg"), alt: say.sheetOf(this.title) })));
+      opened(tabs[at][1]);
     };
-    const picker = h("fieldset.segments", h("legend.away", say.view3d), tabs.map(([name], i) => h("label", h("input", { type: "radio", name: `tab${this.id}`, checked: !i, onchange: () => open(i) }), h("span", name))));
-    put(this.show, h("div.row.tabs", picker, this.compareLink()), tabs.map(([, body]) => body));
+    const picker = h("fieldset.segments", h("legend.away", say.view3d), tabs.map(([name], i) => h("label", inputs[i], h("span", name))));
+    put(this.show, h("div.row.tabs", picker, beside), tabs.map(([, body]) => body));
     open(0);
+    return open;
   }
 
   /** Create a link to compare this job with other finished runs of the same scene. */
@@ -385,6 +421,7 @@ export class JobView {
     this.leaving.abort();
     clearTimeout(this.waiting);
     this.chart.end();
+    this.live?.end();
     this.result?.end();
   }
 }

@@ -1,5 +1,8 @@
 // @ts-check
-/** Results of one scene in 3D: the original and the colors of each run, two of them on the sides of the wipe. */
+/**
+ * Results of one scene in 3D: the original and the colors of each run, two of them on the sides of the wipe. Of an
+ * unfinished run, the colors so far.
+ */
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { Blend } from "./blend.js";
@@ -16,11 +19,17 @@ const say = words.viewer;
 export class ResultStage {
   /**
    * @param {any[]} jobs finished runs; the scene is that of the first one
-   * @param {{signal: AbortSignal}} how
+   * @param {{signal: AbortSignal, live?: {ownScene: boolean}}} how `live`: the one run is unfinished; `ownScene`: the
+   *   rows of its scene are not those of its input
    */
-  constructor(jobs, { signal }) {
+  constructor(jobs, { signal, live }) {
     this.jobs = jobs;
     this.signal = signal;
+    this.live = live;
+    /** @type {Promise<void>} */
+    this.loading = Promise.resolve();
+    /** @type {Promise<void> | undefined} */
+    this.fetching = undefined;
     this.stage = new Stage();
     this.left = this.chooser(say.left);
     this.right = this.chooser(say.right);
@@ -31,8 +40,8 @@ export class ResultStage {
     /** Choices for each side of the wipe. @type {Map<string, {name: string, side: Side}>} */
     this.choices = new Map();
     if (this.stage.viewer) {
-      this.stage.viewer.onReload = () => this.load();
-      this.load();
+      this.stage.viewer.onReload = () => (this.loading = this.load());
+      this.loading = this.load();
     }
   }
 
@@ -75,7 +84,8 @@ export class ResultStage {
   async openOriginal(job) {
     const { viewer } = this.stage;
     if (!viewer || this.signal.aborted) return;
-    const scene = viewer.open(new URL(`/v1/jobs/${job.id}/inputs/scene`, location.href).href);
+    const path = this.live?.ownScene ? artifactPath(job.id, "live/scene.ply") : `/v1/jobs/${job.id}/inputs/scene`;
+    const scene = viewer.open(new URL(path, location.href).href);
     this.stage.show({ scene, colors: "own" });
     try {
       const header = await scene.headerRead;
@@ -100,11 +110,16 @@ export class ResultStage {
   async openRun(job) {
     const { viewer } = this.stage, name = this.jobs.length > 1 ? labels(this.jobs)[this.jobs.indexOf(job)] : say.stylized;
     if (!viewer || this.signal.aborted) return;
-    const fade = job.parameters.sh_attenuation ?? 0;
+    const fade = this.live?.ownScene ? 0 : (job.parameters.sh_attenuation ?? 0);
+    if (this.live) {
+      if (!this.original) return;
+      await this.fetchColors(job, "live/colors.f16");
+      this.choices.set(job.id, { name: say.now, side: { scene: this.original, colors: job.id, fade } });
+      return;
+    }
     if (this.original && sceneOf(job) === sceneOf(this.jobs[0]) && drawnAlike(job, this.jobs[0])) {
       try {
-        const answer = await ask("GET", artifactPath(job.id, "colors.f16"), { signal: this.signal });
-        await this.original.addColors(job.id, /** @type {ReadableStream<Uint8Array>} */ (answer.body));
+        await this.fetchColors(job, "colors.f16");
         this.choices.set(job.id, { name, side: { scene: this.original, colors: job.id, fade } });
         return;
       } catch (error) {
@@ -117,10 +132,55 @@ export class ResultStage {
     await scene.headerRead;
   }
 
+  /** @param {any} job @param {string} name */
+  async fetchColors(job, name) {
+    const answer = await ask("GET", artifactPath(job.id, name), { signal: this.signal });
+    await this.original?.addColors(job.id, /** @type {ReadableStream<Uint8Array>} */ (answer.body));
+  }
+
+  /** Show the present colors of the unfinished run. Calls while colors are being fetched lead to one more fetch. */
+  async refresh() {
+    const [job] = this.jobs;
+    if (document.hidden || !this.choices.has(job.id)) return; // `load` fetches the present colors
+    this.stale = true;
+    this.fetching ??= this.fetchWhileStale(job);
+    await this.fetching;
+  }
+
+  /** @param {any} job */
+  async fetchWhileStale(job) {
+    while (this.stale && this.live) {
+      this.stale = false;
+      await this.fetchColors(job, "live/colors.f16").catch(() => {}); // the next colors follow
+    }
+    this.fetching = undefined;
+  }
+
+  /**
+   * Show the result of the run, which has just finished, without loading the scene again.
+   *
+   * @param {any} job
+   * @returns {Promise<boolean>} whether that is possible
+   */
+  async finish(job) {
+    const { original, live } = this;
+    if (!original || live?.ownScene || job.parameters.sh_attenuation) return false;
+    this.live = undefined;
+    await this.fetching; // older colors would replace the final ones
+    try {
+      await this.fetchColors(job, "colors.f16");
+    } catch {
+      return false;
+    }
+    this.choices.set(job.id, { name: say.stylized, side: { scene: original, colors: job.id } });
+    this.offer();
+    return true;
+  }
+
   /** Offer the blend of one or two results if the viewer has all its color sets. */
   offerBlend() {
     const { original, blend, jobs } = this;
-    if (!original || jobs.length > 2 || !jobs.every(({ id }) => original.colors.has(id))) return;
+    if (!original || this.live || jobs.length > 2 || !jobs.every(({ id }) => original.colors.has(id))) return;
     const side = { scene: original, colors: "own", blend: blend.parts };
     this.choices.set(jobs.length > 1 ? "blend" : jobs[0].id, { name: jobs.length > 1 ? words.blend.title : blend.name, side });
     blend.element.hidden = false;

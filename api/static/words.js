@@ -68,7 +68,7 @@ export const words = {
     lost: "The graphics card was reset. The view will return shortly.",
     name: "3D view", view: "view", instructions: "Arrow keys orbit, W A S D Q E move, + and - zoom, comma and period switch cameras, Space swaps before and after, holding O shows the original, Home resets the view.",
     wipe: "Wipe", wipeAt: (/** @type {string} */ left, /** @type {string} */ right, /** @type {number} */ share) => `${percent(share)} ${left}, the rest ${right}`,
-    original: "Original", stylized: "Stylized", left: "Left", right: "Right",
+    original: "Original", stylized: "Stylized", now: "So far", left: "Left", right: "Right",
     toggle: "Swap before and after", orbit: "Orbit", fly: "Fly", movement: "Movement", home: "Reset view", screenshot: "Save image", full: "Full screen", keys: "Keyboard and gestures",
     camera: "Camera", frames: "Show cameras", free: "Free view", cameraOf: (/** @type {number} */ n, /** @type {number} */ all, /** @type {string} */ name) => `${n} of ${all}${name ? ` · ${name}` : ""}`,
     previous: "Previous camera", next: "Next camera",

@@ -17,7 +17,7 @@ from service.errors import StoreError
 from service.files.artifacts import Artifacts
 from service.files.staging import CHECKPOINT, RESULT
 from service.store import Store
-from service.store.leases import Lease, Published
+from service.store.leases import LIVE, Lease, Published
 
 #: Length of the log's end in the error of a crash, in bytes.
 _LOG_TAIL = 2000
@@ -62,7 +62,8 @@ class Outbox:
         previews = self._out / "previews"
         if previews.is_dir():
             files |= {f"previews/{path.name}": path for path in previews.glob("[!.]*.jpg")}
-        return files
+        live = self._out / LIVE
+        return files | ({f"{LIVE}{path.name}": path for path in live.glob("[!.]*")} if live.is_dir() else {})
 
     def results(self) -> dict[str, Path]:
         """Return the result files of an ended job."""
@@ -87,8 +88,8 @@ class Outbox:
 
     def _put_file(self, name: str, path: Path) -> Published:
         step = _saved_step(path) if name == CHECKPOINT else None
-        # a later checkpoint replaces the file instead of overwriting its bytes, and results are never rewritten
-        final = name == CHECKPOINT or name in RESULTS
+        # later checkpoints and colors replace the file instead of overwriting its bytes; results are never rewritten
+        final = name == CHECKPOINT or name in RESULTS or name.startswith(LIVE)
         return replace(self._artifacts.put(self._job_id, self._epoch, name, path, final=final), step=step)
 
 

@@ -30,6 +30,8 @@ from sgsst_core.errors import InfrastructureError
 EXPIRED = 0.0
 #: Number of progress events stored per job; a client that resumes from an older event misses only old progress.
 MAX_PROGRESS_EVENTS = 200
+#: Prefix of files that only clients of an unfinished job need. They are removed once it has succeeded.
+LIVE = "live/"
 #: Maximum number of past attempts counted for the retry delay: by then the delay is at its maximum.
 _MAX_OUTAGES = 20
 #: Maximum number of candidates for backfilling, each from a different owner.
@@ -274,8 +276,9 @@ class Leases:
         with self._database.writing() as session:
             job = self._require_lease(session, lease)
             unused = _publish(session, job, files, now)
-            hidden = ArtifactRow.name.startswith(".")  # the checkpoint of an unfinished job
-            session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, hidden))
+            # the checkpoint, and the colors of the unfinished job
+            obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in (".", LIVE)))
+            session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, obsolete))
             job.result, job.error = result, None
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
             observe(session, "sgsst_job_seconds", max(0.0, now - (job.started_at or now)))

@@ -24,6 +24,7 @@ from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import Result, execute
 from worker.options import JobVideo
 from worker.prepare import Job, prepare
+from worker.previews import Previews
 from worker.request import Resume, StylizeRequest
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -92,6 +93,17 @@ def test_plan_for_another_device_reuses_the_survey(request_: StylizeRequest) -> 
     assert second.resumed is not None
     assert second.stylizer.job.plan.survey is second.resumed.plan.survey
     assert run_job(second).stopped == "finished"
+
+
+def test_watchers_get_the_refined_scene(tmp_path: Path) -> None:
+    request = small_request(tmp_path, 2, refine=3.0)
+    write_scene(request.source.scene, large_wall())
+    previews = Previews(tmp_path / "previews", 3600, lambda path: None, pytest.fail)
+    execute(prepare(request), progress=lambda now: None, stop=lambda: False, warn=pytest.fail, preview=previews)
+    shared, result = (read_scene(path).scene for path in (tmp_path / "live" / "scene.ply", request.out))
+    assert torch.equal(shared.means, result.means)
+    assert len(shared) > len(large_wall())
+    assert (tmp_path / "live" / "colors.f16").stat().st_size == 6 * len(shared)
 
 
 @pytest.mark.parametrize("form", ["ply", "spz", pytest.param("compressed.ply", marks=pytest.mark.slow)])

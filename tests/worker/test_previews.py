@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -13,6 +14,8 @@ from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.warm_start import warm_start
 from tests.small_scenes import cameras, wall
+from worker import live
+from worker.live import LiveColors
 from worker.previews import Previews
 
 
@@ -62,3 +65,56 @@ def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
             image = views.rasterizer.render(views.colors(index, colors), views.cameras[index])
         wanted = (image.clamp(0, 1) * 255).numpy()[part]
         assert np.abs(thumbnail[part] - wanted).mean() < 5  # JPEG
+
+
+def test_live_colors_are_those_of_the_step(
+    tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("_SECONDS", "_ELAPSED_SHARE"):
+        monkeypatch.setattr(live, name, 0)
+    monkeypatch.setattr(live, "_COST_SHARE", 1e9)
+    settings = make_settings("standard", steps_coarse=0, steps_sos=3, coarsest_side=24)
+    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    scene = wall()
+    scene.means[:5] += 1000  # no view shows them
+    stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
+    missing: list[str] = []
+    colors, found = LiveColors(tmp_path / "live", missing.append), {}
+
+    def preview(stylizer: Stylizer) -> None:
+        colors(stylizer)
+        if not stylizer.step:
+            return
+        seen = stylizer.job.plan.seen
+        wanted = stylizer.job.scene.sh_dc.clone()
+        wanted[seen] = stylizer.shown().cpu()
+        assert not seen[:5].any()
+        found[stylizer.step] = np.fromfile(tmp_path / "live" / "colors.f16", "<f2").reshape(-1, 3)
+        np.testing.assert_array_equal(found[stylizer.step], wanted.numpy().astype("<f2"))
+
+    run(stylizer, Callbacks(preview=preview, preview_seconds=0))
+    assert found.keys() == {1, 2, 3}
+    assert not np.array_equal(found[1], found[2])
+    assert not missing
+    assert [path.name for path in (tmp_path / "live").iterdir()] == ["colors.f16"]
+
+
+def test_live_colors_are_written_seldom_enough(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
+    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    stylizer = Stylizer.planned(wall(), cameras(), style, settings, weights=tiny_weights)
+    missing: list[str] = []
+    colors = LiveColors(tmp_path, missing.append)
+    run(stylizer, Callbacks(preview=colors, preview_seconds=0))
+    first = (tmp_path / "colors.f16").stat().st_mtime_ns
+    colors._due = 2.0**60
+    colors(stylizer)
+    assert (tmp_path / "colors.f16").stat().st_mtime_ns == first
+    colors._due = 0.0
+    colors(stylizer)
+    assert (tmp_path / "colors.f16").stat().st_mtime_ns > first
+    (tmp_path / "colors.f16").unlink()
+    (tmp_path / "colors.f16").mkdir()
+    colors._due = 0.0
+    colors(stylizer)
+    assert len(missing) == 1, "a missing file does not fail the job"

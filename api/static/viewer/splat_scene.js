@@ -133,14 +133,14 @@ export class SplatScene {
   }
 
   /**
-   * Add a color set: three halves for each Gaussian, as in `colors.f16`.
+   * Add or replace a color set: three halves for each Gaussian, as in `colors.f16`.
    *
    * @param {string} name
    * @param {ReadableStream<Uint8Array>} stream
    */
   async addColors(name, stream) {
     await this.headerRead;
-    const { gl } = this, count = this.header?.count ?? 0, texture = this.texture(gl.RGB16F, count);
+    const { gl } = this, count = this.header?.count ?? 0;
     const whole = new Uint8Array(count * 6), reader = stream.getReader();
     let filled = 0;
     for (;;) {
@@ -151,7 +151,7 @@ export class SplatScene {
       filled += value.length;
     }
     if (filled !== whole.length) throw new Error(words.scene.otherColors);
-    const halves = new Uint16Array(whole.buffer);
+    const halves = new Uint16Array(whole.buffer), texture = this.colors.get(name) ?? this.texture(gl.RGB16F, count);
     for (let begin = 0; begin < count; begin += BATCH) {
       this.fill(texture, begin, halves.subarray(begin * 3, Math.min(count, begin + BATCH) * 3), gl.RGB, gl.HALF_FLOAT, 3);
     }

@@ -86,6 +86,26 @@ def test_new_and_changed_files_are_published(
     assert stored_names(settings) == ["log.txt", "plan.json", "step_000010.jpg"], "the older plan is still there"
 
 
+def test_live_colors_are_published_until_the_job_has_succeeded(
+    publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
+) -> None:
+    live = folder / "out" / "live"
+    live.mkdir()
+    (live / "scene.ply").write_bytes(b"scene")
+    for colors in (b"one", b"two"):
+        (live / ".colors.part").write_bytes(colors)
+        (live / ".colors.part").replace(live / "colors.f16")
+        publisher.publish_unfinished()
+        assert content(store, settings, lease, "live/colors.f16") == colors
+    assert content(store, settings, lease, "live/scene.ply") == b"scene"
+    assert stored_names(settings).count("colors.f16") == 1, "the older one is still there"
+    (folder / "out" / "stylized.ply").write_bytes(b"ply")
+    publisher.succeed({})
+    publisher.sweep()
+    assert stored_names(settings) == ["log.txt", "stylized.ply"]
+    assert [row.name for row in store.jobs.artifacts(lease.job_id)] == ["log.txt", "stylized.ply"]
+
+
 def test_log_is_copied_periodically_and_completely_at_the_end(
     publisher: Publisher, folder: Path, store: Store, settings: ServiceSettings, lease: Lease
 ) -> None:
