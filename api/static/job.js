@@ -47,6 +47,8 @@ export class JobView {
     this.plan = h("section.card", { hidden: true });
     this.download = h("section.card", { hidden: true });
     this.film = h("div", { hidden: true });
+    /** @type {VideoCard | undefined} */
+    this.video = undefined;
     this.files = h("section.card");
     this.deletion = h("p.deletion");
     this.facts = h("section.card");

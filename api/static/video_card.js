@@ -13,6 +13,7 @@ export class VideoCard {
    */
   constructor(job, signal) {
     this.job = job;
+    this.shown = "";
     this.signal = signal;
     const cameras = job.inputs.some((/** @type {any} */ input) => input.role === "cameras");
     this.path = h("select", { "aria-label": say.path }, ["orbit", "cameras"].map((name) => h("option", { value: name, selected: cameras === (name === "cameras") }, say.paths[name])));
