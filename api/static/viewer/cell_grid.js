@@ -5,8 +5,10 @@
 const SIDE = 2 ** 16;
 /** Wanted mean number of Gaussians in an occupied cell. */
 const FEWEST = 3, MOST = 24;
-/** Steps to the 27 cells around a cell, itself included, as differences of keys. */
-const AROUND = [-1, 0, 1].flatMap((z) => [-1, 0, 1].flatMap((y) => [-1, 0, 1].map((x) => x + SIDE * (y + SIDE * z))));
+/** Steps along an axis to a cell and its neighbors. */
+const STEPS = [0, -1, 1];
+/** Steps to the 27 cells around a cell, itself first, as differences of keys. */
+const AROUND = STEPS.flatMap((z) => STEPS.flatMap((y) => STEPS.map((x) => x + SIDE * (y + SIDE * z))));
 
 export class CellGrid {
   /**
@@ -67,7 +69,7 @@ export class CellGrid {
   }
 
   /**
-   * Return the occupied cells around a cell, itself included.
+   * Return the occupied cells around a cell, itself first.
    *
    * @param {number} cell
    */
@@ -113,17 +115,19 @@ export class CellGrid {
    * @returns {number[]}
    */
   border(flags) {
-    const { centers, items, starts, side } = this, marked = new Uint8Array(this.keys.length), near = new Uint8Array(this.keys.length);
-    for (let i = 0; i < this.count; i++) if (flags[i]) marked[this.cellOf[i]] = 1;
-    for (let cell = 0; cell < marked.length; cell++) if (marked[cell]) for (const other of this.around(cell)) near[other] = 1;
+    const { centers, items, starts, side } = this, marked = new Uint8Array(this.keys.length), open = new Uint8Array(this.keys.length);
+    for (let i = 0; i < this.count; i++) (flags[i] ? marked : open)[this.cellOf[i]] = 1;
     /** @type {number[]} */
-    const found = [], flagged = [];
-    for (let cell = 0; cell < near.length; cell++) {
-      if (!near[cell]) continue;
-      flagged.length = 0;
+    const found = [];
+    /** @type {number[]} */
+    const flagged = [];
+    for (let cell = 0; cell < open.length; cell++) {
+      if (!open[cell]) continue;
+      flagged.length = 0; // those of the cell itself are first: most are close enough
       for (const other of this.around(cell)) {
         if (marked[other]) for (let k = starts[other]; k < starts[other + 1]; k++) if (flags[items[k]]) flagged.push(items[k]);
       }
+      if (!flagged.length) continue;
       for (let k = starts[cell]; k < starts[cell + 1]; k++) {
         const i = items[k], x = centers[3 * i], y = centers[3 * i + 1], z = centers[3 * i + 2];
         if (!flags[i] && flagged.some((j) => (centers[3 * j] - x) ** 2 + (centers[3 * j + 1] - y) ** 2 + (centers[3 * j + 2] - z) ** 2 <= side * side)) found.push(i);
