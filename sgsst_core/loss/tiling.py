@@ -23,8 +23,8 @@ from sgsst_core.scene.pyramid import scale_count
 
 #: Cost of rendering a pixel and its gradient, relative to that of a pixel in the network, by device. It is a constant,
 #: so that the division of work, and with it the rounding, does not depend on timings. On a CPU it was measured as 0.004
-#: with cached weights at 1280x720; on GPUs it is an estimate.
-RENDERING = {"cpu": 0.0, "cuda": 0.125}
+#: with cached weights at 1280x720; on GPUs, for which meta tensors stand in a forecast, it is an estimate.
+RENDERING = {"cpu": 0.0, "cuda": 0.125, "meta": 0.125}
 
 
 @dataclass(frozen=True)
