@@ -228,7 +228,7 @@ def test_plan_queues_nothing_and_rejects_bad_files(
         assert (caught.value.status, caught.value.problem["input"]) == (422, "scene")
         with pytest.raises(RequestError, match="not a file"):
             client.submit(tmp_path / "none.ply", files["style"], orbit=2)
-        with pytest.raises(RequestError, match="contains no photos"):
+        with pytest.raises(RequestError, match="contains no images"):
             client.submit(files["scene"], files["style"], cameras=files["cameras"], photos=tmp_path)
         assert [job.id for job in client.jobs()] == before
 

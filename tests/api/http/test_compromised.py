@@ -38,7 +38,7 @@ def test_compromised_reader_does_not_affect_service(tmp_path: Path) -> None:
             "own": "scene/a.ply",
         }
         target |= {"port": listener.getsockname()[1], "api": service._process.pid}
-        code = ply.read_bytes() + f"# attack\n{inspect.getsource(attack)}\ntold = attack({target!r})\n".encode()
+        code = ply.read_bytes() + f"# attack\n{inspect.getsource(attack)}\nreached = attack({target!r})\n".encode()
         answer = client.post("/v1/jobs", files={**files, "scene": ("a.ply", code)})
         assert (answer.status_code, answer.json()["code"]) == (422, "invalid-scene")
         detail = answer.json()["detail"]
