@@ -85,6 +85,22 @@ class LostUploadError(NotFoundError):
         super().__init__(f"The bytes of upload {upload_id} are gone. Begin a new one.")
 
 
+class NoShareError(NotFoundError):
+    """Share that does not exist, has expired or was revoked."""
+
+    message = "This link does not work: it has expired or was revoked."
+
+
+class NoSharedFileError(NotFoundError):
+    """File that a shared result does not have."""
+
+    code = "no-shared-file"
+    example = ("colors.f16",)
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"This result has no file {name!r}.")
+
+
 class RefusedInputError(ServiceError):
     """Unusable input; `code` is that of the core's error, and `extra["input"]` names the part of the request."""
 
@@ -260,6 +276,25 @@ class DeleteError(ConflictError):
     def __init__(self, status: str) -> None:
         advice = "It ends in some seconds" if status == "canceling" else "Cancel it first"
         super().__init__(f"The job has status {status}. {advice}; delete it once it has ended.", job_status=status)
+
+
+class ShareError(ConflictError):
+    """Job without a result, which cannot be shared."""
+
+    example = ("running",)
+
+    def __init__(self, status: str) -> None:
+        super().__init__(f"The job has status {status}; only results can be shared.", job_status=status)
+
+
+class TooManySharesError(ConflictError):
+    """Share that would exceed the limit of a job."""
+
+    code = "too-many-shares"
+    example = (20,)
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"The job has {limit} links already. Revoke some.")
 
 
 class OffsetError(ConflictError):

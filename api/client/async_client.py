@@ -229,6 +229,21 @@ class AsyncClient:
         """Queue a failed or canceled job again."""
         return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/retry")).json())
 
+    async def share(self, job_id: str, days: float = 7.0) -> dict[str, Any]:
+        """Create a read-only link to a result, which works for some days; `url` is its address."""
+        response = await self._transport.call("POST", f"/v1/jobs/{job_id}/shares", json={"days": days})
+        share: dict[str, Any] = response.json()
+        return share | {"url": f"{self.url}{share['url']}"}
+
+    async def shares(self, job_id: str) -> list[dict[str, Any]]:
+        """Return the links to a result that have not expired, without their addresses."""
+        shares: list[dict[str, Any]] = (await self._transport.call("GET", f"/v1/jobs/{job_id}/shares")).json()["shares"]
+        return shares
+
+    async def revoke_share(self, job_id: str, share_id: str) -> None:
+        """Revoke a link to a result."""
+        await self._transport.call("DELETE", f"/v1/jobs/{job_id}/shares/{share_id}")
+
     async def delete(self, job_id: str) -> None:
         """Delete a job that has ended, with its results."""
         await self._transport.call("DELETE", f"/v1/jobs/{job_id}")

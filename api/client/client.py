@@ -115,4 +115,7 @@ class Client:
     finish = _blocking(AsyncClient.finish)
     cancel = _blocking(AsyncClient.cancel)
     retry = _blocking(AsyncClient.retry)
+    share = _blocking(AsyncClient.share)
+    shares = _blocking(AsyncClient.shares)
+    revoke_share = _blocking(AsyncClient.revoke_share)
     delete = _blocking(AsyncClient.delete)

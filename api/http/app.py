@@ -23,7 +23,7 @@ from api.http.problems import METHODS, Problem, add_handlers
 from api.http.rates import Rates
 from api.http.readiness import Readiness
 from api.http.receipts import Receipts
-from api.http.routes import artifacts, blends, events, inputs, jobs, operations, session, uploads, videos
+from api.http.routes import artifacts, blends, events, inputs, jobs, operations, session, shares, uploads, videos
 from api.http.schemas import ANSWERS
 from api.http.sign_ins import SignIns
 from api.http.static import add_static
@@ -43,6 +43,9 @@ from service.weights import check_weights
 _THREADS = 40
 #: Seconds that a request waits for a locked database, and for each response of the database server.
 _ANSWER_SECONDS = 8.0
+
+#: Start of paths that contain the token of a share.
+_SHARED = "/v1/shared/"
 
 _access = logging.getLogger("api.access")
 
@@ -108,7 +111,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         docs_url=None,  # FastAPI's own page loads its script from a CDN
         redoc_url=None,
     )
-    for module in (jobs, events, inputs, blends, artifacts, videos, uploads, session, operations):
+    for module in (jobs, events, inputs, blends, artifacts, videos, shares, uploads, session, operations):
         app.include_router(module.router)
     add_static(app)
     add_handlers(app)
@@ -149,7 +152,8 @@ class Observed:
         route = getattr(scope.get("route"), "path", "(none)")
         method = scope["method"] if scope["method"] in METHODS else "(other)"
         self._state.context.metrics.observe(method, route, status, seconds)
-        extra = {"method": scope["method"], "path": scope["path"], "status": status, "seconds": round(seconds, 4)}
+        path = route if scope["path"].startswith(_SHARED) else scope["path"]  # logs must not contain tokens
+        extra = {"method": scope["method"], "path": path, "status": status, "seconds": round(seconds, 4)}
         _access.info("request", extra=extra)
 
 

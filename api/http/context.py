@@ -156,7 +156,7 @@ async def get_caller(
         if cookie:
             raise NoKeyError("The session has ended. Sign in again with an API key.")
         raise NoKeyError
-    _check_site(request, context.settings)
+    check_site(request, context.settings)
     return Caller(LOCAL_OWNER, 0)
 
 
@@ -191,7 +191,7 @@ def check_origin(request: Request, *, required: bool = True) -> None:
         )
 
 
-def _check_site(request: Request, settings: ServiceSettings) -> None:
+def check_site(request: Request, settings: ServiceSettings) -> None:
     """Refuse requests of other sites' pages to a service that requires no key.
 
     A malicious page that is open in a browser on this machine could call the service across origins, or through a DNS

@@ -42,6 +42,7 @@ _HEADERS: dict[str, tuple[str, dict[str, Any], object]] = {
     "ETag": ("Tag of this state, for `If-None-Match`.", {"type": "string", "pattern": '^"[0-9a-f]+"$'}, f'"{SHA256}"'),
     "Idempotency-Replayed": ("Nothing was created: it existed already.", {"const": "true"}, "true"),
     "Location": ("Address of the new resource.", _TEXT, f"/v1/jobs/{JOB_ID}"),
+    "Referrer-Policy": ("The address contains a secret.", {"const": "no-referrer"}, "no-referrer"),
     "Retry-After": ("Seconds to wait before the next request.", _COUNT, 2),
     "Set-Cookie": (
         "Session cookie.",

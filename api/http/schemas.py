@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from service.examples import JOB_ID, SHA256, UPLOAD_ID
+from service.examples import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.files.artifacts import media_type
 from service.parameters import JobName, JobParameters
 from service.store.history import Point
@@ -425,6 +426,80 @@ class JobChange(BaseModel):
     name: JobName = Field(description="New display name; an empty one restores the names of scene and style.")
 
 
+class NewShare(BaseModel):
+    """A link to the result of a job to be created."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"days": 7}]})
+
+    days: float = Field(7.0, gt=0, le=90, allow_inf_nan=False, description="Lifetime of the link in days.")
+
+
+class ShareView(BaseModel):
+    """A link to the result of a job."""
+
+    model_config = _with_example(id=SHARE_ID, created_at=_CREATED, expires_at=_NOW)
+
+    id: str
+    created_at: Time
+    expires_at: Time
+
+
+class ShareCreated(ShareView):
+    """A new link to the result of a job, with its token."""
+
+    model_config = _with_example(**_example_of(ShareView), url=f"/shared#{SHARE_TOKEN}")
+
+    url: str = Field(
+        description="Address of the page, on this service. The part after # is the token, which is not stored: "
+        "browsers send it to this service only, in the path of `/v1/shared/{token}`."
+    )
+
+
+class ShareList(BaseModel):
+    """Links to the result of a job."""
+
+    model_config = _with_example(shares=[_example_of(ShareView)])
+
+    shares: list[ShareView]
+
+
+class SharedView(BaseModel):
+    """A shared result, as its viewer needs it."""
+
+    model_config = _with_example(
+        name="plush",
+        expires_at=_NOW,
+        parameters={"background": [0.0, 0.0, 0.0], "near": 0.2},
+        cameras=["cameras.json"],
+        files=["colors.f16", "stylized.ply"],
+    )
+
+    name: str
+    expires_at: Time
+    parameters: dict[str, Any] = Field(description="Parameters of the job that matter for rendering.")
+    cameras: list[str] = Field(description="Names of the camera files `cameras:0` and so on.")
+    files: list[str] = Field(description="Files of the result.")
+
+
+#: Parameters of a job that matter for rendering.
+_RENDERED = ("background", "near", "render_mode", "eps2d", "sh_attenuation")
+
+
+def shared_view(job: JobRow, expires_at: float, artifacts: Sequence[str]) -> SharedView:
+    """Return the view of a shared job, without anything that its viewer does not need.
+
+    Args:
+        artifacts: Names of the job's artifacts.
+    """
+    return SharedView(
+        name=job.name,
+        expires_at=expires_at,
+        parameters={name: job.parameters[name] for name in _RENDERED if name in job.parameters},
+        cameras=[entry["name"] for entry in job.inputs if entry["role"] == "cameras"],
+        files=[name for name in ("colors.f16", "stylized.ply") if name in artifacts],
+    )
+
+
 class SessionView(BaseModel):
     """Session state for the browser."""
 
@@ -455,6 +530,7 @@ ANSWERS: tuple[type[BaseModel], ...] = (
     PlanView,
     Health,
     SignIn,
+    NewShare,
     JobChange,
     BlendRequest,
 )

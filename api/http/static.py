@@ -1,4 +1,4 @@
-"""Static files of `api/static`: the page at `/` and the API's documentation at `/docs`.
+"""Static files of `api/static`: the page at `/`, that of shared results, and the API's documentation at `/docs`.
 
 The files are read and compressed once, and served from memory. Their URLs, `/static/DIGEST/NAME`, contain a digest of
 all files, so that browsers can cache them forever. JavaScript modules import each other by relative paths, so a page
@@ -42,7 +42,7 @@ POLICY = (
 )
 #: Content-Security-Policy of `/docs`. Swagger UI's style sheet has inline icons.
 DOCS_POLICY = POLICY.replace("img-src 'self' blob:", "img-src 'self' data:")
-_PAGES = {"/": ("index.html", POLICY), "/docs": ("docs.html", DOCS_POLICY)}
+_PAGES = {"/": ("index.html", POLICY), "/shared": ("shared.html", POLICY), "/docs": ("docs.html", DOCS_POLICY)}
 _IMMUTABLE = "public, max-age=31536000, immutable"
 
 

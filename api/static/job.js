@@ -6,6 +6,7 @@ import { announce, h, icon, put } from "./dom.js";
 import { labels, nameOf } from "./names.js";
 import { decisions } from "./plan.js";
 import { ResultStage } from "./result_stage.js";
+import { ShareCard } from "./share_card.js";
 import { resultFormats } from "./scene_formats.js";
 import { startFrom } from "./submit.js";
 import { actionsOf, titles, UNFINISHED } from "./statuses.js";
@@ -49,12 +50,13 @@ export class JobView {
     this.film = h("div", { hidden: true });
     /** @type {VideoCard | undefined} */
     this.video = undefined;
+    this.sharing = h("div", { hidden: true });
     this.files = h("section.card");
     this.deletion = h("p.deletion");
     this.facts = h("section.card");
     this.curve = h("section.card", h("h2", say.loss), this.chart.element);
     this.body = h("div.job", h("header.head", h("div", h("div.row", this.heading, this.renaming, this.badge), this.meta), this.actions),
-      this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.download, this.film, this.curve, this.plan, this.files, this.facts, this.deletion)));
+      this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.download, this.film, this.sharing, this.curve, this.plan, this.files, this.facts, this.deletion)));
     this.element = h("div", h("p.quiet.pending", words.page.loading));
     this.begin();
   }
@@ -301,6 +303,8 @@ export class JobView {
     if (this.job.status !== "succeeded" || !result || this.result || this.finishing) return;
     this.finishing = true;
     this.offerDownload(result.size);
+    this.sharing.hidden = false;
+    put(this.sharing, new ShareCard(this.id).element);
     const { live } = this;
     this.live = undefined;
     await live?.loading;

@@ -7,23 +7,26 @@ import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { Blend } from "./blend.js";
 import { h, put } from "./dom.js";
-import { labels } from "./names.js";
+import { labels, nameOf } from "./names.js";
 import { Stage } from "./stage.js";
 import { requestedRendering } from "./viewer/render_tag.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./viewer/viewer.js").Side} Side */
+/** @typedef {{scene: string, result: (name: string) => string, cameras: () => Promise<{name: string, blob: Blob}[]>}} Files addresses */
 
 const say = words.viewer;
 
 export class ResultStage {
   /**
    * @param {any[]} jobs finished runs; the scene is that of the first one
-   * @param {{signal: AbortSignal, live?: {ownScene: boolean}}} how `live`: the one run is unfinished; `ownScene`: the
-   *   rows of its scene are not those of its input
+   * @param {{signal: AbortSignal, live?: {ownScene: boolean}, files?: (job: any) => Files, blend?: boolean}} how `live`: the
+   *   one run is unfinished; `ownScene`: the rows of its scene are not those of its input; `files`: where the files of a
+   *   job are; `blend`: whether to offer blends
    */
-  constructor(jobs, { signal, live }) {
+  constructor(jobs, { signal, live, files = (job) => filesOf(job, signal), blend = true }) {
     this.jobs = jobs;
+    this.files = files;
     this.signal = signal;
     this.live = live;
     /** @type {Promise<void>} */
@@ -34,8 +37,9 @@ export class ResultStage {
     this.left = this.chooser(say.left);
     this.right = this.chooser(say.right);
     this.pickers = h("div.row.sides", { hidden: jobs.length < 2 }, this.left.element, this.right.element);
-    this.blend = new Blend(jobs, labels(jobs), () => this.showBlend());
+    this.blend = new Blend(jobs, jobs.length > 1 ? labels(jobs) : [nameOf(jobs[0])], () => this.showBlend());
     this.blend.element.hidden = true;
+    this.blends = blend && jobs.length <= 2;
     this.element = h("div.result-stage", this.pickers, this.stage.element, this.blend.element);
     /** Choices for each side of the wipe. @type {Map<string, {name: string, side: Side}>} */
     this.choices = new Map();
@@ -69,11 +73,9 @@ export class ResultStage {
   }
 
   async loadCameras() {
-    const here = `/v1/jobs/${this.jobs[0].id}/inputs`;
     try {
-      const { inputs } = await get(here, this.signal), files = inputs.filter((/** @type {any} */ input) => /^cameras(:|$)/.test(input.role));
-      if (!files.length) return;
-      const blobs = await Promise.all(files.map(async (/** @type {any} */ file) => ({ name: file.name, blob: await (await ask("GET", `${here}/${file.role}`, { signal: this.signal })).blob() })));
+      const blobs = await this.files(this.jobs[0]).cameras();
+      if (!blobs.length) return;
       this.stage.setCameras(await readCameras(blobs), { stand: true });
     } catch {
       // without cameras, the view is free
@@ -84,7 +86,7 @@ export class ResultStage {
   async openOriginal(job) {
     const { viewer } = this.stage;
     if (!viewer || this.signal.aborted) return;
-    const path = this.live?.ownScene ? artifactPath(job.id, "live/scene.ply") : `/v1/jobs/${job.id}/inputs/scene`;
+    const files = this.files(job), path = this.live?.ownScene ? files.result("live/scene.ply") : files.scene;
     const scene = viewer.open(new URL(path, location.href).href);
     this.stage.show({ scene, colors: "own" });
     try {
@@ -126,7 +128,7 @@ export class ResultStage {
         if (!(error instanceof Problem) || error.status !== 404) throw error;
       }
     }
-    const scene = viewer.open(new URL(artifactPath(job.id, "stylized.ply"), location.href).href);
+    const scene = viewer.open(new URL(this.files(job).result("stylized.ply"), location.href).href);
     this.choices.set(job.id, { name, side: { scene, colors: "own" } });
     if (!this.original) this.stage.show({ scene, colors: "own" });
     await scene.headerRead;
@@ -134,7 +136,7 @@ export class ResultStage {
 
   /** @param {any} job @param {string} name */
   async fetchColors(job, name) {
-    const answer = await ask("GET", artifactPath(job.id, name), { signal: this.signal });
+    const answer = await ask("GET", this.files(job).result(name), { signal: this.signal });
     await this.original?.addColors(job.id, /** @type {ReadableStream<Uint8Array>} */ (answer.body));
   }
 
@@ -180,7 +182,7 @@ export class ResultStage {
   /** Offer the blend of one or two results if the viewer has all its color sets. */
   offerBlend() {
     const { original, blend, jobs } = this;
-    if (!original || this.live || jobs.length > 2 || !jobs.every(({ id }) => original.colors.has(id))) return;
+    if (!original || this.live || !this.blends || !jobs.every(({ id }) => original.colors.has(id))) return;
     const side = { scene: original, colors: "own", blend: blend.parts };
     this.choices.set(jobs.length > 1 ? "blend" : jobs[0].id, { name: jobs.length > 1 ? words.blend.title : blend.name, side });
     blend.element.hidden = false;
@@ -228,6 +230,16 @@ export class ResultStage {
     for (const { side } of this.choices.values()) side.scene.end();
     this.stage.end();
   }
+}
+
+/** Return where the files of a job are. @param {any} job @param {AbortSignal} signal @returns {Files} */
+function filesOf(job, signal) {
+  const inputs = `/v1/jobs/${job.id}/inputs`;
+  const cameras = async () => {
+    const found = (await get(inputs, signal)).inputs.filter((/** @type {any} */ input) => /^cameras(:|$)/.test(input.role));
+    return Promise.all(found.map(async (/** @type {any} */ file) => ({ name: file.name, blob: await (await ask("GET", `${inputs}/${file.role}`, { signal })).blob() })));
+  };
+  return { scene: `${inputs}/scene`, result: (name) => artifactPath(job.id, name), cameras };
 }
 
 /** @param {any} a @param {any} b @returns {boolean} whether two jobs draw their scene in the same render mode */

@@ -191,5 +191,10 @@ export const words = {
     }),
   },
   strengths: { legend: "How strongly to paint", titles: /** @type {Record<string, string>} */ ({ light: "Light", balanced: "Balanced", strong: "Strong" }) },
+  share: {
+    title: "Share", help: "Anyone with the link sees this result in 3D, before and after, and nothing else.", create: "Create a link", lifetime: "Lifetime of the link", days: (/** @type {number} */ n) => several(n, "day"),
+    link: "Link to this result", copy: "Copy", copied: "Copied.", once: "The link is shown only now.", until: (/** @type {string} */ at) => `Works until ${at}`, revoke: "Revoke", revokeOf: (/** @type {string} */ at) => `Revoke the link until ${at}`, revoked: "The link no longer works.",
+  },
+  shared: { title: "Shared result", until: (/** @type {string} */ at) => `Shared until ${at}`, gone: "This link doesn't work" },
   signIn: { title: "Sign in", heading: "Sign in", lead: "This service requires an API key.", expired: "Your session has expired, or you signed out in another tab. Sign in to continue where you were.", where: "Enter your API key. Ask your administrator for one.", key: "API key", go: "Sign in", wrong: "That key isn't valid.", out: "You signed out." },
 };

@@ -17,6 +17,7 @@ from service.store.operations import Operations
 from service.store.quotas import Usage
 from service.store.retention import Retention
 from service.store.retries import RetryPolicy
+from service.store.shares import Shares
 
 #: Interval between attempts to connect to an unavailable database, in seconds.
 _RETRY_SECONDS = 1.0
@@ -38,6 +39,7 @@ class Store:
         self.inputs = Inputs(self.database)
         self.keys = Keys(self.database)
         self.sessions = Sessions(self.database, settings.session_seconds)
+        self.shares = Shares(self.database)
         self.usage = Usage(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)
 

@@ -260,6 +260,18 @@ class SessionRow(Base):
     __table_args__ = (Index("ix_sessions_key_id", "key_id", "created_at"),)
 
 
+class ShareRow(Base):
+    """Link to the result of a job; only the SHA-256 of its token is stored."""
+
+    __tablename__ = "shares"
+
+    id: Mapped[str] = mapped_column(String(40), primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), index=True)
+    sha256: Mapped[str] = mapped_column(String(64))
+    created_at: Mapped[float] = mapped_column(Float)
+    expires_at: Mapped[float] = mapped_column(Float)
+
+
 class IdempotencyRow(Base):
     """Idempotency-Key of a client with the id of the object that its request created."""
 

@@ -140,7 +140,7 @@ async def get_artifact(
         kind=kind,
         inline=kind.startswith(_INLINE),
         policy=_SANDBOX if kind.startswith("text/html") else None,
-        check=partial(_check, context, row),
+        check=partial(check_artifact, context, row),
         read=partial(context.artifacts.read, row.location),
     )
     return await send_file(request, file, conditions)
@@ -158,7 +158,7 @@ async def _find_artifact(context: Context, job: JobRow, name: str, format_: Resu
     return row
 
 
-def _check(context: Context, row: ArtifactRow) -> None:
+def check_artifact(context: Context, row: ArtifactRow) -> None:
     """Check that a stored result matches its database row.
 
     Raises:

@@ -114,13 +114,13 @@ async def get_input(
         kind=_KINDS.get(PurePosixPath(entry["name"]).suffix.lower(), "application/octet-stream"),
         inline=False,
         policy=_POLICY,
-        check=partial(_check, context, row),
+        check=partial(check_input, context, row),
         read=partial(context.blobs.read, row),
     )
     return await send_file(request, file, conditions)
 
 
-def _check(context: Context, row: BlobRow) -> None:
+def check_input(context: Context, row: BlobRow) -> None:
     """Check that a stored input matches its database row.
 
     Raises:

@@ -121,12 +121,12 @@ def test_replaced_result_is_not_reported_lost(
     context: Any = SimpleNamespace(store=store, artifacts=Artifacts(ServiceSettings(data=service.data).artifacts_url))
     path.unlink()
     with pytest.raises(LostFileError):
-        routes._check(context, before)
+        routes.check_artifact(context, before)
     store.jobs.cancel(job_id, None)
     store.leases.stop(Lease(store.jobs.get(job_id, None), "one", 1))
     store.jobs.delete(job_id, None)
     with pytest.raises(NotFoundError):
-        routes._check(context, before)
+        routes.check_artifact(context, before)
 
 
 @pytest.mark.parametrize("lost", [True, False])

@@ -1,0 +1,237 @@
+"""`/v1/jobs/{id}/shares`: links to a result. `/v1/shared/{token}`: what somebody with such a link can read."""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi.responses import StreamingResponse
+
+from api.http.context import CallerDep, Context, ContextDep, ForeignSiteError, check_site, is_id
+from api.http.documentation import Responses, headers, invalid, links, problems
+from api.http.input_references import input_entry
+from api.http.multipart import BodyTypeError, NotUtf8Error, TooSlowError, check_media_type, read_json
+from api.http.routes.artifacts import check_artifact
+from api.http.routes.inputs import check_input
+from api.http.routes.jobs import JobId, find
+from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, ShareView, shared_view
+from api.http.sending import ConditionsDep, RangeError, SentFile, file_answers, send_file
+from service.errors import (
+    DamagedFileError,
+    LostFileError,
+    NoJobError,
+    NoSharedFileError,
+    NoShareError,
+    RateLimitError,
+    ShareError,
+    StoreError,
+    TooLargeError,
+    TooManySharesError,
+)
+from service.examples import SHARE_ID, SHARE_TOKEN
+from service.store.quotas import Quotas
+from service.store.shares import Shared
+
+router = APIRouter(tags=["shares"])
+
+#: Maximum bytes of the JSON body that creates a share.
+_MAX_BODY = 4096
+_DAY = 86_400.0
+#: Content-Security-Policy of shared files.
+_POLICY = "sandbox; default-src 'none'"
+#: Headers of answers to requests with a token in their path: neither pages nor caches may pass it on.
+_SECRET = {"Referrer-Policy": "no-referrer", "Cache-Control": "no-store"}
+
+ShareToken = Annotated[str, Path(description="Token of a share.", max_length=120, examples=[SHARE_TOKEN])]
+
+
+async def get_shared(request: Request, context: ContextDep, token: ShareToken) -> Shared:
+    """Return the share that a request names by its token, instead of a caller.
+
+    Raises:
+        ForeignSiteError: If the service requires no keys, and the request does not come from this machine's pages.
+        RateLimitError: If requests of one share, or with wrong tokens from one address, arrive too fast.
+        NoShareError: If the token is not valid.
+    """
+    if not context.settings.keys_required:
+        check_site(request, context.settings)
+    limit = Quotas.of_settings(context.settings).requests_a_second
+    try:
+        shared = await asyncio.to_thread(context.store.shares.find, token)
+    except NoShareError:
+        context.rates.take(f"address {request.client.host if request.client else ''}", limit)
+        raise
+    context.rates.take(shared.share.id, limit)
+    return shared
+
+
+SharedDep = Annotated[Shared, Depends(get_shared)]
+
+
+@router.post(
+    "/v1/jobs/{job_id}/shares",
+    status_code=201,
+    response_model=ShareCreated,
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewShare"}}},
+        }
+    },
+    responses={
+        201: {
+            "description": "The link. Its token is not shown again.",
+            "headers": headers("Cache-Control"),
+            "links": links("revoke_share", job_id="$request.path.job_id", share_id="$response.body#/id"),
+        },
+        **problems(
+            NoJobError,
+            ShareError,
+            TooManySharesError,
+            invalid("days", "Input should be less than or equal to 90"),
+            BodyTypeError("application/json"),
+            TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", _MAX_BODY),
+            NotUtf8Error,
+            TooSlowError,
+        ),
+    },
+    operation_id="create_share",
+)
+async def create_share(request: Request, job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+    """Create a read-only link to the result of a job, for people without a key.
+
+    Whoever has the link sees the scene before and after in 3D, and nothing else, until it expires or is revoked. The
+    link also ends with the results of the job, and if the key that created the job is revoked.
+    """
+    await asyncio.to_thread(find, context, caller, job_id)
+    check_media_type(request, "application/json")
+    new = NewShare.model_validate(await read_json(request, context.settings, _MAX_BODY))
+    row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
+    view = ShareCreated(id=row.id, created_at=row.created_at, expires_at=row.expires_at, url=f"/shared#{token}")
+    body = view.model_dump_json()
+    return Response(body, 201, {"Cache-Control": "no-store"}, media_type="application/json")
+
+
+@router.get(
+    "/v1/jobs/{job_id}/shares",
+    response_model=ShareList,
+    responses=problems(NoJobError),
+    operation_id="list_shares",
+)
+def list_shares(job_id: JobId, context: ContextDep, caller: CallerDep) -> ShareList:
+    """List the links to the result of a job that have not expired. Their tokens are not stored."""
+    find(context, caller, job_id)
+    rows = context.store.shares.of_job(job_id)
+    return ShareList(
+        shares=[ShareView(id=row.id, created_at=row.created_at, expires_at=row.expires_at) for row in rows]
+    )
+
+
+@router.delete(
+    "/v1/jobs/{job_id}/shares/{share_id}",
+    status_code=204,
+    responses={204: {"description": "The link no longer works."}, **problems(NoJobError, NoShareError)},
+    operation_id="revoke_share",
+)
+def revoke_share(
+    job_id: JobId,
+    share_id: Annotated[str, Path(description="ID of a share.", examples=[SHARE_ID])],
+    context: ContextDep,
+    caller: CallerDep,
+) -> None:
+    """Revoke a link to the result of a job."""
+    find(context, caller, job_id)
+    if not is_id(share_id):
+        raise NoShareError
+    context.store.shares.revoke(job_id, share_id)
+
+
+@router.get(
+    "/v1/shared/{token}",
+    response_model=SharedView,
+    responses={
+        200: {"headers": headers("Cache-Control", "Referrer-Policy")},
+        **problems(
+            NoShareError,
+            RateLimitError,
+            ForeignSiteError,
+            invalid("path.token", "String should have at most 120 characters"),
+            key=False,
+        ),
+    },
+    operation_id="get_shared",
+)
+async def show_shared(shared: SharedDep, context: ContextDep) -> Response:
+    """Get what the viewer of a shared result needs to know. The token of the link replaces a key."""
+    artifacts = await asyncio.to_thread(context.store.jobs.artifacts, shared.job.id)
+    view = shared_view(shared.job, shared.share.expires_at, [row.name for row in artifacts])
+    return Response(view.model_dump_json(), headers=_SECRET, media_type="application/json")
+
+
+#: Files that a share gives access to: the scene and its cameras as they were sent, and the result.
+_NAMES = r"^(scene|cameras:[0-7]|colors\.f16|stylized\.ply)$"
+_ANSWERS: Responses = {
+    **file_answers({"application/octet-stream": "ply\nformat binary_little_endian 1.0\n"}, always_policy=True),
+    **problems(
+        NoShareError,
+        NoSharedFileError,
+        RangeError,
+        RateLimitError,
+        ForeignSiteError,
+        StoreError,
+        LostFileError,
+        DamagedFileError,
+        invalid("path.name", f"String should match pattern '{_NAMES}'"),
+        key=False,
+    ),
+}
+
+
+@router.head("/v1/shared/{token}/{name}", operation_id="head_shared_file", response_class=Response, responses=_ANSWERS)
+@router.get(
+    "/v1/shared/{token}/{name}", operation_id="get_shared_file", response_class=StreamingResponse, responses=_ANSWERS
+)
+async def get_shared_file(
+    request: Request,
+    name: Annotated[
+        str,
+        Path(
+            description="`scene` and `cameras:0` as they were sent, `colors.f16` or `stylized.ply` as stylized.",
+            pattern=_NAMES,
+            examples=["scene"],
+        ),
+    ],
+    shared: SharedDep,
+    context: ContextDep,
+    conditions: ConditionsDep,
+) -> Response:
+    """Download a file of a shared result, whole or in ranges. Only what the viewer shows can be read."""
+    response = await send_file(request, await asyncio.to_thread(_find_file, context, shared, name), conditions)
+    response.headers["Referrer-Policy"] = _SECRET["Referrer-Policy"]
+    return response
+
+
+def _find_file(context: Context, shared: Shared, name: str) -> SentFile:
+    """Return the shared file with this name.
+
+    Raises:
+        NoSharedFileError: If the job has no such file, such as `colors.f16` after Gaussians were split.
+    """
+    check: partial[None]
+    entry = input_entry(shared.job, name)
+    if entry is not None:
+        blob = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
+        if blob is None:
+            raise NoSharedFileError(name)
+        check, read = partial(check_input, context, blob), partial(context.blobs.read, blob)
+        sha256, size = blob.sha256, blob.size
+    else:
+        row = context.store.jobs.artifact(shared.job.id, name)
+        if row is None:
+            raise NoSharedFileError(name)
+        check, read = partial(check_artifact, context, row), partial(context.artifacts.read, row.location)
+        sha256, size = row.sha256, row.size
+    values: dict[str, Any] = {"kind": "application/octet-stream", "inline": False, "policy": _POLICY}
+    return SentFile(sha256=sha256, size=size, name=name, check=check, read=read, **values)

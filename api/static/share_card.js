@@ -1,0 +1,65 @@
+// @ts-check
+/** Card of a job's page that creates, lists and revokes read-only links to the result. */
+import { ask, get } from "./api.js";
+import { announce, h, put } from "./dom.js";
+import { time, words } from "./words.js";
+
+const say = words.share;
+const DAYS = [1, 7, 30, 90];
+
+export class ShareCard {
+  /** @param {string} id id of the job */
+  constructor(id) {
+    this.path = `/v1/jobs/${id}/shares`;
+    this.days = h("select", { "aria-label": say.lifetime }, DAYS.map((days) => h("option", { value: days, selected: days === 7 }, say.days(days))));
+    this.link = h("div");
+    this.list = h("ul.files");
+    this.wrong = h("p.wrong", { hidden: true, role: "alert" });
+    this.element = h("section.card.share", h("h2", say.title), h("p.help", say.help),
+      h("div.row", h("button.quiet", { type: "button", onclick: () => this.act(() => this.create()) }, say.create), this.days), this.link, this.list, this.wrong);
+    this.act(() => this.show());
+  }
+
+  /** @param {() => Promise<void>} act */
+  async act(act) {
+    this.wrong.hidden = true;
+    try {
+      await act();
+    } catch (error) {
+      this.wrong.hidden = false;
+      this.wrong.textContent = error instanceof Error ? error.message : String(error);
+    }
+  }
+
+  async create() {
+    const { url } = await (await ask("POST", this.path, { json: { days: Number(this.days.value) } })).json();
+    const input = h("input", { type: "text", readOnly: true, value: new URL(url, location.href).href, "aria-label": say.link, onfocus: () => input.select() });
+    put(this.link, h("div.row", input, h("button.primary", { type: "button", onclick: () => copy(input) }, say.copy)), h("p.help", say.once));
+    input.focus();
+    await this.show();
+  }
+
+  async show() {
+    const { shares } = await get(this.path);
+    put(this.list, shares.map((/** @type {any} */ share) => h("li", h("span", say.until(time(share.expires_at))),
+      h("button.quiet.small", { type: "button", "aria-label": say.revokeOf(time(share.expires_at)), onclick: () => this.act(() => this.revoke(share.id)) }, say.revoke))));
+  }
+
+  /** @param {string} id */
+  async revoke(id) {
+    await ask("DELETE", `${this.path}/${id}`);
+    put(this.link);
+    announce(say.revoked);
+    await this.show();
+  }
+}
+
+/** Copy the text of an input; without a secure context, browsers have no other way than the selection. @param {HTMLInputElement} input */
+async function copy(input) {
+  if (navigator.clipboard) await navigator.clipboard.writeText(input.value);
+  else {
+    input.select();
+    document.execCommand("copy");
+  }
+  announce(say.copied);
+}

@@ -1,0 +1,294 @@
+"""Tests of links to results: what they show, when they end, and that they give access to nothing else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api.client import Client
+from service.files.artifacts import Artifacts
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.shares import MOST_SHARES
+from service.store.tables import ShareRow
+from tests.api.service import Service, check_documented
+from tests.small_scenes import wall, write_files
+
+PLY, COLORS = b"ply\nstylized", b"\0\1" * 9
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """Yield an API process that requires keys, without a dispatcher."""
+    with Service(tmp_path_factory.mktemp("shares") / "data", alone=True, SGSST_REQUIRE_KEYS="true") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def store(service: Service) -> Iterator[Store]:
+    opened = open_store(ServiceSettings(data=service.data))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def me(service: Service, store: Store) -> Iterator[httpx.Client]:
+    with service.client(store.keys.create("me")[1]) as client:
+        yield client
+
+
+@pytest.fixture
+def visitor(service: Service) -> Iterator[httpx.Client]:
+    """Yield a client without a key."""
+    with service.client() as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("files"), wall())
+    return {"scene": ply, "cameras": cameras, "style": style}
+
+
+def finished(client: httpx.Client, service: Service, store: Store, files: dict[str, Path], folder: Path) -> str:
+    """Return a finished job, with results in place of those of a dispatcher."""
+    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+    parameters = {"background": "white", "name": "my wall", "seed": 7}
+    answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
+    job_id = str(answer.json()["id"])
+    artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
+    while (lease := store.leases.take("test")) is not None:
+        results = []
+        for name, content in (("stylized.ply", PLY), ("colors.f16", COLORS), ("report.json", b"{}")):
+            path = folder / name
+            path.write_bytes(content)
+            results.append(artifacts.put(lease.job_id, lease.epoch, name, path))
+        store.leases.start(lease)
+        store.leases.succeed(lease, results, {"steps": 1})
+    return job_id
+
+
+def share(client: httpx.Client, job_id: str, **body: Any) -> tuple[dict[str, Any], str]:
+    """Share a job; return the share and its token."""
+    answer = client.post(f"/v1/jobs/{job_id}/shares", json=body)
+    assert answer.status_code == 201, answer.text
+    view = answer.json()
+    return view, view["url"].partition("/shared#")[2]
+
+
+def gone(answer: httpx.Response, code: str = "not-found") -> None:
+    assert (answer.status_code, answer.json()["code"]) == (404, code), answer.text
+    check_documented(answer)
+
+
+def test_link_shows_the_result_and_nothing_else(
+    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    job_id = finished(me, service, store, files, tmp_path)
+    view, token = share(me, job_id)
+    shown = visitor.get(f"/v1/shared/{token}")
+    assert shown.headers["referrer-policy"] == "no-referrer"
+    assert shown.headers["cache-control"] == "no-store"
+    assert shown.json() == {
+        "name": "my wall",
+        "expires_at": view["expires_at"],
+        "parameters": {"background": [1.0, 1.0, 1.0]},
+        "cameras": ["cameras.json"],
+        "files": ["colors.f16", "stylized.ply"],
+    }
+    for name, content in (
+        ("scene", files["scene"].read_bytes()),
+        ("cameras:0", files["cameras"].read_bytes()),
+        ("colors.f16", COLORS),
+        ("stylized.ply", PLY),
+    ):
+        answer = visitor.get(f"/v1/shared/{token}/{name}")
+        assert answer.content == content
+        assert answer.headers["referrer-policy"] == "no-referrer"
+        assert answer.headers["content-disposition"].startswith("attachment")
+        assert "sandbox" in answer.headers["content-security-policy"]
+    part = visitor.get(f"/v1/shared/{token}/stylized.ply", headers={"Range": "bytes=4-7"})
+    assert (part.status_code, part.content) == (206, PLY[4:8])
+    gone(visitor.get(f"/v1/shared/{token}/cameras:1"), "no-shared-file")
+    page = visitor.get("/shared")
+    assert page.headers["referrer-policy"] == "no-referrer"
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    listed = me.get(f"/v1/jobs/{job_id}/shares").json()["shares"]
+    assert [each["id"] for each in listed] == [view["id"]]
+    assert token.partition(".")[2] not in json.dumps(listed)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "report.json",
+        "style",
+        "style:0",
+        "photos:0",
+        "cameras:8",
+        "log.txt",
+        ".checkpoint",
+        "..%2f..%2fartifacts%2freport.json",
+        "%2e%2e%2fscene",
+        "scene%00",
+        "scene%0a",
+        "scene%2f..%2freport.json",
+        "stylized.ply%3fformat=spz",
+        "Scene",
+    ],
+)
+def test_token_opens_no_other_file(
+    service: Service,
+    store: Store,
+    me: httpx.Client,
+    visitor: httpx.Client,
+    files: dict[str, Path],
+    tmp_path: Path,
+    name: str,
+) -> None:
+    _, token = share(me, finished(me, service, store, files, tmp_path))
+    assert visitor.get(f"/v1/shared/{token}/{name}").status_code in (404, 422)
+
+
+def test_token_is_no_key_and_of_one_job(
+    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    job_id, other = (finished(me, service, store, files, tmp_path) for _ in range(2))
+    view, token = share(me, job_id)
+    for headers in ({"Authorization": f"Bearer {token}"}, {"Cookie": f"sgsst_session={token}"}):
+        for method, path in (
+            ("GET", "/v1/jobs"),
+            ("GET", f"/v1/jobs/{job_id}"),
+            ("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply"),
+            ("GET", f"/v1/jobs/{job_id}/shares"),
+            ("GET", f"/v1/jobs/{other}/artifacts/stylized.ply"),
+            ("DELETE", f"/v1/jobs/{job_id}/shares/{view['id']}"),
+            ("DELETE", f"/v1/jobs/{job_id}"),
+        ):
+            assert visitor.request(method, path, headers=headers).status_code == 401
+    for method in ("POST", "PUT", "PATCH", "DELETE"):
+        assert visitor.request(method, f"/v1/shared/{token}").status_code == 405
+    for path in (f"/v1/shared/{token}/../{other}", f"/v1/shared/{token}/{other}", f"/v1/shared/{view['id']}"):
+        assert visitor.get(path).status_code in (404, 422)
+    reference = f"/v1/shared/{token}/scene"
+    body = {"scene": reference, "style": reference, "parameters": {"orbit": 1}}
+    assert me.post("/v1/jobs", json=body).json()["code"] == "unknown-upload"
+
+
+def test_wrong_tokens_open_nothing(
+    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    view, token = share(me, finished(me, service, store, files, tmp_path))
+    secret = token.partition(".")[2]
+    changed = ("A" if secret[0] != "A" else "B") + secret[1:]
+    for wrong in (f"{view['id']}.{changed}", view["id"], f"{view['id']}.", f"{token}x", f"x{token}", secret, "x" * 100):
+        gone(visitor.get(f"/v1/shared/{wrong}"))
+        gone(visitor.get(f"/v1/shared/{wrong}/scene"))
+    assert visitor.get(f"/v1/shared/{'x' * 200}").status_code == 422
+    assert visitor.get(f"/v1/shared/{token}").status_code == 200
+
+
+def test_link_ends_when_it_expires_or_is_revoked(
+    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    job_id = finished(me, service, store, files, tmp_path)
+    (first, one), (second, two), (_, three) = (share(me, job_id) for _ in range(3))
+    with store.database.writing() as session:
+        session.get_one(ShareRow, first["id"]).expires_at = store.database.clock() - 1
+    gone(visitor.get(f"/v1/shared/{one}"))
+    gone(visitor.get(f"/v1/shared/{one}/stylized.ply"))
+    assert visitor.get(f"/v1/shared/{two}").status_code == 200
+    assert me.delete(f"/v1/jobs/{job_id}/shares/{second['id']}").status_code == 204
+    gone(visitor.get(f"/v1/shared/{two}"))
+    gone(me.delete(f"/v1/jobs/{job_id}/shares/{second['id']}"))
+    gone(me.delete(f"/v1/jobs/{job_id}/shares/x"))
+    assert visitor.get(f"/v1/shared/{three}").status_code == 200
+    assert me.delete(f"/v1/jobs/{job_id}").status_code == 204
+    gone(visitor.get(f"/v1/shared/{three}"))
+
+
+def test_link_ends_with_the_key_of_its_job(
+    service: Service, store: Store, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    key, text = store.keys.create("leaving")
+    with service.client(text) as client:
+        _, token = share(client, finished(client, service, store, files, tmp_path))
+    assert visitor.get(f"/v1/shared/{token}").status_code == 200
+    store.keys.revoke(key.id)
+    gone(visitor.get(f"/v1/shared/{token}"))
+
+
+def test_only_results_of_ones_own_can_be_shared(
+    service: Service, store: Store, me: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    job_id = finished(me, service, store, files, tmp_path)
+    with service.client(store.keys.create("other")[1]) as other:
+        for method in ("GET", "POST"):
+            gone(other.request(method, f"/v1/jobs/{job_id}/shares", json={}))
+        view, _ = share(me, job_id)
+        gone(other.delete(f"/v1/jobs/{job_id}/shares/{view['id']}"))
+    own = finished(me, service, store, files, tmp_path)
+    gone(me.delete(f"/v1/jobs/{own}/shares/{view['id']}"))
+    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+    waiting = me.post("/v1/jobs", files=body).json()["id"]
+    refused = me.post(f"/v1/jobs/{waiting}/shares", json={})
+    check_documented(refused)
+    assert (refused.status_code, refused.json()["code"]) == (409, "conflict")
+    for days in (0, -1, 91, "x", None, 1e400):
+        assert (
+            me.post(
+                f"/v1/jobs/{job_id}/shares",
+                content=json.dumps({"days": days}),
+                headers={"Content-Type": "application/json"},
+            ).status_code
+            == 422
+        )
+    for _ in range(MOST_SHARES - 1):
+        share(me, job_id)
+    refused = me.post(f"/v1/jobs/{job_id}/shares", json={})
+    assert (refused.status_code, refused.json()["code"]) == (409, "too-many-shares")
+
+
+def test_stored_digest_is_no_token_and_logs_contain_none(
+    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    view, token = share(me, finished(me, service, store, files, tmp_path))
+    with store.database.reading() as session:
+        row = session.get_one(ShareRow, view["id"])
+    assert token.partition(".")[2] not in (row.id, row.sha256)
+    gone(visitor.get(f"/v1/shared/{row.id}.{row.sha256[:43]}"))
+    assert visitor.get(f"/v1/shared/{token}/scene").status_code == 200
+    assert visitor.get(f"/v1/shared/{token}/a/b").status_code == 404
+    assert token.partition(".")[2] not in service.log.read_text()
+
+
+def test_requests_of_a_link_are_limited(files: dict[str, Path], tmp_path: Path) -> None:
+    settings = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_REQUESTS_A_SECOND_PER_KEY": "0.5"}
+    with Service(tmp_path / "data", alone=True, **settings) as service, service.client() as visitor:
+        store = open_store(ServiceSettings(data=service.data))
+        with service.client(store.keys.create("me")[1]) as me:
+            _, token = share(me, finished(me, service, store, files, tmp_path))
+        store.close()
+        for path in (token, "shr_1.x"):
+            answers = [visitor.get(f"/v1/shared/{path}") for _ in range(20)]
+            refused = next(answer for answer in answers if answer.status_code == 429)
+            check_documented(refused)
+            assert refused.json()["code"] == "rate-limited"
+
+
+def test_client_shares_results(
+    service: Service, store: Store, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    key = store.keys.create("client")[1]
+    with service.client(key) as raw, Client(service.url, key) as client:
+        job_id = finished(raw, service, store, files, tmp_path)
+        made = client.share(job_id, days=2)
+        assert made["url"].startswith(f"{service.url}/shared#shr_")
+        assert [each["id"] for each in client.shares(job_id)] == [made["id"]]
+        client.revoke_share(job_id, made["id"])
+        assert client.shares(job_id) == []
