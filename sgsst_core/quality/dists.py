@@ -107,13 +107,14 @@ class Dists:
 
 
 def load_dists_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> Dists | None:
-    """Load DISTS in float32, or return None if its package or VGG16's weights are missing.
-
-    Raises:
-        WeightsError: If the weights are installed but corrupt, or not those of the published network.
-    """
+    """Load DISTS in float32, or return None if its package or the published VGG16 is not installed."""
     installed = any(entry.name == "vgg16" and entry.path for entry in list_network_weights(folder))
-    return Dists(device=device, folder=folder) if installed and find_spec(_PACKAGE) else None
+    if not installed or not find_spec(_PACKAGE):
+        return None
+    try:
+        return Dists(device=device, folder=folder)
+    except WeightsError:  # another network of that name
+        return None
 
 
 def may_judge(network: str, content_weight: float) -> bool:
