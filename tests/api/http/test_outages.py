@@ -18,6 +18,7 @@ import httpx
 import pytest
 
 from api.http.app import create_app
+from service.examples import SHARE_ID, SHARE_TOKEN
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from tests.api.http.test_api import TUS, form, refused
@@ -126,6 +127,7 @@ def request(client: httpx.Client, method: str, path: str, outage: Outage, files:
         body["headers"] |= {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
         body["content"] = b"x" * 10
     values = {"job_id": outage.job_id, "upload_id": outage.upload_id, "role": "scene", "name": "stylized.ply"}
+    values |= {"share_id": SHARE_ID, "token": SHARE_TOKEN}
     return client.request(method, path.format(**values), **body)
 
 
